@@ -1,0 +1,19 @@
+"""Controllers for control-affine problems on the torus, with a certificate of how far from optimal they can be."""
+
+from ocp_torch.control_cost import PowerCost
+from ocp_torch.controller import Controller, load_controller
+from ocp_torch.errors import InputError
+from ocp_torch.problems import PROBLEMS, Circle, Manufactured, Problem, Torus
+
+__version__ = "0.1.0"
+__all__ = [
+    "PROBLEMS",
+    "Circle",
+    "Controller",
+    "InputError",
+    "Manufactured",
+    "PowerCost",
+    "Problem",
+    "Torus",
+    "load_controller",
+]

@@ -1,0 +1,106 @@
+"""The three constants the bounds rest on, `M`, `C_V` and `C_u`, and where each came from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+
+from ocp_torch.errors import require_number
+from ocp_torch.extremum import supremum
+from ocp_torch.problems.problem import Problem
+from ocp_torch.samplers import scrambled_sobol
+
+# Head-room on a sampled supremum that is going to be used as a bound.
+MARGIN = 1.05
+# Without any knowledge of mu*, M starts at this multiple of sup mu0 and the certificate judges it afterwards.
+OCCUPATION_GUESS = 4.0
+
+FROM_CONFIGURATION, FROM_PROBLEM, ESTIMATED = "configuration", "problem", "estimated"
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """`M >= sup mu*`, `C_V >= sup V*`, `C_u >= sup |u*|` and, per name, its source."""
+
+    M: float
+    C_V: float
+    C_u: float
+    sources: dict[str, str]
+    warnings: tuple[str, ...] = ()
+
+
+def resolve_bounds(
+    problem: Problem,
+    occupation_bound: float | None = None,
+    value_bound: float | None = None,
+    control_bound: float | None = None,
+) -> Bounds:
+    """Each bound from the configuration if it was set there, else from the problem, else estimated with a warning.
+
+    `OPT <= J` needs `C_V >= sup V*`, for which `sup f` will do (Proposition 1); `C_u` is that of Proposition 2 where
+    `a = 0` and an estimate by the same formula with the least-squares `alpha` (`B alpha = a`) otherwise.
+    """
+    chosen: dict[str, float] = {}
+    sources: dict[str, str] = {}
+    notes: list[str] = []
+    configured = {"M": occupation_bound, "C_V": value_bound, "C_u": control_bound}
+    known = {"M": problem.occupation_bound, "C_V": problem.value_bound, "C_u": problem.control_bound}
+    fields = {"M": "method.occupation_bound", "C_V": "method.value_bound", "C_u": "method.control_bound"}
+    for name in ("C_V", "C_u", "M"):
+        if configured[name] is not None:
+            chosen[name] = require_number(fields[name], configured[name], above=0.0)
+            sources[name] = FROM_CONFIGURATION
+        elif known[name] is not None and math.isfinite(known[name]):
+            chosen[name], sources[name] = float(known[name]), FROM_PROBLEM
+        else:
+            chosen[name], why = _ESTIMATES[name](problem)
+            sources[name] = ESTIMATED
+            notes.append(f"{name} is not known: {chosen[name]:.4g} is {why}; set {fields[name]} if you know better.")
+    if sources["M"] == FROM_CONFIGURATION and problem.occupation_bound is not None:
+        if chosen["M"] < problem.occupation_bound:
+            true = f"{problem.occupation_bound:.4g}" if math.isfinite(problem.occupation_bound) else "infinite"
+            notes.append(
+                f"method.occupation_bound = {chosen['M']:.4g} is below this problem's sup mu*, which is {true}."
+            )
+    return Bounds(**chosen, sources=sources, warnings=tuple(notes))
+
+
+def _search_points(problem: Problem):
+    return scrambled_sobol(2**13, problem.dim, 1, torch.float64)
+
+
+def state_cost_supremum(problem: Problem) -> float:
+    """`sup f`: the problem's own bound, or a sampled and climbed estimate with head-room."""
+    if problem.state_cost_bound is not None:
+        return problem.state_cost_bound
+    return MARGIN * supremum(problem.state_cost, _search_points(problem), differentiable=False).value
+
+
+def _estimate_value_bound(problem: Problem) -> tuple[float, str]:
+    return state_cost_supremum(problem), "the largest state cost met at sampled states, which bounds V*"
+
+
+def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
+    q, conjugate = problem.exponent, problem.control_cost.conjugate_exponent
+    total = 2.0 * conjugate * state_cost_supremum(problem)
+    if problem.driftless:
+        return total ** (1.0 / q), "Proposition 2 of the paper with a sampled sup f"
+    x = _search_points(problem)[:2048]
+    alpha = torch.linalg.pinv(problem.control_matrix(x)) @ problem.drift(x).unsqueeze(-1)
+    largest = float(alpha.squeeze(-1).norm(dim=-1).max())
+    return (total + 2.0**q * (conjugate - 1.0) * largest) ** (1.0 / q), "Proposition 2 with a least-squares alpha"
+
+
+def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
+    largest = float(problem.initial_density(_search_points(problem)).max())
+    return OCCUPATION_GUESS * largest, f"a guess, {OCCUPATION_GUESS:g} times sup mu0, that F_M cannot be trusted on"
+
+
+_ESTIMATES = {"M": _estimate_occupation_bound, "C_V": _estimate_value_bound, "C_u": _estimate_control_bound}
+
+
+def with_value_bound(bounds: Bounds, value: float, source: str) -> Bounds:
+    """The same bounds with another `C_V`."""
+    return replace(bounds, C_V=value, sources={**bounds.sources, "C_V": source})

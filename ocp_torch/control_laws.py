@@ -1,0 +1,76 @@
+"""Controllers as functions of the state: from `V` alone, from `w / mu`, or zero; and the densities `mu` they need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ocp_torch import calculus, formulas
+from ocp_torch.bounds import Bounds
+from ocp_torch.calculus import Field
+from ocp_torch.fields.fields import Fields
+from ocp_torch.problems.problem import Problem
+from ocp_torch.samples import Samples
+
+# A control law maps states (N, d) to controls (N, m); a density maps them to (N,).
+ControlLaw = Callable[[Tensor], Tensor]
+Density = Callable[[Tensor], Tensor]
+
+# How a method turns its fields into mu: Lemma 2, Lemma 3, or a network for log mu.
+CLOSED, SADDLE, NETWORK = "closed", "saddle", "network"
+
+
+def value_law(problem: Problem, value: Field) -> ControlLaw:
+    """`u = grad R*(-B^T grad V / rho)` (Proposition 2): optimal when `V = V*`."""
+
+    def law(x: Tensor) -> Tensor:
+        _, gradient = calculus.value_and_gradient(value, x)
+        pull = torch.einsum("ndm,nd->nm", problem.control_matrix(x), gradient)
+        return problem.control_cost.argmax(-pull / problem.discount)
+
+    return law
+
+
+def density_law(control_density: Field, occupation: Density) -> ControlLaw:
+    """`u = w / mu`, and 0 where `mu` is 0 (no state is ever there) or infinite (mass stands still)."""
+
+    def law(x: Tensor) -> Tensor:
+        mu = occupation(x)
+        usable = (mu > 0) & torch.isfinite(mu)
+        return torch.where(usable.unsqueeze(-1), control_density(x) / torch.where(usable, mu, 1.0).unsqueeze(-1), 0.0)
+
+    return law
+
+
+def zero_law(problem: Problem) -> ControlLaw:
+    """`u = 0`, what the certificate calls doing nothing."""
+    return lambda x: x.new_zeros(len(x), problem.control_dim)
+
+
+def occupation_density(kind: str, problem: Problem, fields: Fields, bounds: Bounds) -> Density:
+    """`mu(x)` of trained fields: ``closed`` (Lemma 2, no drift), ``saddle`` (Lemma 3) or ``network`` (`exp log mu`)."""
+    cost, rho = problem.control_cost, problem.discount
+
+    def closed(x: Tensor) -> Tensor:
+        samples = Samples.of(problem, x)
+        w, inflow = formulas.controlled_inflow(samples, fields.control_density, rho)
+        return cost.primal_occupation(w, samples.f, bounds.C_V, inflow)
+
+    def saddle(x: Tensor) -> Tensor:
+        value, gradient = calculus.value_and_gradient(fields.value, x)
+        beta = problem.state_cost(x) - value + (gradient * problem.drift(x)).sum(dim=-1) / rho
+        return cost.saddle_occupation(fields.control_density(x), beta, bounds.M)
+
+    return {CLOSED: closed, SADDLE: saddle, NETWORK: lambda x: fields.log_occupation(x).exp()}[kind]
+
+
+def control_laws(kind: str | None, problem: Problem, fields: Fields, bounds: Bounds) -> dict[str, ControlLaw]:
+    """The controllers trained fields give: ``value`` if they hold `V`, ``density`` if they hold `w`."""
+    laws = {}
+    if fields.value is not None:
+        laws["value"] = value_law(problem, fields.value)
+    if fields.control_density is not None:
+        laws["density"] = density_law(fields.control_density, occupation_density(kind, problem, fields, bounds))
+    return laws

@@ -1,0 +1,166 @@
+"""A trained controller that loads in one line: `u = load_controller(path); u(x)`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ocp_torch.bounds import Bounds
+from ocp_torch.control_laws import CLOSED, NETWORK, SADDLE, control_laws
+from ocp_torch.errors import InputError
+from ocp_torch.fields import MODELS, Fields
+from ocp_torch.problems import PROBLEMS, Problem
+from ocp_torch.storage import load_tensors, save_tensors
+
+SCHEMA = 1
+# What a file may ask for, so that a crafted one cannot ask for all memory.
+LARGEST_COUNT = 2**22
+
+
+@dataclass
+class Controller:
+    """`u(x)` with all it came from.
+
+    ``kind`` says which law `u` is: ``value`` (from `V` alone) or ``density`` (`w / mu`). ``certificate`` is the dict of
+    `certificate.json`, ``config`` the resolved configuration of the run, ``model`` the network's configuration.
+    """
+
+    problem: Problem
+    fields: Fields
+    bounds: Bounds
+    occupation: str | None
+    kind: str
+    model: dict
+    certificate: dict
+    config: dict
+
+    def __post_init__(self) -> None:
+        self._law = control_laws(self.occupation, self.problem, self.fields, self.bounds)[self.kind]
+        self._like = next(self.fields.parameters())
+
+    def __call__(self, x: Tensor | np.ndarray) -> Tensor | np.ndarray:
+        """Controls ``(N, m)`` at states ``(N, d)``: any reals, wrapped to the torus; NumPy in gives NumPy out.
+
+        Raises `InputError` for another shape.
+        """
+        states = torch.as_tensor(x)
+        if states.ndim != 2 or states.shape[1] != self.problem.dim:
+            raise InputError(f"x has shape {tuple(states.shape)}, but must have shape (N, {self.problem.dim}).")
+        if not states.is_floating_point():
+            states = states.double()
+        with torch.no_grad():
+            # Wrapped before it is rounded, so that states far from the unit cell keep their place in it.
+            u = self._law(states.remainder(1.0).to(self._like))
+        return u.cpu().numpy() if isinstance(x, np.ndarray) else u
+
+    def save(self, path: str | Path) -> None:
+        """Write `controller.safetensors`: weights, and as JSON everything needed to build the controller again."""
+        metadata = {
+            "schema": SCHEMA,
+            "problem": {"name": problem_name(self.problem), "parameters": _plain(self.problem.parameters)},
+            "dtype": str(self._like.dtype).removeprefix("torch."),
+            "fields": list(self.fields.networks),
+            "model": self.model,
+            "bounds": asdict(self.bounds),
+            "occupation": self.occupation,
+            "kind": self.kind,
+            "certificate": self.certificate,
+            "config": self.config,
+        }
+        save_tensors(Path(path), dict(self.fields.state_dict()), metadata)
+
+
+def problem_name(problem: Problem) -> str:
+    """The name of a built-in problem, or the class name of a user's own in lower case."""
+    return next((n for n, c in PROBLEMS.items() if c is type(problem)), type(problem).__name__.lower())
+
+
+def load_controller(path: str | Path, problem: Problem | None = None, device: str = "cpu") -> Controller:
+    """Load a controller saved by a run; no code in the file is run.
+
+    A controller of one of the package's problems rebuilds it from its parameters; one of a user's own problem needs that
+    ``problem``. Raises `InputError` when the file is missing, damaged, of a newer schema, or does not fit the problem.
+    """
+    path = Path(path)
+    tensors, metadata = load_tensors(path)
+    schema = metadata.get("schema")
+    if not isinstance(schema, int) or schema > SCHEMA:
+        raise InputError(f"{path} has schema {schema!r}, but this version of ocp_torch reads up to {SCHEMA}.")
+    try:
+        return _rebuild(path, tensors, metadata, problem, device)
+    except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path} does not describe a controller ({type(error).__name__}: {error}).") from None
+
+
+def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None, device: str) -> Controller:
+    if metadata["occupation"] not in (None, CLOSED, SADDLE, NETWORK):
+        raise InputError(f"{path} names the unknown occupation {metadata['occupation']!r}.")
+    saved = metadata["problem"]
+    if problem is None:
+        if saved["name"] not in PROBLEMS:
+            raise InputError(
+                f"{path} belongs to the problem {saved['name']!r}, which is not part of ocp_torch; "
+                "pass it: load_controller(path, problem=MyProblem())."
+            )
+        _require_reasonable(path, saved["parameters"])
+        problem = PROBLEMS[saved["name"]](**saved["parameters"])
+    elif saved["name"] in PROBLEMS and problem_name(problem) != saved["name"]:
+        raise InputError(f"{path} belongs to the problem {saved['name']!r}, not to {problem_name(problem)!r}.")
+    model = metadata["model"]
+    _require_reasonable(path, model)
+    options = {k: v for k, v in model.items() if k != "name"}
+    if model["name"] not in MODELS:
+        raise InputError(f"{path} names the unknown model {model['name']!r}; known are {', '.join(MODELS)}.")
+    build = lambda: Fields.build(
+        problem, metadata["fields"], lambda **form: MODELS[model["name"]](**form, **options), 0
+    )
+    with torch.device("meta"):
+        # Shapes first, without memory: a crafted size must not be allocated before it is refused.
+        shapes = {name: tuple(t.shape) for name, t in _sketch(problem, metadata["fields"], model, options).items()}
+    held = {name: tuple(t.shape) for name, t in tensors.items()}
+    if shapes != held:
+        raise InputError(
+            f"{path} does not fit: its weights are not those of its model on a problem of dimension {problem.dim}."
+        )
+    if not all(torch.isfinite(t).all() for t in tensors.values()):
+        raise InputError(f"{path} holds weights that are not finite.")
+    if metadata["dtype"] not in ("float32", "float64"):
+        raise InputError(f"{path} has dtype {metadata['dtype']!r}, but must have float32 or float64.")
+    fields = build().to(dtype=getattr(torch, metadata["dtype"]))
+    fields.load_state_dict(tensors)
+    fields = fields.to(device).requires_grad_(False)
+    bounds = Bounds(**{**metadata["bounds"], "warnings": tuple(metadata["bounds"]["warnings"])})
+    return Controller(
+        problem=problem,
+        fields=fields,
+        bounds=bounds,
+        occupation=metadata["occupation"],
+        kind=metadata["kind"],
+        model=model,
+        certificate=metadata["certificate"],
+        config=metadata["config"],
+    )
+
+
+def _sketch(problem: Problem, names: list[str], model: dict, options: dict) -> dict[str, Tensor]:
+    """The state dict the fields would have, on whatever device is the default."""
+    network = MODELS[model["name"]]
+    outputs = {"value": None, "control_density": problem.control_dim, "log_occupation": None}
+    return Fields({n: network(dim=problem.dim, outputs=outputs[n], **options) for n in names}).state_dict()
+
+
+def _require_reasonable(path: Path, numbers: dict) -> None:
+    for name, value in numbers.items():
+        if isinstance(value, int) and value > LARGEST_COUNT and name != "seed":
+            raise InputError(f"{path} asks for {name} = {value}, which is beyond anything a run can have had.")
+
+
+def _plain(parameters: dict) -> dict:
+    """Only what JSON can hold; the rest is a user's own problem's, which is passed in on loading."""
+    return {k: v for k, v in parameters.items() if isinstance(v, bool | int | float | str | list | type(None))}

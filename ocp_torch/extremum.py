@@ -1,0 +1,69 @@
+"""Suprema over the torus: sampled, then climbed by local ascent from the worst points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Extremum:
+    """A supremum as it was found: an estimate from below of the true one, with what was done to find it."""
+
+    value: float
+    x: Tensor  # (d,) where it is attained
+    points: int  # states sampled
+    ascents: int  # local ascents started from the largest of them
+
+
+@torch.no_grad()
+def batched(function: Callable[[Tensor], Tensor], x: Tensor, chunk: int = 8192) -> Tensor:
+    """``function`` over the rows of ``x`` in chunks, so that memory stays bounded."""
+    return torch.cat([function(part) for part in x.split(chunk)])
+
+
+def supremum(
+    function: Callable[[Tensor], Tensor],
+    points: Tensor,
+    ascents: int = 32,
+    steps: int = 60,
+    start_step: float = 1e-2,
+    differentiable: bool = True,
+) -> Extremum:
+    """The largest value of ``function`` ``(N, d) -> (N,)`` met at ``points`` and on ascents from the ``ascents`` best.
+
+    Each ascent moves along the normalised gradient (or, when ``differentiable`` is false, along random directions) with
+    a step that grows on success and shrinks on failure, so a value never goes down. A NaN anywhere is returned as NaN.
+    """
+    values = batched(function, points)
+    if torch.isnan(values).any():
+        worst = int(torch.isnan(values).nonzero()[0])
+        return Extremum(float("nan"), points[worst], len(points), 0)
+    count = min(ascents, len(points))
+    best, index = values.topk(count)
+    x = points[index].clone()
+    step = torch.full_like(best, start_step)
+    generator = torch.Generator(device="cpu").manual_seed(0)
+    for _ in range(steps if count else 0):
+        direction = _gradient(function, x) if differentiable else torch.randn(x.shape, generator=generator).to(x)
+        direction = direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-30)
+        candidate = x + step.unsqueeze(-1) * direction
+        with torch.no_grad():
+            reached = function(candidate)
+        better = reached > best
+        x = torch.where(better.unsqueeze(-1), candidate, x)
+        best = torch.where(better, reached, best)
+        step = torch.where(better, 1.5 * step, 0.4 * step)
+    top = int(best.argmax())
+    return Extremum(float(best[top]), x[top].remainder(1.0), len(points), count)
+
+
+def _gradient(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
+    """Gradient of ``function`` at each row of ``x``."""
+    with torch.enable_grad():
+        x = x.detach().requires_grad_(True)
+        (gradient,) = torch.autograd.grad(function(x).sum(), x)
+    return gradient

@@ -1,0 +1,8 @@
+"""What represents `V`, `w` and `log mu`: anything periodic and differentiable. `MODELS` maps names to network classes."""
+
+from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fields
+from ocp_torch.fields.mlp import PeriodicMLP
+
+MODELS = {"mlp": PeriodicMLP}
+
+__all__ = ["CONTROL_DENSITY", "LOG_OCCUPATION", "MODELS", "VALUE", "Fields", "PeriodicMLP"]

@@ -1,0 +1,78 @@
+"""The networks that represent `V`, `w` and, where needed, `log mu`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+
+import torch
+from torch import Tensor, nn
+
+from ocp_torch.errors import InputError
+from ocp_torch.problems.problem import Problem
+from ocp_torch.samplers import scrambled_sobol
+
+VALUE, CONTROL_DENSITY, LOG_OCCUPATION = "value", "control_density", "log_occupation"
+# Builds a network from (dim, outputs, shift, scale); outputs None means a scalar field.
+NetworkFactory = Callable[..., nn.Module]
+
+
+class Fields(nn.Module):
+    """The fields a method trains, each under its name; a name that is not there reads as `None`."""
+
+    def __init__(self, networks: dict[str, nn.Module]) -> None:
+        super().__init__()
+        self.networks = nn.ModuleDict(networks)
+
+    @classmethod
+    def build(cls, problem: Problem, names: Iterable[str], network: NetworkFactory, seed: int) -> Fields:
+        """Fresh networks for ``names`` in the units of ``problem``, initialised from ``seed`` alone."""
+        cost, control = typical_sizes(problem)
+        forms = {
+            VALUE: dict(outputs=None, shift=cost[0], scale=cost[1]),
+            CONTROL_DENSITY: dict(outputs=problem.control_dim, shift=0.0, scale=control),
+            LOG_OCCUPATION: dict(outputs=None, shift=0.0, scale=1.0),
+        }
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            return cls({name: network(dim=problem.dim, **forms[name]) for name in names})
+
+    @property
+    def value(self) -> nn.Module | None:
+        """`V`: ``(N, d) -> (N,)``."""
+        return self._get(VALUE)
+
+    @property
+    def control_density(self) -> nn.Module | None:
+        """`w`: ``(N, d) -> (N, m)``."""
+        return self._get(CONTROL_DENSITY)
+
+    @property
+    def log_occupation(self) -> nn.Module | None:
+        """`log mu`: ``(N, d) -> (N,)``."""
+        return self._get(LOG_OCCUPATION)
+
+    def _get(self, name: str) -> nn.Module | None:
+        return self.networks[name] if name in self.networks else None
+
+    def parameters_of(self, names: Iterable[str]) -> list[nn.Parameter]:
+        """The trainable parameters of the fields ``names``, in a fixed order."""
+        return [p for name in names for p in self.networks[name].parameters() if p.requires_grad]
+
+
+def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:
+    """Mean and standard deviation of the state cost, and the control `(q std)^{1/q}` worth as much: a problem's units.
+
+    Raises `InputError` when the state cost is not finite at some sampled state.
+    """
+    x = scrambled_sobol(1024, problem.dim, 0, torch.float64)
+    f: Tensor = problem.state_cost(x)
+    if f.shape != (len(x),):
+        raise InputError(f"state_cost gave shape {tuple(f.shape)} for states {tuple(x.shape)}; it must give (N,).")
+    if not torch.isfinite(f).all():
+        at = x[~torch.isfinite(f)][0].tolist()
+        raise InputError(f"state_cost is not finite at x = {at}; it must be finite on the whole torus.")
+    spread = float(f.std())
+    mean = float(f.mean())
+    spread = spread if spread > 1e-12 * max(abs(mean), 1e-300) else max(abs(mean), 1.0)
+    return (mean, spread), math.pow(problem.exponent * spread, 1.0 / problem.exponent)

@@ -1,0 +1,36 @@
+"""What every method has in common: which fields it trains, who moves them, and one loss per player."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from torch import Tensor
+
+from ocp_torch.bounds import Bounds
+from ocp_torch.fields.fields import Fields
+from ocp_torch.problems.problem import Problem
+from ocp_torch.samples import Samples
+
+
+class Objective(ABC):
+    """A one-player objective is minimised; a two-player one is a game in which each player minimises its own loss.
+
+    ``players`` maps a player to the fields it moves; ``needs_divergences`` says whether `losses` reads `div a`, `div B`;
+    ``occupation`` says how the fields give `mu` (see `control_laws`), `None` where they do not.
+    """
+
+    players: dict[str, tuple[str, ...]]
+    needs_divergences: bool = False
+    occupation: str | None = None
+
+    def __init__(self, problem: Problem, bounds: Bounds) -> None:
+        self.rho, self.cost, self.bounds = problem.discount, problem.control_cost, bounds
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """All fields the method trains."""
+        return tuple(name for names in self.players.values() for name in names)
+
+    @abstractmethod
+    def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
+        """One scalar loss per player, each a mean over ``samples``."""

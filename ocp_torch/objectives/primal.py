@@ -1,0 +1,57 @@
+r"""The primal with an exact penalty, P-P (section 5 of the paper)."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from ocp_torch import control_laws, formulas
+from ocp_torch.bounds import Bounds
+from ocp_torch.errors import InputError, require_choice
+from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, Fields
+from ocp_torch.objectives.objective import Objective
+from ocp_torch.problems.problem import Problem
+from ocp_torch.samples import Samples
+
+
+class ClosedPrimal(Objective):
+    r"""Without drift: minimise `G(w) = min_mu J(w, mu)`, whose minimum over `mu` is pointwise (Lemma 2)."""
+
+    players = {"density": (CONTROL_DENSITY,)}
+    needs_divergences = True
+    occupation = control_laws.CLOSED
+
+    def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
+        w, inflow = formulas.controlled_inflow(samples, fields.control_density, self.rho)
+        return {"density": samples.mean(self.cost.primal_minimum(w, samples.f, self.bounds.C_V, inflow))}
+
+
+class NetworkPrimal(Objective):
+    r"""With drift: minimise `J(w, mu)` over two networks, `w` and `log mu`."""
+
+    players = {"density": (CONTROL_DENSITY, LOG_OCCUPATION)}
+    needs_divergences = True
+    occupation = control_laws.NETWORK
+
+    def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
+        w, inflow = formulas.controlled_inflow(samples, fields.control_density, self.rho)
+        mu, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
+        return {
+            "density": samples.mean(
+                formulas.primal_integrand(samples, w, mu, inflow - loss, self.cost, self.bounds.C_V)
+            )
+        }
+
+
+def primal(problem: Problem, bounds: Bounds, occupation: str = "auto") -> Objective:
+    """The primal with `mu` in closed form (only where `a = 0`), by a network, or whichever suits the problem.
+
+    Raises `InputError` for ``occupation="closed"`` with drift.
+    """
+    require_choice("method.occupation", occupation, ("auto", "closed", "network"))
+    if occupation == "closed" and not problem.driftless:
+        raise InputError(
+            "method.occupation is 'closed', but this problem has drift, for which mu has no closed form; "
+            "use method.occupation=network or auto."
+        )
+    closed = problem.driftless and occupation != "network"
+    return (ClosedPrimal if closed else NetworkPrimal)(problem, bounds)

@@ -1,0 +1,109 @@
+r"""A discounted control-affine problem on the unit torus, known through evaluations at batches of states.
+
+minimise  rho E_{x0 ~ mu0} int_0^inf e^{-rho t} (f(x_t) + |u_t|^q / q) dt,   dx/dt = a(x) + B(x) u
+"""
+
+from __future__ import annotations
+
+import inspect
+
+import torch
+from torch import Tensor
+
+from ocp_torch import calculus
+from ocp_torch.control_cost import PowerCost
+from ocp_torch.errors import InputError, require_integer, require_number
+
+
+class Problem:
+    """Base class: override `state_cost`, and whatever else differs from `dx/dt = u` with a uniform start.
+
+    All methods are batched, take states ``(N, d)``, work in the precision and on the device of their argument, and have
+    period 1 in each coordinate. Arguments of `__init__`: ``dim`` is `d`, ``control_dim`` is `m` (default `d`),
+    ``discount`` is `rho > 0` (per unit time), ``exponent`` is `q` in (1, 2]. Raises `InputError` outside these ranges.
+
+    Attributes a subclass may set, each `None` where unknown: ``state_cost_bound >= sup f``; ``occupation_bound >= sup
+    mu*`` (`math.inf` when known to be unbounded); ``control_bound >= sup |u*|``; ``value_bound >= sup V*``;
+    ``exact_optimum``, the number `OPT`.
+    """
+
+    def __init__(self, dim: int, control_dim: int | None = None, discount: float = 2.0, exponent: float = 2.0) -> None:
+        self.dim = require_integer("problem.dim", dim, 1)
+        self.control_dim = self.dim if control_dim is None else require_integer("problem.control_dim", control_dim, 1)
+        self.discount = require_number("problem.discount", discount, above=0.0)
+        self.exponent = require_number("problem.exponent", exponent, above=1.0, at_most=2.0)
+        self.control_cost = PowerCost(self.exponent)
+        self.state_cost_bound: float | None = None
+        self.occupation_bound: float | None = None
+        self.control_bound: float | None = None
+        self.value_bound: float | None = None
+        self.exact_optimum: float | None = None
+        self._placed: dict = {}
+
+    def state_cost(self, x: Tensor) -> Tensor:
+        """Running state cost `f >= 0`, ``(N,)``. The one method every problem must override."""
+        raise InputError(f"{type(self).__name__} must define state_cost(x), the running cost of shape (N,).")
+
+    def drift(self, x: Tensor) -> Tensor:
+        """Uncontrolled velocity `a`, ``(N, d)``, in torus units per unit time; zero unless overridden."""
+        return torch.zeros_like(x)
+
+    def control_matrix(self, x: Tensor) -> Tensor:
+        """`B`, ``(N, d, m)``; by default control `k` moves coordinate `k`."""
+        eye = torch.eye(self.dim, self.control_dim, dtype=x.dtype, device=x.device)
+        return eye.expand(len(x), self.dim, self.control_dim)
+
+    def initial_density(self, x: Tensor) -> Tensor:
+        """Density `mu0` of the initial state, ``(N,)``, with mean 1 over the torus; uniform unless overridden."""
+        return torch.ones_like(x[:, 0])
+
+    @property
+    def driftless(self) -> bool:
+        """Whether `a = 0`: true exactly when `drift` is not overridden, unless a subclass knows better."""
+        return type(self).drift is Problem.drift
+
+    def drift_divergence(self, x: Tensor) -> Tensor | None:
+        """`div a`, ``(N,)``: by forward-mode autograd through `drift`. Override where it is known, or give `None`."""
+        if self.driftless:
+            return torch.zeros_like(x[:, 0])
+        return calculus.divergence(self.drift, x)
+
+    def control_divergence(self, x: Tensor) -> Tensor | None:
+        """The divergence of each column of `B`, ``(N, m)``; by forward-mode autograd unless `B` is constant."""
+        if type(self).control_matrix is Problem.control_matrix:
+            return x.new_zeros(len(x), self.control_dim)
+        basis = torch.eye(self.dim, dtype=x.dtype, device=x.device)
+        along = lambda e: calculus.directional_derivative(self.control_matrix, x, e.expand_as(x))[1]
+        tangents = torch.func.vmap(along)(basis)  # (d, N, d, m): derivative of B along coordinate i
+        return torch.einsum("inim->nm", tangents)
+
+    # Exact truth, where known: `None` otherwise.
+    def exact_value(self, x: Tensor) -> Tensor | None:
+        """`V*(x)`, ``(N,)``."""
+        return None
+
+    def exact_control(self, x: Tensor) -> Tensor | None:
+        """`u*(x)`, ``(N, m)``."""
+        return None
+
+    def exact_occupation(self, x: Tensor) -> Tensor | None:
+        """`mu*(x)`, ``(N,)``."""
+        return None
+
+    def velocity(self, x: Tensor, u: Tensor) -> Tensor:
+        """`a(x) + B(x) u`, ``(N, d)``."""
+        pushed = torch.einsum("ndm,nm->nd", self.control_matrix(x), u)
+        return pushed if self.driftless else self.drift(x) + pushed
+
+    @property
+    def parameters(self) -> dict:
+        """The arguments that make this problem again: each `__init__` argument is read from the attribute of its name."""
+        names = list(inspect.signature(type(self).__init__).parameters)[1:]
+        return {name: getattr(self, name) for name in names if hasattr(self, name)}
+
+    def _like(self, x: Tensor, name: str, constant: Tensor) -> Tensor:
+        """``constant`` in the precision and on the device of ``x``, converted once."""
+        key = (name, x.dtype, x.device)
+        if key not in self._placed:
+            self._placed[key] = constant.to(x)
+        return self._placed[key]

@@ -1,0 +1,94 @@
+"""Where training states come from: uniform, or scrambled Sobol points; and the evaluation points that never meet them.
+
+Points are always made on the CPU, so that the same seed gives the same states on every device.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.quasirandom import SobolEngine
+
+# A fresh scrambling after so many points: keeps the stream endless and fast-forwarding cheap.
+SOBOL_BLOCK = 2**18
+# Evaluation draws come from another branch of the seed tree than training draws.
+TRAINING_STREAM, EVALUATION_STREAM = 0, 1
+
+
+def derive_seed(seed: int, *path: int) -> int:
+    """A seed for the branch ``path`` below ``seed``: distinct branches give independent streams."""
+    return int(np.random.SeedSequence(entropy=seed, spawn_key=path).generate_state(1, np.uint64)[0] >> 1)
+
+
+def scrambled_sobol(count: int, dim: int, seed: int, dtype: torch.dtype, skip: int = 0) -> Tensor:
+    """``count`` scrambled Sobol points in `[0, 1)^dim`, after ``skip`` of the same scrambling; ``(count, dim)``."""
+    engine = SobolEngine(dim, scramble=True, seed=seed % 2**31)
+    if skip:
+        engine.fast_forward(skip)
+    points = engine.draw(count, dtype=torch.float64)
+    # Rounding to float32 can give exactly 1, the same state as 0.
+    return points.to(dtype).remainder(1.0)
+
+
+def evaluation_points(count: int, dim: int, replicate: int, seed: int) -> Tensor:
+    """Randomised quasi-Monte Carlo states in float64, from a stream no training sampler uses; ``(count, dim)``."""
+    return scrambled_sobol(count, dim, derive_seed(seed, EVALUATION_STREAM, replicate), torch.float64)
+
+
+class UniformSampler:
+    """Independent uniform states."""
+
+    def __init__(self, dim: int, seed: int, dtype: torch.dtype) -> None:
+        self.dim, self.dtype = dim, dtype
+        self.generator = torch.Generator().manual_seed(derive_seed(seed, TRAINING_STREAM))
+
+    def draw(self, count: int) -> Tensor:
+        """The next ``count`` states, ``(count, d)``."""
+        return torch.rand(count, self.dim, generator=self.generator, dtype=self.dtype)
+
+    def state_dict(self) -> dict:
+        return {"generator": self.generator.get_state()}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.generator.set_state(state["generator"])
+
+
+class SobolSampler:
+    """Consecutive points of a scrambled Sobol sequence, scrambled anew every `SOBOL_BLOCK` points."""
+
+    def __init__(self, dim: int, seed: int, dtype: torch.dtype) -> None:
+        self.dim, self.seed, self.dtype = dim, seed, dtype
+        self.count = 0
+        self._buffer, self._start = None, -1
+
+    def draw(self, count: int) -> Tensor:
+        """The next ``count`` states, ``(count, d)``."""
+        pieces = []
+        while count > 0:
+            block, position = divmod(self.count, SOBOL_BLOCK)
+            taken = min(count, SOBOL_BLOCK - position)
+            pieces.append(self._block(block, position + taken)[position : position + taken])
+            self.count += taken
+            count -= taken
+        return torch.cat(pieces)
+
+    def _block(self, block: int, stop: int) -> Tensor:
+        """The first points of ``block``, at least up to ``stop``; kept, because an engine's start costs more than a draw."""
+        if self._start != block:
+            self._start, self._buffer = block, torch.empty(0, self.dim, dtype=self.dtype)
+            seed = derive_seed(self.seed, TRAINING_STREAM, block)
+            self._engine = SobolEngine(self.dim, scramble=True, seed=seed % 2**31)
+        while len(self._buffer) < stop:
+            fresh = self._engine.draw(max(stop - len(self._buffer), 4096), dtype=torch.float64)
+            self._buffer = torch.cat([self._buffer, fresh.to(self.dtype).remainder(1.0)])
+        return self._buffer
+
+    def state_dict(self) -> dict:
+        return {"count": self.count}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.count, self._start = state["count"], -1
+
+
+SAMPLERS = {"uniform": UniformSampler, "sobol": SobolSampler}

@@ -1,0 +1,62 @@
+"""What the learner may see of a problem: evaluations at a batch of states, and nothing that could be differentiated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from ocp_torch.errors import InputError
+from ocp_torch.problems.problem import Problem
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A problem's data at `N` states.
+
+    `weight` is one over the density the states were drawn from, so that a weighted mean estimates an integral over the
+    torus. The divergences are `None` where the problem cannot give them.
+    """
+
+    x: Tensor  # (N, d) states
+    f: Tensor  # (N,) running state cost
+    a: Tensor  # (N, d) drift
+    B: Tensor  # (N, d, m) control matrix
+    mu0: Tensor  # (N,) initial density
+    weight: Tensor  # (N,) importance weight
+    div_a: Tensor | None = None  # (N,) divergence of the drift
+    div_B: Tensor | None = None  # (N, m) divergence of each column of B
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, problem: Problem, x: Tensor, divergences: bool = True, weight: Tensor | None = None) -> Samples:
+        """Evaluate ``problem`` at the states ``x`` of shape ``(N, d)``."""
+        return cls(
+            x=x,
+            f=problem.state_cost(x),
+            a=problem.drift(x),
+            B=problem.control_matrix(x),
+            mu0=problem.initial_density(x),
+            weight=torch.ones_like(x[:, 0]) if weight is None else weight,
+            div_a=problem.drift_divergence(x) if divergences else None,
+            div_B=problem.control_divergence(x) if divergences else None,
+        )
+
+    def __len__(self) -> int:
+        return self.x.shape[0]
+
+    def mean(self, integrand: Tensor) -> Tensor:
+        """The weighted mean of ``integrand`` ``(N,)``: an estimate of its integral over the torus."""
+        return (self.weight * integrand).mean()
+
+    def require_divergences(self, who: str) -> tuple[Tensor, Tensor]:
+        """`div a` and `div B`, or an `InputError` that names ``who`` needs them."""
+        if self.div_a is None or self.div_B is None:
+            raise InputError(f"{who} needs the divergences of a and B, which this problem does not give.")
+        return self.div_a, self.div_B
+
+    def to(self, dtype: torch.dtype, device: torch.device) -> Samples:
+        """The same samples in another precision or on another device."""
+        moved = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Samples(**{k: None if v is None else v.to(dtype=dtype, device=device) for k, v in moved.items()})

@@ -1,0 +1,58 @@
+"""Optimisers and schedules by name: `torch.optim`'s, and SOAP from `pytorch_optimizer`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import CosineAnnealingLR, LambdaLR, LRScheduler, StepLR
+
+from ocp_torch.errors import require_choice, require_integer, require_number
+
+
+def _sgd(parameters: list[Tensor], lr: float, momentum: float = 0.0) -> Optimizer:
+    return torch.optim.SGD(parameters, lr=lr, momentum=require_number("optimizer.momentum", momentum, at_least=0.0))
+
+
+def _adam(parameters: list[Tensor], lr: float, betas=(0.9, 0.999)) -> Optimizer:
+    return torch.optim.Adam(parameters, lr=lr, betas=_betas(betas))
+
+
+def _soap(parameters: list[Tensor], lr: float, betas=(0.95, 0.95), precondition_frequency: int = 10) -> Optimizer:
+    from pytorch_optimizer import SOAP  # slow to import, and only needed here
+
+    every = require_integer("optimizer.precondition_frequency", precondition_frequency, 1)
+    return SOAP(parameters, lr=lr, betas=_betas(betas), weight_decay=0.0, precondition_frequency=every)
+
+
+def _betas(betas) -> tuple[float, float]:
+    first, second = (require_number("optimizer.betas", b, at_least=0.0, at_most=1.0) for b in betas)
+    return first, second
+
+
+OPTIMIZERS = {"sgd": _sgd, "adam": _adam, "soap": _soap}
+
+
+def optimizer_maker(name: str, lr: float, **options) -> Callable[[list[Tensor]], Optimizer]:
+    """A maker of the optimiser ``name`` with learning rate ``lr``; other options as in its configuration file."""
+    make = OPTIMIZERS[require_choice("optimizer.name", name, OPTIMIZERS)]
+    rate = require_number("optimizer.lr", lr, above=0.0)
+    return lambda parameters: make(parameters, lr=rate, **options)
+
+
+def schedule_maker(
+    name: str, steps: int, decay: float = 0.75, every: int = 20000
+) -> Callable[[Optimizer], LRScheduler]:
+    """A maker of the learning-rate schedule: ``constant``; ``cosine`` to zero over ``steps``; or ``decay``, a factor
+    ``decay`` every ``every`` steps (the paper decreases by 25 % every 20,000)."""
+    require_choice("schedule.name", name, ("constant", "cosine", "decay"))
+    factor = require_number("schedule.decay", decay, above=0.0, at_most=1.0)
+    period = require_integer("schedule.every", every, 1)
+    makers = {
+        "constant": lambda optimizer: LambdaLR(optimizer, lambda _: 1.0),
+        "cosine": lambda optimizer: CosineAnnealingLR(optimizer, T_max=steps),
+        "decay": lambda optimizer: StepLR(optimizer, step_size=period, gamma=factor),
+    }
+    return makers[name]

@@ -1,0 +1,122 @@
+"""One step of the game: what simultaneous and extragradient steps share. The arithmetic is `torch.optim`'s."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from ocp_torch.errors import InputError
+from ocp_torch.fields.fields import Fields
+from ocp_torch.objectives.objective import Objective
+from ocp_torch.samples import Samples
+
+Draw = Callable[[], Samples]
+Visit = Callable[[], None]
+
+
+class NonFiniteError(ArithmeticError):
+    """A loss or gradient is not finite; raised before any parameter was touched."""
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one step saw, per player; tensors, so that nothing is synchronised unless it is read."""
+
+    losses: dict[str, Tensor]
+    gradient_norms: dict[str, Tensor]
+    samples: int
+
+
+class Stepper(ABC):
+    """Moves every player of ``objective`` by its own optimiser and schedule.
+
+    ``optimizers`` maps a player to a maker of its optimiser, ``schedule`` makes the learning-rate schedule of each;
+    ``radius``, if given, is the Euclidean ball each player's parameters are projected on after every update (the paper's
+    proximal operator); ``clip``, if given, is the largest gradient norm of a player.
+    """
+
+    def __init__(
+        self,
+        fields: Fields,
+        objective: Objective,
+        optimizers: dict[str, Callable[[list[Tensor]], Optimizer]],
+        schedule: Callable[[Optimizer], LRScheduler],
+        radius: float | None = None,
+        clip: float | None = None,
+    ) -> None:
+        self.fields, self.objective, self.radius, self.clip = fields, objective, radius, clip
+        self.parameters = {player: fields.parameters_of(names) for player, names in objective.players.items()}
+        self.optimizers = {player: optimizers[player](self.parameters[player]) for player in objective.players}
+        self.schedules = {player: schedule(optimizer) for player, optimizer in self.optimizers.items()}
+
+    @abstractmethod
+    def step(self, draw: Draw, visit: Visit) -> StepReport:
+        """One update of all players from samples of ``draw``; calls ``visit`` while the iterate to average is in place."""
+
+    def learning_rates(self) -> dict[str, float]:
+        """The current learning rate of each player."""
+        return {player: optimizer.param_groups[0]["lr"] for player, optimizer in self.optimizers.items()}
+
+    def state_dict(self) -> dict:
+        return {
+            "optimizers": {player: o.state_dict() for player, o in self.optimizers.items()},
+            "schedules": {player: s.state_dict() for player, s in self.schedules.items()},
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        for player, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][player])
+            self.schedules[player].load_state_dict(state["schedules"][player])
+
+    def _differentiate(self, samples: Samples) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Set each parameter's gradient to that of its own player's loss; losses and gradient norms per player."""
+        losses = self.objective.losses(self.fields, samples)
+        gradients = {}
+        for i, (player, parameters) in enumerate(self.parameters.items()):
+            more = i < len(self.parameters) - 1
+            gradients[player] = torch.autograd.grad(losses[player], parameters, retain_graph=more, allow_unused=True)
+        norms = {}
+        for player, parameters in self.parameters.items():
+            for parameter, gradient in zip(parameters, gradients[player], strict=True):
+                # A bias that only shifts V gets no gradient where only grad V matters.
+                parameter.grad = torch.zeros_like(parameter) if gradient is None else gradient
+            norms[player] = torch.nn.utils.get_total_norm([p.grad for p in parameters])
+        self._guard(losses, norms)
+        if self.clip is not None:
+            for player, parameters in self.parameters.items():
+                torch.nn.utils.clip_grads_with_norm_(parameters, self.clip, norms[player])
+        return {player: loss.detach() for player, loss in losses.items()}, norms
+
+    def _guard(self, losses: dict[str, Tensor], norms: dict[str, Tensor]) -> None:
+        checks = torch.stack([*losses.values(), *norms.values()])
+        if torch.isfinite(checks).all():
+            return
+        bad_loss = [player for player, loss in losses.items() if not torch.isfinite(loss)]
+        what = f"the loss of player {bad_loss[0]!r}" if bad_loss else "a gradient"
+        raise NonFiniteError(f"{what} is not finite; try a smaller optimizer.lr, or stepper.clip.")
+
+    def _update(self) -> None:
+        """One update of every player with the gradients in place, then the projection."""
+        for player, optimizer in self.optimizers.items():
+            optimizer.step()
+            if self.radius is not None:
+                project_on_ball(self.parameters[player], self.radius)
+
+    def _advance_schedules(self) -> None:
+        for schedule in self.schedules.values():
+            schedule.step()
+
+
+@torch.no_grad()
+def project_on_ball(parameters: list[Tensor], radius: float) -> None:
+    """Scale ``parameters`` back, as one vector, onto the Euclidean ball of ``radius`` around the origin."""
+    if radius <= 0:
+        raise InputError(f"stepper.radius is {radius}, but must be above 0.")
+    norm = torch.nn.utils.get_total_norm(parameters)
+    torch._foreach_mul_(parameters, torch.clamp(radius / norm.clamp_min(1e-30), max=1.0))

@@ -1,0 +1,40 @@
+"""Certify a saved controller again, on the same or on fresh evaluation states."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from ocp_torch.certificate import Certificate, CertificateSettings, Run, certify_fields, table
+from ocp_torch.config import build_problem
+from ocp_torch.controller import Controller, load_controller
+from ocp_torch.errors import InputError, require_integer
+
+log = logging.getLogger(__name__)
+
+
+def load_run(config: dict) -> Controller:
+    """The controller of ``config["run"]``, a run's folder or a file; a user's own problem comes from ``config["problem"]``,
+    that is from the command line, never from the file."""
+    path = Path(str(config["run"]))
+    if not path.exists():
+        raise InputError(
+            f"run is {str(path)!r}, which does not exist; give a run's folder or its controller.safetensors."
+        )
+    if path.is_dir():
+        path = path / "controller.safetensors"
+    problem = build_problem(config["problem"]) if config["problem"] else None
+    return load_controller(path, problem=problem)
+
+
+def certify_saved(controller: Controller, settings: CertificateSettings, seed: int | None = None) -> Certificate:
+    """Print and return the certificate of ``controller``; with its own ``seed`` the numbers are those of its run."""
+    before = controller.certificate
+    run = Run(**{name: before[name] for name in Run.__dataclass_fields__})
+    if seed is not None:
+        run = Run(**{**vars(run), "seed": require_integer("seed", seed, 0)})
+    certificate = certify_fields(
+        controller.problem, controller.fields, controller.bounds, controller.occupation, settings, run
+    )
+    log.info("\n%s", table(certificate.to_dict()))
+    return certificate

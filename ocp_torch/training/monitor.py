@@ -1,0 +1,102 @@
+"""What a run shows while it goes: a progress bar, the log, and TensorBoard."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+
+import torch
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from ocp_torch.certificate import Certificate
+from ocp_torch.steppers import StepReport
+
+log = logging.getLogger(__name__)
+
+
+class Silent:
+    """A monitor that shows nothing: for tests and for use as a library."""
+
+    def stepped(self, trainer, report: StepReport, log: bool) -> None:
+        """A step was taken; ``log`` says whether it is one to be recorded."""
+
+    def evaluated(self, trainer, certificate: Certificate) -> None:
+        """The bounds were looked at."""
+
+
+class Monitor(Silent):
+    """Progress bar (terminals only), log lines, and TensorBoard scalars in the groups bounds, performance, loss, lr,
+    gradient_norm and throughput."""
+
+    def __init__(self, folder: Path, steps: int, progress: bool = True) -> None:
+        self.writer = SummaryWriter(str(folder))
+        # disable=None: no bar where the output is not a terminal.
+        self.bar = tqdm(total=steps, unit="step", dynamic_ncols=True, disable=None if progress else True)
+        self._shown: dict[str, str] = {}
+        self._mark = (time.perf_counter(), 0)
+
+    def __enter__(self) -> Monitor:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.bar.close()
+        self.writer.close()
+
+    def stepped(self, trainer, report: StepReport, log: bool) -> None:
+        self.bar.update(trainer.step - self.bar.n)
+        if not log:
+            return
+        step = trainer.step
+        for player in report.losses:
+            self.writer.add_scalar(f"loss/{player}", float(report.losses[player]), step)
+            self.writer.add_scalar(f"gradient_norm/{player}", float(report.gradient_norms[player]), step)
+        for player, rate in trainer.stepper.learning_rates().items():
+            self.writer.add_scalar(f"lr/{player}", rate, step)
+        now, (then, before) = time.perf_counter(), self._mark
+        speed = (trainer.samples - before) / max(now - then, 1e-9)
+        self._mark = (now, trainer.samples)
+        self.writer.add_scalar("throughput/samples_per_second", speed, step)
+        self._show(**{"samples/s": f"{speed:,.0f}"})
+
+    def evaluated(self, trainer, certificate: Certificate) -> None:
+        self.record(certificate, trainer.step)
+        shown = {name: e for name, e in {**certificate.lower, **certificate.upper}.items() if e is not None}
+        values = {name: f"{shown[name].value:.6f}" for name in ("F_M", "J") if name in shown}
+        gap = certificate.gap["certified"]
+        if gap is not None:
+            values["gap"] = f"{100 * gap:.2f}%"
+        self._show(**values)
+        log.debug("step %d: %s", trainer.step, ", ".join(f"{k} {v}" for k, v in values.items()))
+
+    def record(self, certificate: Certificate, step: int) -> None:
+        """All numbers of ``certificate`` as scalars at ``step``."""
+        scalars = {f"bounds/{n}": e for g in ("lower", "upper") for n, e in getattr(certificate, g).items()}
+        scalars |= {f"performance/{n}": e for g in ("perf", "baseline") for n, e in getattr(certificate, g).items()}
+        for name, estimate in scalars.items():
+            if estimate is not None and estimate.finite:
+                self.writer.add_scalar(name, estimate.value, step)
+        if certificate.exact is not None:
+            self.writer.add_scalar("bounds/exact", certificate.exact, step)
+        for group in ("gap", "share"):
+            for kind in ("certified", "simulated"):
+                value = getattr(certificate, group)[kind]
+                if value is not None:
+                    self.writer.add_scalar(f"{group}/{kind}", value, step)
+
+    def figures(self, figures: dict, step: int) -> None:
+        """Matplotlib figures by name."""
+        for name, figure in figures.items():
+            self.writer.add_figure(f"fields/{name}", figure, step, close=False)
+
+    def hyper_parameters(self, flat: dict, certificate: Certificate) -> None:
+        """The run's settings beside its results, in TensorBoard's HParams tab."""
+        allowed = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in flat.items()}
+        results = {f"hparam/{k}": v for k, v in certificate.gap.items() if isinstance(v, float)}
+        # run_name="." keeps the hyper-parameters in this run instead of a sub-run.
+        self.writer.add_hparams(allowed, results or {"hparam/none": torch.nan}, run_name=".")
+
+    def _show(self, **values: str) -> None:
+        self._shown |= values
+        self.bar.set_postfix(self._shown, refresh=False)

@@ -1,0 +1,44 @@
+"""The trainer's own settings, validated where they are made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from ocp_torch.errors import InputError, require_choice, require_integer
+
+
+@dataclass(frozen=True)
+class TrainerSettings:
+    """Budget, precision, device and rhythm of a run. Raises `InputError`, naming the field, on a wrong value."""
+
+    steps: int  # updates of every player
+    batch: int  # states per draw
+    dtype: str  # float32 or float64, for networks and samples; certificates are always float64
+    device: str  # auto (a GPU where there is one), cpu or cuda
+    threads: int  # CPU threads; one is fastest for small networks
+    log_every: int  # steps between scalars
+    evaluate_every: int  # steps between quick bounds; 0 for none
+    checkpoint_every: int  # steps between checkpoints; 0 for one at the end
+    figures: bool  # draw figures at the end and in TensorBoard
+    progress: bool  # a progress bar, where the output is a terminal
+
+    def __post_init__(self) -> None:
+        for name, minimum in (("steps", 1), ("batch", 1), ("threads", 1), ("log_every", 1)):
+            require_integer(f"trainer.{name}", getattr(self, name), minimum)
+        for name in ("evaluate_every", "checkpoint_every"):
+            require_integer(f"trainer.{name}", getattr(self, name), 0)
+        require_choice("trainer.dtype", self.dtype, ("float32", "float64"))
+        require_choice("trainer.device", self.device, ("auto", "cpu", "cuda"))
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise InputError("trainer.device is 'cuda', but no CUDA device is available here; use auto or cpu.")
+
+    @property
+    def torch_dtype(self) -> torch.dtype:
+        return getattr(torch, self.dtype)
+
+    @property
+    def torch_device(self) -> torch.device:
+        available = "cuda" if torch.cuda.is_available() else "cpu"
+        return torch.device(available if self.device == "auto" else self.device)

@@ -1,0 +1,28 @@
+"""Certify a finished run again: python scripts/evaluate.py run=outputs/circle_pd/2026-01-01_12-00-00-000000"""
+
+from __future__ import annotations
+
+import hydra
+from omegaconf import DictConfig
+
+from ocp_torch.config import build_certificate_settings
+from ocp_torch.launch import job, launch
+from ocp_torch.training.evaluation import certify_saved, load_run
+
+
+def check(config: dict):
+    return load_run(config), build_certificate_settings(config)
+
+
+def evaluate(config: dict, folder) -> None:
+    controller, settings = check(config)
+    certify_saved(controller, settings, config["seed"])
+
+
+@hydra.main(version_base="1.3", config_path="../configs", config_name="evaluate")
+def main(config: DictConfig) -> None:
+    job(evaluate, config)
+
+
+if __name__ == "__main__":
+    launch(main, "evaluate", check)
