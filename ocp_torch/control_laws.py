@@ -22,15 +22,20 @@ Density = Callable[[Tensor], Tensor]
 CLOSED, SADDLE, NETWORK = "closed", "saddle", "network"
 
 
-def value_law(problem: Problem, value: Field) -> ControlLaw:
+class ValueLaw:
     """`u = grad R*(-B^T grad V / rho)` (Proposition 2): optimal when `V = V*`."""
 
-    def law(x: Tensor) -> Tensor:
-        _, gradient = calculus.value_and_gradient(value, x)
-        pull = torch.einsum("ndm,nd->nm", problem.control_matrix(x), gradient)
-        return problem.control_cost.argmax(-pull / problem.discount)
+    def __init__(self, problem: Problem, value: Field) -> None:
+        self.problem, self.value = problem, value
 
-    return law
+    def __call__(self, x: Tensor) -> Tensor:
+        _, gradient = calculus.value_and_gradient(self.value, x)
+        return self.control(self.problem.control_matrix(x), gradient)
+
+    def control(self, B: Tensor, gradient: Tensor) -> Tensor:
+        """The control where `grad V` is known already."""
+        pull = torch.einsum("ndm,nd->nm", B, gradient)
+        return self.problem.control_cost.argmax(-pull / self.problem.discount)
 
 
 def density_law(control_density: Field, occupation: Density) -> ControlLaw:
@@ -70,7 +75,7 @@ def control_laws(kind: str | None, problem: Problem, fields: Fields, bounds: Bou
     """The controllers trained fields give: ``value`` if they hold `V`, ``density`` if they hold `w`."""
     laws = {}
     if fields.value is not None:
-        laws["value"] = value_law(problem, fields.value)
+        laws["value"] = ValueLaw(problem, fields.value)
     if fields.control_density is not None:
         laws["density"] = density_law(fields.control_density, occupation_density(kind, problem, fields, bounds))
     return laws

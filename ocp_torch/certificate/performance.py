@@ -17,7 +17,7 @@ from ocp_torch import calculus, formulas
 from ocp_torch.calculus import Field
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.simulation import Dynamics, discounted_integral
-from ocp_torch.control_laws import ControlLaw
+from ocp_torch.control_laws import ControlLaw, ValueLaw
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samplers import evaluation_points
 from ocp_torch.samples import Samples
@@ -26,7 +26,7 @@ from ocp_torch.samples import Samples
 SIMULATION_REPLICATE = 1000
 # What is left of the discount when simulation stops, times the rate's supremum, relative to the answer.
 TAIL = 2e-5
-# Integration is refined until step-halving differs by less, relative to the answer, or the budget is used.
+# A trajectory is refined until halving its step changes it by less, relative to the answer, or the budget is used.
 TOLERANCE = 5e-5
 MAX_DOUBLINGS = 4
 
@@ -44,11 +44,13 @@ def _dynamics(problem: Problem, law: ControlLaw, value: Field | None) -> Dynamic
     cost, rho = problem.control_cost, problem.discount
 
     def dynamics(x: Tensor) -> tuple[Tensor, Tensor]:
-        u = law(x)
         if value is None:
+            u = law(x)
             return problem.velocity(x, u), problem.state_cost(x) + cost.cost(u)
         samples = Samples.of(problem, x, divergences=False)
         v, gradient = calculus.value_and_gradient(value, x)
+        own = isinstance(law, ValueLaw) and law.value is value
+        u = law.control(samples.B, gradient) if own else law(x)
         velocity = samples.a + torch.einsum("ndm,nm->nd", samples.B, u)
         return velocity, -formulas.bellman_slack(samples, v, gradient, u, cost, rho)
 
@@ -84,13 +86,19 @@ def simulate_performance(
     horizon = max(math.log(max(largest_rate / (TAIL * size), math.e)), 1.0) / rho
     speed = float(velocity.norm(dim=-1).max())
     steps = max(8, 2 * math.ceil(0.5 * horizon * max(rho / 0.4, speed / 0.2)))
-    coarse, _ = discounted_integral(dynamics, x0, rho, horizon, steps // 2)
+    integrate = lambda starts, count: discounted_integral(dynamics, starts, rho, horizon, count)
+    coarse, _ = integrate(x0, steps // 2)
+    fine, end = integrate(x0, steps)
+    change = (fine - coarse).abs()
     for _ in range(MAX_DOUBLINGS):
-        fine, end = discounted_integral(dynamics, x0, rho, horizon, steps)
-        halving = float((mu0 * (fine - coarse).abs()).mean())
-        if halving <= TOLERANCE * size or not math.isfinite(halving):
+        # Only the trajectories that still change are refined: those that pass a kink of the controller.
+        active = change > TOLERANCE * size
+        if not active.any():
             break
-        coarse, steps = fine, 2 * steps
+        steps *= 2
+        finer, end[active] = integrate(x0[active], steps)
+        change[active], fine[active] = (finer - fine[active]).abs(), finer
+    halving = float((mu0 * change).mean())
     with torch.no_grad():
         largest_rate = max(largest_rate / 2.0, float(dynamics(end)[1].abs().max()))
     tail = math.exp(-rho * horizon) * largest_rate
