@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib
 import inspect
+from collections.abc import Callable
 
 import torch
+from torch import nn
 
 from ocp_torch.bounds import resolve_bounds
-from ocp_torch.certificate import CertificateSettings
+from ocp_torch.certificate import CertificateSettings, StageSettings
 from ocp_torch.controller import problem_name
 from ocp_torch.errors import InputError, nearest, require_choice, require_integer, require_number
 from ocp_torch.fields import MODELS, Fields
@@ -69,27 +71,29 @@ def build_trainer(config: dict) -> Trainer:
     name = require_choice("method.name", method.pop("name", None), METHODS)
     bounds = resolve_bounds(problem, **{field: method.pop(field, None) for field in BOUND_FIELDS})
     objective = call(METHODS[name], "method", method, problem=problem, bounds=bounds)
-    fields = build_fields(problem, objective.fields, config["model"], seed)
+    network = build_network(config["model"])
+    fields = Fields.build(problem, objective.fields, network, derive_seed(seed, WEIGHTS_STREAM))
     fields = fields.to(dtype=settings.torch_dtype, device=settings.torch_device)
     stepper = _build_stepper(config, fields, objective, settings.steps)
     average = call(averaged, "averaging", config["averaging"], fields=fields)
     sampler_name = require_choice("sampler.name", config["sampler"].get("name"), SAMPLERS)
     sampler = SAMPLERS[sampler_name](problem.dim, seed, settings.torch_dtype)
     names = (problem_name(problem), name)
-    return Trainer(problem, fields, objective, bounds, stepper, average, sampler, settings, seed, names)
+    return Trainer(problem, fields, objective, bounds, stepper, average, sampler, settings, network, seed, names)
 
 
-def build_fields(problem: Problem, names: tuple[str, ...], model: dict, seed: int) -> Fields:
-    """Fresh fields of the configured ``model``."""
+def build_network(model: dict) -> Callable[..., nn.Module]:
+    """A maker of networks of the configured ``model``, given what a field needs of them."""
     network = MODELS[require_choice("model.name", model.get("name"), MODELS)]
     options = {k: v for k, v in model.items() if k != "name"}
-    make = lambda **form: call(network, "model", options, **form)
-    return Fields.build(problem, names, make, derive_seed(seed, WEIGHTS_STREAM))
+    return lambda **form: call(network, "model", options, **form)
 
 
 def build_certificate_settings(config: dict) -> CertificateSettings:
     """How much the final certificate may cost."""
-    return call(CertificateSettings, "certificate", config["certificate"])
+    section = dict(config["certificate"])
+    stage = call(StageSettings, "certificate.stage", section.pop("stage", None) or {})
+    return call(CertificateSettings, "certificate", section, stage=stage)
 
 
 def _build_stepper(config: dict, fields: Fields, objective, steps: int):

@@ -56,3 +56,9 @@ def primal_integrand(
     """The integrand of `J`: `f mu + mu R(w/mu) + C_V max(residual, 0)`, ``(N,)``; 0 for `f mu` where `f = 0`."""
     running = torch.where(samples.f > 0, samples.f * mu, 0.0) + cost.perspective(w, mu)
     return running + value_bound * residual.clamp_min(0.0)
+
+
+def lagrange_term(samples: Samples, value: Tensor, gradient: Tensor, mu: Tensor, w: Tensor, rho: float) -> Tensor:
+    """`V (mu0 - mu) + grad V . (a mu + B w) / rho`, ``(N,)``: the multiplier's part of the Lagrangian (equation 14)."""
+    transported = along(samples, gradient) * mu + (pull_back(samples, gradient) * w).sum(dim=-1)
+    return value * (samples.mu0 - mu) + transported / rho

@@ -56,7 +56,20 @@ class Samples:
             raise InputError(f"{who} needs the divergences of a and B, which this problem does not give.")
         return self.div_a, self.div_B
 
-    def to(self, dtype: torch.dtype, device: torch.device) -> Samples:
-        """The same samples in another precision or on another device."""
-        moved = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Samples(**{k: None if v is None else v.to(dtype=dtype, device=device) for k, v in moved.items()})
+    def take(self, index: Tensor | slice) -> Samples:
+        """The samples at the rows ``index``."""
+        return Samples(**{k: None if v is None else v[index] for k, v in self._columns()})
+
+    def split(self, chunk: int) -> list[Samples]:
+        """The samples in pieces of at most ``chunk`` states."""
+        rows = torch.arange(len(self), device=self.x.device).split(chunk)
+        return [self.take(slice(int(part[0]), int(part[-1]) + 1)) for part in rows]
+
+    @staticmethod
+    def concatenate(pieces: list[Samples]) -> Samples:
+        """All ``pieces`` as one batch."""
+        columns = {k: [getattr(p, k) for p in pieces] for k, _ in pieces[0]._columns()}
+        return Samples(**{k: None if v[0] is None else torch.cat(v) for k, v in columns.items()})
+
+    def _columns(self) -> list[tuple[str, Tensor | None]]:
+        return [(f.name, getattr(self, f.name)) for f in fields(self)]

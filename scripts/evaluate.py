@@ -5,13 +5,13 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 
-from ocp_torch.config import build_certificate_settings
 from ocp_torch.launch import job, launch
-from ocp_torch.training.evaluation import certify_saved, load_run
+from ocp_torch.training.evaluation import certify_saved, load_run, settings_for
 
 
 def check(config: dict):
-    return load_run(config), build_certificate_settings(config)
+    controller = load_run(config)
+    return controller, settings_for(controller, config)
 
 
 def evaluate(config: dict, folder) -> None:

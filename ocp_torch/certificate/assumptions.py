@@ -3,7 +3,7 @@ r"""The assumptions the bounds rest on, checked under the learned controller as 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import torch
 from torch import Tensor
@@ -37,6 +37,10 @@ class Assumptions:
     @property
     def hold(self) -> bool:
         return self.occupation_holds and self.value_holds and self.control_holds
+
+    def with_value_bound(self, C_V: float) -> Assumptions:
+        """With a `C_V` that was proved for the controller at hand."""
+        return replace(self, C_V=C_V, value_holds=True, control_holds=True)
 
     def to_dict(self) -> dict:
         """JSON form; a supremum that grew beyond all numbers is null."""
@@ -86,7 +90,7 @@ def check_assumptions(
 ) -> tuple[Assumptions, list[str]]:
     """Hold what was measured against ``bounds``; ``uses`` says whether a lower and an upper side are in the certificate."""
     uses_M, uses_C_V = uses
-    warnings = list(bounds.warnings)
+    warnings: list[str] = []
     M_holds, why = _occupation_holds(problem, bounds, occupation_estimate)
     if uses_M and not M_holds:
         warnings.append(f"F_M is not used: {why}.")

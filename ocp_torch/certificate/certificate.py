@@ -29,7 +29,8 @@ class Run:
 class Certificate:
     """`F_M <= OPT <= Perf(u) <= J`: each number an `Estimate`, or `None` where it does not apply.
 
-    ``lower``, ``upper``, ``perf`` and ``baseline`` map the names of `certificate.json` to estimates.
+    ``lower``, ``upper``, ``perf`` and ``baseline`` map the names of `certificate.json` to estimates; ``searches`` says how
+    each supremum behind them was found.
     """
 
     run: Run
@@ -40,6 +41,7 @@ class Certificate:
     baseline: dict[str, Estimate | None]
     assumptions: Assumptions
     warnings: list[str] = field(default_factory=list)
+    searches: list[str] = field(default_factory=list)
 
     @property
     def best_lower(self) -> tuple[str, float] | None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import torch
 from torch import nn
@@ -11,13 +12,20 @@ from torch import nn
 from ocp_torch.bounds import Bounds
 from ocp_torch.certificate.assumptions import check_assumptions, estimated_sup_occupation
 from ocp_torch.certificate.certificate import Certificate, Run
-from ocp_torch.certificate.estimate import replicated_samples
+from ocp_torch.certificate.estimate import Estimate, replicated_samples
+from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.performance import Simulated, simulate_performance
-from ocp_torch.certificate.sides import lower_side, upper_side
+from ocp_torch.certificate.sides import LowerSide, lower_side, upper_side
+from ocp_torch.certificate.stage import StageSettings, fit_closed_loop
 from ocp_torch.control_laws import control_laws, occupation_density, zero_law
-from ocp_torch.errors import require_integer
+from ocp_torch.errors import InputError, require_integer
 from ocp_torch.fields.fields import Fields
+from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.problem import Problem
+from ocp_torch.samples import Samples
+
+# The zero controller costs a fraction of a learned one to simulate, and has no control variate.
+BASELINE_FACTOR = 8
 
 
 @dataclass(frozen=True)
@@ -26,14 +34,24 @@ class CertificateSettings:
 
     points: int = 8192  # states per replicate for the integrals and sampled suprema
     replicates: int = 8  # independent randomised point sets behind each standard error
-    trajectories: int = 128  # simulated starts per replicate; 0 skips every simulation
+    trajectories: int = 256  # simulated starts per replicate; 0 skips every simulation
     ascents: int = 32  # local ascents from the worst sampled states
+    stage: StageSettings = field(default_factory=StageSettings)  # the fit to the closed loop
 
     def __post_init__(self) -> None:
         require_integer("certificate.points", self.points, 1)
         require_integer("certificate.replicates", self.replicates, 2)
         require_integer("certificate.trajectories", self.trajectories, 0)
         require_integer("certificate.ascents", self.ascents, 1)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What training hands over: the fields, how they give `mu` (see `control_laws`), and the network they are made of."""
+
+    fields: Fields
+    occupation: str | None
+    network: Callable[..., nn.Module]
 
 
 def in_float64(fields: Fields) -> Fields:
@@ -43,64 +61,104 @@ def in_float64(fields: Fields) -> Fields:
 
 
 def certify_fields(
-    problem: Problem,
-    fields: Fields,
-    bounds: Bounds,
-    occupation: str | None,
-    settings: CertificateSettings,
-    run: Run,
+    problem: Problem, trained: Trained, bounds: Bounds, settings: CertificateSettings, run: Run
 ) -> Certificate:
-    """The certificate of trained ``fields``, on states that no training sampler draws.
+    """The certificate of ``trained`` fields, on states that no training sampler draws.
 
-    ``occupation`` says how they give `mu` (see `control_laws`), `None` where they hold no `w`.
+    Both controllers are simulated; the better one is handed out, and the certification stage speaks of that one.
     """
-    fields = in_float64(fields)
+    fields, occupation = in_float64(trained.fields), trained.occupation
     seed, count = run.seed, settings.replicates
     has_value, has_density = fields.value is not None, fields.control_density is not None
-    sets = replicated_samples(problem, settings.points, count, seed, divergences=has_density)
+    sets = replicated_samples(problem, settings.points, count, seed, divergences=True)
     lower = lower_side(problem, fields.value, sets, bounds.M, settings.ascents) if has_value else None
     J = G = None
-    if has_density:
+    if has_density and sets[0].div_B is not None and sets[0].div_a is not None:
         mu = occupation_density(occupation, problem, fields, bounds)
         J, G = upper_side(problem, fields.control_density, mu, sets, bounds.C_V)
     laws = control_laws(occupation, problem, fields, bounds)
     simulated: dict[str, Simulated] = {}
-    zero = None
-    sup_control = sup_occupation = None
+    zero = sup_control = sup_occupation = stage = None
+    warnings: list[str] = []
     if settings.trajectories:
         initial = lower.initial if lower else None
         for name, law in laws.items():
             simulated[name] = simulate_performance(
                 problem, law, settings.trajectories, count, seed, value=fields.value, initial=initial
             )
-        zero = simulate_performance(problem, zero_law(problem), settings.trajectories, count, seed).perf
-    best = min(simulated, key=lambda n: simulated[n].perf.above, default=None)
+        zero = simulate_performance(problem, zero_law(problem), BASELINE_FACTOR * settings.trajectories, count, seed).perf
+    finite = {name: s for name, s in simulated.items() if s.perf.finite}
+    best = min(finite, key=lambda n: finite[n].perf.above, default=next(iter(laws)))
+    if settings.stage.steps:
+        stage, notes = certification_stage(problem, trained, fields, bounds, settings, sets, best, seed)
+        warnings += notes
     with torch.no_grad():
-        if laws:
-            law = laws[best or next(iter(laws))]
-            sup_control = max(float(law(samples.x[:4096]).norm(dim=-1).max()) for samples in sets)
-        if best is not None:
-            sup_occupation = estimated_sup_occupation(problem, laws[best], simulated[best].end_states)
-    assumptions, warnings = check_assumptions(
-        problem,
-        bounds,
-        sup_occupation,
-        sup_control,
-        simulated[best].largest_value if best else None,
-        uses=(has_value, has_density),
+        sup_control = max(float(laws[best](samples.x[:4096]).norm(dim=-1).max()) for samples in sets)
+        if best in finite:
+            sup_occupation = estimated_sup_occupation(problem, laws[best], finite[best].end_states)
+    largest_value = finite[best].largest_value if best in finite else None
+    assumptions, notes = check_assumptions(
+        problem, bounds, sup_occupation, sup_control, largest_value, uses=(has_value, J is not None)
     )
+    warnings = list(bounds.warnings) + notes + warnings
+    J, assumptions = _tighter_J(J, stage, assumptions)
     perf = {name: simulated[name].perf if name in simulated else None for name in ("value", "density")}
     warnings += _plausibility(perf, zero)
     return Certificate(
         run=run,
         exact=problem.exact_optimum,
         lower={"F_M": lower.F_M if lower else None, "shifted": lower.shifted if lower else None},
-        upper={"J": J, "G": G, "lagrangian": None},
+        upper={"J": J, "G": G, "lagrangian": stage.lagrangian if stage else None},
         perf=perf,
         baseline={"zero": zero},
         assumptions=assumptions,
         warnings=warnings,
+        searches=_searches(lower, stage),
     )
+
+
+def certification_stage(
+    problem: Problem,
+    trained: Trained,
+    fields: Fields,
+    bounds: Bounds,
+    settings: CertificateSettings,
+    sets: list[Samples],
+    kind: str,
+    seed: int,
+) -> tuple[ClosedLoopBounds | None, list[str]]:
+    """Fit `mu` to the closed loop of the controller ``kind`` and evaluate its bounds; ``fields`` are float64 copies."""
+    if sets[0].div_a is None or sets[0].div_B is None:
+        return None, ["no upper bound without simulation: this problem gives no divergences of a and B."]
+    rough = control_laws(trained.occupation, problem, trained.fields, bounds)[kind]
+    try:
+        fitted = fit_closed_loop(problem, rough, trained.fields, trained.network, bounds, settings.stage, seed)
+    except ArithmeticError as error:
+        return None, [f"the certification stage failed: {error}"]
+    fitted = in_float64(fitted)
+    loop = ClosedLoop(problem, control_laws(trained.occupation, problem, fields, bounds)[kind])
+    loop_sets = [Samples.concatenate([Samples.of(loop, x) for x in s.x.split(8192)]) for s in sets]
+    value = fields.value if fields.value is not None else fitted.value
+    return closed_loop_bounds(loop, value, fitted.log_occupation, loop_sets, settings.ascents, kind), []
+
+
+def _tighter_J(J: Estimate | None, stage: ClosedLoopBounds | None, assumptions):
+    """The smaller `J` whose `C_V` holds, and the assumptions with the `C_V` that was used for it."""
+    if stage is None:
+        return J, assumptions
+    trained_is_best = J is not None and J.finite and assumptions.value_holds and J.value <= stage.J.value
+    return (J, assumptions) if trained_is_best else (stage.J, assumptions.with_value_bound(stage.C_V))
+
+
+def _searches(lower: LowerSide | None, stage: ClosedLoopBounds | None) -> list[str]:
+    """How each sampled supremum was found."""
+    found = {"sup max(Q, 0)": lower.largest_slack} if lower else {}
+    if stage is not None:
+        found |= {"eps_hi": stage.eps_hi, "eps_lo": stage.eps_lo}
+    return [
+        f"{name} = {max(e.value, 0.0):.3e}, the largest of {e.points:,} sampled states and {e.ascents} ascents"
+        for name, e in found.items()
+    ]
 
 
 def _plausibility(perf: dict, zero) -> list[str]:

@@ -15,6 +15,9 @@ from ocp_torch.extremum import Extremum, supremum
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
 
+# States evaluated at once, so that memory stays bounded.
+CHUNK = 8192
+
 
 @dataclass(frozen=True)
 class LowerSide:
@@ -51,7 +54,7 @@ def lower_side(problem: Problem, value: Field, sets: list[Samples], M: float, as
     """
     penalised, initial, worst = [], [], None
     for samples in sets:
-        v, gradient = _chunked_gradient(value, samples.x)
+        v, gradient = chunked_gradient(value, samples.x)
         slack = formulas.hjb_slack(samples, v, gradient, problem.control_cost, problem.discount)
         initial.append(integral(samples, v * samples.mu0))
         penalised.append(integral(samples, v * samples.mu0 - M * slack.clamp_min(0.0)))
@@ -74,7 +77,7 @@ def upper_side(
     """
     J, G = [], []
     for samples in sets:
-        parts = [_upper_integrands(problem, control_density, occupation, s, C_V) for s in split(samples)]
+        parts = [_upper_integrands(problem, control_density, occupation, s, C_V) for s in samples.split(CHUNK)]
         J.append(integral(samples, torch.cat([j for j, _ in parts])))
         if problem.driftless:
             G.append(integral(samples, torch.cat([g for _, g in parts])))
@@ -100,17 +103,8 @@ def _upper_integrands(problem, control_density, occupation, samples: Samples, C_
     return formulas.primal_integrand(samples, w, mu, residual, cost, C_V), None
 
 
-def split(samples: Samples, chunk: int = 8192) -> list[Samples]:
-    """``samples`` in pieces of at most ``chunk`` states."""
-    if len(samples) <= chunk:
-        return [samples]
-    columns = {name: getattr(samples, name) for name in Samples.__dataclass_fields__}
-    pieces = {name: [None] * len(samples) if c is None else c.split(chunk) for name, c in columns.items()}
-    count = len(samples.x.split(chunk))
-    return [Samples(**{name: piece[i] for name, piece in pieces.items()}) for i in range(count)]
-
-
 @torch.no_grad()
-def _chunked_gradient(value: Field, x: Tensor, chunk: int = 8192) -> tuple[Tensor, Tensor]:
+def chunked_gradient(value: Field, x: Tensor, chunk: int = CHUNK) -> tuple[Tensor, Tensor]:
+    """`V` and `grad V` at many states."""
     pairs = [calculus.value_and_gradient(value, part) for part in x.split(chunk)]
     return torch.cat([v for v, _ in pairs]), torch.cat([g for _, g in pairs])

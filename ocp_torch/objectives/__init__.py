@@ -3,8 +3,8 @@
 from ocp_torch.objectives.dual import Dual
 from ocp_torch.objectives.objective import Objective
 from ocp_torch.objectives.primal import primal
-from ocp_torch.objectives.saddle import Saddle
+from ocp_torch.objectives.saddle import saddle
 
-METHODS = {"dual": Dual, "primal": primal, "pd": Saddle}
+METHODS = {"dual": Dual, "primal": primal, "pd": saddle}
 
-__all__ = ["METHODS", "Dual", "Objective", "Saddle", "primal"]
+__all__ = ["METHODS", "Dual", "Objective", "primal", "saddle"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from ocp_torch.certificate import Certificate, CertificateSettings, Run, certify_fields, table
-from ocp_torch.config import build_problem
+from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields, table
+from ocp_torch.config import build_certificate_settings, build_network, build_problem
 from ocp_torch.controller import Controller, load_controller
 from ocp_torch.errors import InputError, require_integer
 
@@ -27,14 +27,21 @@ def load_run(config: dict) -> Controller:
     return load_controller(path, problem=problem)
 
 
+def settings_for(controller: Controller, config: dict) -> CertificateSettings:
+    """The settings of the controller's own run, with what ``config`` sets in their place."""
+    own = controller.config["certificate"]
+    changed = {k: v for k, v in config["certificate"].items() if v is not None and k != "stage"}
+    stage = {k: v for k, v in (config["certificate"].get("stage") or {}).items() if v is not None}
+    return build_certificate_settings({"certificate": {**own, **changed, "stage": {**own.get("stage", {}), **stage}}})
+
+
 def certify_saved(controller: Controller, settings: CertificateSettings, seed: int | None = None) -> Certificate:
     """Print and return the certificate of ``controller``; with its own ``seed`` the numbers are those of its run."""
     before = controller.certificate
     run = Run(**{name: before[name] for name in Run.__dataclass_fields__})
     if seed is not None:
         run = Run(**{**vars(run), "seed": require_integer("seed", seed, 0)})
-    certificate = certify_fields(
-        controller.problem, controller.fields, controller.bounds, controller.occupation, settings, run
-    )
+    trained = Trained(controller.fields, controller.occupation, build_network(controller.model))
+    certificate = certify_fields(controller.problem, trained, controller.bounds, settings, run)
     log.info("\n%s", table(certificate.to_dict()))
     return certificate

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
+from torch import nn
+
 from ocp_torch.bounds import Bounds
-from ocp_torch.certificate import Certificate, CertificateSettings, Run, certify_fields
+from ocp_torch.certificate import Certificate, CertificateSettings, Run, StageSettings, Trained, certify_fields
 from ocp_torch.fields import Fields
 from ocp_torch.objectives import Objective
 from ocp_torch.problems import Problem
@@ -16,7 +19,7 @@ from ocp_torch.training.checkpoint import load_checkpoint, save_checkpoint
 from ocp_torch.training.settings import TrainerSettings
 
 # What a look at the bounds during training costs: enough for a curve, not for a claim.
-QUICK = CertificateSettings(points=1024, replicates=2, trajectories=0, ascents=8)
+QUICK = CertificateSettings(points=1024, replicates=2, trajectories=0, ascents=8, stage=StageSettings(steps=0))
 
 
 class Trainer:
@@ -33,12 +36,13 @@ class Trainer:
         average,
         sampler,
         settings: TrainerSettings,
+        network: Callable[..., nn.Module],
         seed: int,
         names: tuple[str, str],
     ) -> None:
         self.problem, self.fields, self.objective, self.bounds = problem, fields, objective, bounds
         self.stepper, self.average, self.sampler, self.settings = stepper, average, sampler, settings
-        self.seed, self.names = seed, names
+        self.network, self.seed, self.names = network, seed, names
         self.step, self.samples, self.seconds = 0, 0, 0.0
 
     @property
@@ -76,8 +80,8 @@ class Trainer:
 
     def certify(self, settings: CertificateSettings) -> Certificate:
         """The certificate of the averaged fields as they stand."""
-        occupation = self.objective.occupation
-        return certify_fields(self.problem, self.averaged_fields, self.bounds, occupation, settings, self.run)
+        trained = Trained(self.averaged_fields, self.objective.occupation, self.network)
+        return certify_fields(self.problem, trained, self.bounds, settings, self.run)
 
     def state_dict(self) -> dict:
         """Everything needed to go on exactly."""

@@ -1,0 +1,82 @@
+r"""Upper bounds on `Perf(u)` for one given controller, from any `V` and any `mu >= 0`, without simulation.
+
+Write `Q_u` for the Bellman slack of `V` and `r = mu0 - mu - div(mu g_u) / rho` for the Liouville residual of `mu`, and let
+`mu^u` be the true occupation density, so that `Perf(u) = E_{mu^u}[f + R(u)]`.
+
+1. Along the closed loop `d/dt (e^{-rho t} V(x_t)) = -rho e^{-rho t} (Q_u + f + R(u))(x_t)`. Integrated from 0 to infinity:
+   `V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt`, hence `V - eps_lo <= V^u <= V + eps_hi` with
+   `eps_lo = sup max(Q_u, 0)` and `eps_hi = sup max(-Q_u, 0)`.
+2. `V^u` has Bellman slack 0, so by parts `E[V^u mu0] = E[(f + R(u)) mu + V^u r]` for every `mu`: with `V^u = V + (V^u - V)`,
+   `Perf(u) = E[(f + R(u)) mu + V r] + E[(V^u - V) r]`, and by 1 the last term is at most
+   `eps_hi E[max(r, 0)] + eps_lo E[max(-r, 0)]`. That sum is the **Lagrangian bound**: wrong by a product of two errors.
+3. By parts again `E[(f + R(u)) mu + V r] = E[V mu0 - mu Q_u]`: the same number with far less variance.
+4. `0 <= V^u <= C_V` with `C_V = sup V + eps_hi` gives `J = E[(f + R(u)) mu + C_V max(r, 0)]`, with `w = mu u`, for the
+   smallest `C_V` that these facts prove for this very controller.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from ocp_torch import formulas
+from ocp_torch.calculus import Field
+from ocp_torch.certificate.estimate import Estimate, integral
+from ocp_torch.certificate.sides import CHUNK, chunked_gradient, slack_function
+from ocp_torch.extremum import Extremum, supremum
+from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.samples import Samples
+
+
+@dataclass(frozen=True)
+class ClosedLoopBounds:
+    """The bounds of one closed loop and the suprema they rest on, as found."""
+
+    lagrangian: Estimate
+    J: Estimate
+    C_V: float
+    eps_hi: Extremum
+    eps_lo: Extremum
+    residual: float  # E[|r|]
+
+
+def closed_loop_bounds(
+    loop: ClosedLoop, value: Field, log_occupation: Field, sets: list[Samples], ascents: int, controller: str
+) -> ClosedLoopBounds:
+    """Evaluate both bounds on ``sets`` of samples of ``loop``; the suprema are sampled on them and climbed."""
+    values = [_integrands(loop, value, log_occupation, samples) for samples in sets]
+    states = torch.cat([samples.x for samples in sets])
+    slack_all = torch.cat([slack for *_, slack in values])
+    largest = torch.cat([v for v, *_ in values]).max()
+    slack = slack_function(loop, value)
+    eps_lo = _climbed(slack, slack_all, states, ascents)
+    eps_hi = _climbed(lambda x: -slack(x), -slack_all, states, ascents)
+    C_V = float(largest) + eps_hi.value
+    lagrangian, J, residual = [], [], []
+    for samples, (v, low_variance, r, _) in zip(sets, values, strict=True):
+        gain, loss = r.clamp_min(0.0), (-r).clamp_min(0.0)
+        lagrangian.append(integral(samples, low_variance + eps_hi.value * gain + eps_lo.value * loss))
+        J.append(integral(samples, low_variance - v * r + C_V * gain))
+        residual.append(integral(samples, r.abs()))
+    mean_residual = sum(residual) / len(residual)
+    return ClosedLoopBounds(
+        Estimate.of(lagrangian, controller=controller), Estimate.of(J), C_V, eps_hi, eps_lo, mean_residual
+    )
+
+
+@torch.no_grad()
+def _integrands(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples):
+    """`V`, `V mu0 - mu Q_u`, `r` and `Q_u` at the states of ``samples``."""
+    v, gradient = chunked_gradient(value, samples.x)
+    slack = formulas.hjb_slack(samples, v, gradient, loop.control_cost, loop.discount)
+    pairs = [formulas.drifting_loss(part, log_occupation, loop.discount) for part in samples.split(CHUNK)]
+    mu, spent = torch.cat([m for m, _ in pairs]), torch.cat([s for _, s in pairs])
+    return v, v * samples.mu0 - mu * slack, samples.mu0 - spent, slack
+
+
+def _climbed(function, values: torch.Tensor, states: torch.Tensor, ascents: int) -> Extremum:
+    """`sup max(function, 0)`: from the largest of the sampled ``values``, upwards."""
+    start = states[values.topk(min(ascents, len(values))).indices]
+    found = supremum(function, start, ascents=ascents)
+    return Extremum(max(found.value, 0.0), found.x, len(states), found.ascents)

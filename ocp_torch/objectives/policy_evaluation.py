@@ -1,0 +1,36 @@
+r"""Policy evaluation by least squares: `V^u` and `mu^u` of a closed loop, two linear equations with smooth losses."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from ocp_torch import calculus, formulas
+from ocp_torch.bounds import Bounds
+from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
+from ocp_torch.objectives.objective import Objective
+from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.samples import Samples
+
+
+class PolicyEvaluation(Objective):
+    r"""`min_mu E[r^2]` and, where a value function is wanted too, `min_V E[(Q_u / s)^2]`, on samples of a `ClosedLoop`.
+
+    `r = mu0 - mu (1 + (grad log mu . g_u + div g_u) / rho)` is the Liouville residual, `Q_u` the Bellman slack and `s` the
+    scale of the `V` network: the strong forms of P(u) and D(u) (section 5.4 of the paper). The two players do not
+    interact; there is no hinge and no game.
+    """
+
+    needs_divergences = True
+
+    def __init__(self, problem: ClosedLoop, bounds: Bounds, with_value: bool) -> None:
+        super().__init__(problem, bounds)
+        self.players = {"occupation": (LOG_OCCUPATION,)} | ({"value": (VALUE,)} if with_value else {})
+
+    def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
+        _, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
+        losses = {"occupation": samples.mean((samples.mu0 - loss).square())}
+        if "value" in self.players:
+            value, gradient = calculus.value_and_gradient(fields.value, samples.x)
+            slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
+            losses["value"] = samples.mean((slack / getattr(fields.value, "scale", 1.0)).square())
+        return losses

@@ -1,0 +1,50 @@
+"""A problem whose controller is fixed: an uncontrolled system, on which policy evaluation is the same mathematics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ocp_torch import calculus
+from ocp_torch.problems.problem import Problem
+
+
+class ClosedLoop(Problem):
+    r"""`dx/dt = g_u(x) = a + B u(x)` with running cost `f + R(u)` and no control left (`B = 0`, `m = 1`).
+
+    Its value function is `V^u`, its occupation density `mu^u`, its optimum `Perf(u)`; the HJB slack of any `V` on it is
+    the Bellman slack `Q_u`, its Liouville residual that of `u` (problems P(u) and D(u), section 5.4 of the paper).
+    """
+
+    def __init__(self, problem: Problem, law: Callable[[Tensor], Tensor]) -> None:
+        super().__init__(dim=problem.dim, control_dim=1, discount=problem.discount, exponent=problem.exponent)
+        self.problem, self.law = problem, law
+
+    @property
+    def driftless(self) -> bool:
+        return False
+
+    def state_cost(self, x: Tensor) -> Tensor:
+        return self.problem.state_cost(x) + self.problem.control_cost.cost(self.law(x))
+
+    def drift(self, x: Tensor) -> Tensor:
+        return self.problem.velocity(x, self.law(x))
+
+    def drift_divergence(self, x: Tensor) -> Tensor | None:
+        """`div g_u = div a + (div B) . u + sum_k (d u_k along column k of B)`: `m` tangents through the controller."""
+        div_a, div_B = self.problem.drift_divergence(x), self.problem.control_divergence(x)
+        if div_a is None or div_B is None:
+            return None
+        _, flux = calculus.control_flux_divergence(self.law, x, self.problem.control_matrix(x), div_B)
+        return div_a + flux
+
+    def control_matrix(self, x: Tensor) -> Tensor:
+        return x.new_zeros(len(x), self.dim, 1)
+
+    def control_divergence(self, x: Tensor) -> Tensor:
+        return x.new_zeros(len(x), 1)
+
+    def initial_density(self, x: Tensor) -> Tensor:
+        return self.problem.initial_density(x)

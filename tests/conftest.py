@@ -1,0 +1,27 @@
+"""What every test shares: one thread, repeatable hypothesis examples, the devices there are, and the zoo as a fixture."""
+
+import pytest
+import torch
+import zoo
+from hypothesis import settings
+
+# The same examples on every run: a failure is then a change in the code, never luck.
+settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
+settings.load_profile("repeatable")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread():
+    """Small networks are faster on one thread, and sums are then added in one order."""
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(params=["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"])
+def device(request) -> torch.device:
+    return torch.device(request.param)
+
+
+@pytest.fixture
+def problem(request):
+    """The problem of the zoo whose name a test is parametrised with (``zoo.on``)."""
+    return zoo.build(request.param)
