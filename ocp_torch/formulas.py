@@ -58,7 +58,7 @@ def primal_integrand(
     return running + value_bound * residual.clamp_min(0.0)
 
 
-def lagrange_term(samples: Samples, value: Tensor, gradient: Tensor, mu: Tensor, w: Tensor, rho: float) -> Tensor:
-    """`V (mu0 - mu) + grad V . (a mu + B w) / rho`, ``(N,)``: the multiplier's part of the Lagrangian (equation 14)."""
+def multiplier_term(samples: Samples, value: Tensor, gradient: Tensor, mu: Tensor, w: Tensor, rho: float) -> Tensor:
+    """`-V mu + grad V . (a mu + B w) / rho`, ``(N,)``: what the multiplier `V` charges for `mu` and `w`."""
     transported = along(samples, gradient) * mu + (pull_back(samples, gradient) * w).sum(dim=-1)
-    return value * (samples.mu0 - mu) + transported / rho
+    return transported / rho - value * mu

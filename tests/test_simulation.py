@@ -8,12 +8,11 @@ import torch
 import zoo
 
 from ocp_torch.certificate.assumptions import occupation_along_flow
-from ocp_torch.certificate.performance import simulate_performance
+from ocp_torch.certificate.performance import SIMULATION_REPLICATE, simulate_performance
 from ocp_torch.certificate.simulation import discounted_integral
 from ocp_torch.samplers import evaluation_points
 
 TURN = 2.0 * math.pi
-smooth_quadratic = zoo.on([name for name in zoo.SMOOTH if "q=2" in name or "mu0" in name or "B(x)" in name[-4:]])
 
 
 def test_the_integrator_has_order_four():
@@ -52,7 +51,7 @@ def wrong_law(problem):
     return lambda x: problem.exact_control(x) + mistake(x)
 
 
-@zoo.on(zoo.SMOOTH)
+@zoo.on((*zoo.FEW_SMOOTH, "manufactured 1-d q=1.2", "manufactured 2-d q=1.5", "manufactured 3-d interaction=3"))
 def test_the_exact_controller_performs_at_the_optimum(problem):
     perf = simulate_performance(problem, problem.exact_control, trajectories=64, replicates=8, seed=0).perf
     assert abs(perf.value - problem.exact_optimum) <= 4.0 * perf.se + perf.bias
@@ -75,43 +74,43 @@ def test_the_exact_value_as_control_variate_leaves_nothing_to_simulate(problem):
     )
     assert simulated.perf.value == pytest.approx(problem.exact_optimum, rel=1e-10)
     assert simulated.perf.se + simulated.perf.bias < 1e-10
-    starts = torch.cat([evaluation_points(8, problem.dim, 1000 + r, seed=0) for r in range(2)])
+    starts = torch.cat([evaluation_points(8, problem.dim, SIMULATION_REPLICATE + r, seed=0) for r in range(2)])
     assert simulated.largest_value == pytest.approx(float(problem.exact_value(starts).max()), rel=1e-10)
 
 
-@zoo.on((*zoo.FEW_SMOOTH, "swing"))
-def test_a_control_variate_changes_the_error_but_not_the_answer(problem):
-    """With any smooth value function, here a random network, and a controller that is not optimal."""
-    network = zoo.rough_network(problem.dim, seed=2, size=0.3)
+@zoo.on(("manufactured 2-d mu0", "swing"))
+def test_a_control_variate_does_not_change_the_answer(problem):
+    """Any smooth value function will do, and any controller: from the same starts nothing but the bias is left."""
+    network = zoo.rough_network(problem.dim, seed=2, size=0.03)
     law = wrong_law(problem) if problem.exact_optimum else lambda x: 0.5 * (TURN * x[:, :1]).sin()
-    sets = [evaluation_points(2**13, problem.dim, r, seed=0) for r in range(8)]
-    initial = [float((network(x) * problem.initial_density(x)).mean()) for x in sets]
-    plain = simulate_performance(problem, law, trajectories=64, replicates=8, seed=0).perf
-    varied = simulate_performance(problem, law, 64, 8, seed=0, value=network, initial=initial).perf
-    allowed = 4.0 * math.hypot(plain.se, varied.se) + plain.bias + varied.bias
-    assert abs(plain.value - varied.value) <= allowed
-    assert allowed < 0.05 * plain.value
+    starts = [evaluation_points(8, problem.dim, SIMULATION_REPLICATE + r, seed=0) for r in range(2)]
+    initial = [float((network(x) * problem.initial_density(x)).mean()) for x in starts]
+    plain = simulate_performance(problem, law, trajectories=8, replicates=2, seed=0).perf
+    varied = simulate_performance(problem, law, 8, 2, seed=0, value=network, initial=initial).perf
+    assert abs(plain.value - varied.value) <= plain.bias + varied.bias
+    assert plain.bias + varied.bias < 1e-3 * plain.value
+    assert varied.se == pytest.approx(plain.se, rel=0.05)
 
 
-@smooth_quadratic
-def test_the_loss_of_a_controller_is_half_its_squared_distance_from_the_optimal_one_along_its_own_flow(problem):
+@zoo.on(("manufactured 1-d q=2", "manufactured 2-d mu0", "manufactured 2-d B(x)", "manufactured 3-d m=2"))
+def test_a_controller_loses_half_its_squared_distance_from_the_optimal_one(problem):
     """`Perf(u) - OPT = E_{mu^u} |u - u*|^2 / 2` for `q = 2` and smooth `V*`; the right side simulated by itself."""
     law = wrong_law(problem)
-    perf = simulate_performance(problem, law, trajectories=128, replicates=8, seed=0).perf
+    perf = simulate_performance(problem, law, trajectories=64, replicates=8, seed=0).perf
     half_square = lambda x: 0.5 * (law(x) - problem.exact_control(x)).square().sum(dim=-1)
-    x0 = torch.cat([evaluation_points(128, problem.dim, r, seed=7) for r in range(8)])
+    x0 = torch.cat([evaluation_points(64, problem.dim, r, seed=7) for r in range(8)])
     dynamics = lambda x: (problem.velocity(x, law(x)), half_square(x))
-    losses, _ = discounted_integral(dynamics, x0, problem.discount, 16.0 / problem.discount, 400)
+    losses, _ = discounted_integral(dynamics, x0, problem.discount, 12.0 / problem.discount, 200)
     per_set = (problem.initial_density(x0) * losses).reshape(8, -1).mean(dim=1)
     loss, error = float(per_set.mean()), float(per_set.std()) / math.sqrt(8.0)
     allowed = 4.0 * math.hypot(perf.se, error) + perf.bias
     assert abs(perf.value - problem.exact_optimum - loss) <= allowed
-    assert allowed < 0.1 * loss
+    assert allowed < 0.2 * loss
 
 
-@zoo.on((*zoo.FEW_SMOOTH, "manufactured 2-d q=1.2"))
+@zoo.on(zoo.FEW_SMOOTH)
 def test_the_occupation_density_along_the_exact_flow_is_the_exact_one(problem):
-    """Truncation leaves `e^{-12}`, below 1e-5, of it."""
+    """Truncation leaves `e^{-10}`, below 1e-4, of it."""
     x = zoo.states(problem, 16, seed=4)
-    found = occupation_along_flow(problem, problem.exact_control, x, horizon=12.0 / problem.discount, steps=100)
-    torch.testing.assert_close(found, problem.exact_occupation(x), rtol=1e-4, atol=1e-4)
+    found = occupation_along_flow(problem, problem.exact_control, x, horizon=10.0 / problem.discount, steps=80)
+    torch.testing.assert_close(found, problem.exact_occupation(x), rtol=2e-4, atol=2e-4)

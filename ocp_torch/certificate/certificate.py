@@ -127,8 +127,8 @@ def _share(lower, upper, zero: Estimate | None) -> float | None:
     return 1.0 - (upper[1] - lower[1]) / gain if gain > 0.0 and math.isfinite(gain) else None
 
 
-def table(certificate: dict) -> str:
-    """The certificate (as a dict of its schema) as a table for the terminal."""
+def table(certificate: dict, searches: list[str] = ()) -> str:
+    """The certificate (as a dict of its schema) as a table for the terminal, and how its suprema were found."""
     exact = certificate["exact"]
     lines = [f"{certificate['problem']} / {certificate['method']}, seed {certificate['seed']}", ""]
     header = f"{'':26}{'value':>14}{'± se':>11}{'± bias':>11}" + (f"{'vs OPT':>12}" if exact else "")
@@ -156,5 +156,6 @@ def table(certificate: dict) -> str:
         if gap[kind] is not None:
             part = f", {100 * share[kind]:.2f}% of the gain over doing nothing" if share[kind] is not None else ""
             lines.append(f"gap, {kind}: {100.0 * gap[kind]:.4f}%{part}")
+    lines += searches
     lines += [f"warning: {warning}" for warning in certificate["warnings"]]
     return "\n".join(lines)

@@ -18,7 +18,7 @@ from ocp_torch.certificate.performance import Simulated, simulate_performance
 from ocp_torch.certificate.sides import LowerSide, lower_side, upper_side
 from ocp_torch.certificate.stage import StageSettings, fit_closed_loop
 from ocp_torch.control_laws import control_laws, occupation_density, zero_law
-from ocp_torch.errors import InputError, require_integer
+from ocp_torch.errors import require_integer
 from ocp_torch.fields.fields import Fields
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.problem import Problem
@@ -86,7 +86,9 @@ def certify_fields(
             simulated[name] = simulate_performance(
                 problem, law, settings.trajectories, count, seed, value=fields.value, initial=initial
             )
-        zero = simulate_performance(problem, zero_law(problem), BASELINE_FACTOR * settings.trajectories, count, seed).perf
+        zero = simulate_performance(
+            problem, zero_law(problem), BASELINE_FACTOR * settings.trajectories, count, seed
+        ).perf
     finite = {name: s for name, s in simulated.items() if s.perf.finite}
     best = min(finite, key=lambda n: finite[n].perf.above, default=next(iter(laws)))
     if settings.stage.steps:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
+import torch
 from torch import Tensor
 
+from ocp_torch import calculus, formulas
 from ocp_torch.bounds import Bounds
 from ocp_torch.fields.fields import Fields
 from ocp_torch.problems.problem import Problem
@@ -16,12 +18,14 @@ class Objective(ABC):
     """A one-player objective is minimised; a two-player one is a game in which each player minimises its own loss.
 
     ``players`` maps a player to the fields it moves; ``needs_divergences`` says whether `losses` reads `div a`, `div B`;
-    ``occupation`` says how the fields give `mu` (see `control_laws`), `None` where they do not.
+    ``occupation`` says how the fields give `mu` (see `control_laws`), `None` where they do not; ``notes`` is what a user
+    should be told of the form that was chosen.
     """
 
     players: dict[str, tuple[str, ...]]
     needs_divergences: bool = False
     occupation: str | None = None
+    notes: tuple[str, ...] = ()
 
     def __init__(self, problem: Problem, bounds: Bounds) -> None:
         self.rho, self.cost, self.bounds = problem.discount, problem.control_cost, bounds
@@ -34,3 +38,17 @@ class Objective(ABC):
     @abstractmethod
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         """One scalar loss per player, each a mean over ``samples``."""
+
+    @torch.no_grad()
+    def diagnostics(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
+        """How far the two constraints are violated on ``samples``: the HJB slack and the Liouville residual."""
+        shown: dict[str, Tensor] = {}
+        if fields.value is not None:
+            value, gradient = calculus.value_and_gradient(fields.value, samples.x)
+            slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho).clamp_min(0.0)
+            shown |= {"slack_mean_positive": samples.mean(slack), "slack_maximum": slack.max()}
+        if fields.control_density is not None and fields.log_occupation is not None:
+            _, inflow = formulas.controlled_inflow(samples, fields.control_density, self.rho)
+            _, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
+            shown["residual_mean_absolute"] = samples.mean((inflow - loss).abs())
+        return shown

@@ -9,6 +9,7 @@ from ocp_torch.bounds import Bounds
 from ocp_torch.errors import InputError, require_choice
 from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, Fields
 from ocp_torch.objectives.objective import Objective
+from ocp_torch.objectives.saddle import Saddle
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
 
@@ -53,5 +54,9 @@ def primal(problem: Problem, bounds: Bounds, occupation: str = "auto") -> Object
             "method.occupation is 'closed', but this problem has drift, for which mu has no closed form; "
             "use method.occupation=network or auto."
         )
+    if not problem.gives_divergences:
+        objective = Saddle(problem, bounds, augmentation=1.0)
+        objective.notes = ("this problem gives no divergences of a and B: primal falls back to the saddle, without J.",)
+        return objective
     closed = problem.driftless and occupation != "network"
     return (ClosedPrimal if closed else NetworkPrimal)(problem, bounds)

@@ -1,6 +1,6 @@
 r"""The primal-dual saddle, PD (section 6 of the paper), as it stands there and with each player's exact penalty added.
 
-`L(V; w, mu) = E[(f + R(w/mu)) mu + V (mu0 - mu) + grad V . (a mu + B w) / rho]` is the Lagrangian (equation 14).
+`L(V; w, mu) = E[V mu0 + l]` with `l = (f + R(w/mu)) mu - V mu + grad V . (a mu + B w) / rho` is its Lagrangian.
 """
 
 from __future__ import annotations
@@ -17,13 +17,18 @@ from ocp_torch.samples import Samples
 
 
 class Saddle(Objective):
-    r"""`sup_V inf_w E[V mu0 + grad V . B w / rho + S_M(w, f - V + grad V . a / rho)]`, with `S_M` of Lemma 3.
+    r"""`sup_V inf_w Psi`, `Psi = E[V mu0 + grad V . B w / rho + S_M(w, f - V + grad V . a / rho)]`, `S_M` of Lemma 3.
 
-    Convex in `w`, concave in `V`, and needs no divergence of the problem.
+    Convex in `w`, concave in `V`, and needs no divergence of the problem. With ``augmentation`` `k > 0` the value player
+    minimises `-(Psi + k F_M)`, which `V*` does as well.
     """
 
     players = {"value": (VALUE,), "density": (CONTROL_DENSITY,)}
     occupation = control_laws.SADDLE
+
+    def __init__(self, problem: Problem, bounds: Bounds, augmentation: float = 0.0) -> None:
+        super().__init__(problem, bounds)
+        self.augmentation = augmentation
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         value, gradient = calculus.value_and_gradient(fields.value, samples.x)
@@ -31,52 +36,71 @@ class Saddle(Objective):
         pushed = (formulas.pull_back(samples, gradient) * w).sum(dim=-1) / self.rho
         beta = samples.f - value + formulas.along(samples, gradient) / self.rho
         psi = samples.mean(value * samples.mu0 + pushed + self.cost.saddle_minimum(w, beta, self.bounds.M))
-        return {"value": -psi, "density": psi}
+        if self.augmentation == 0.0:
+            return {"value": -psi, "density": psi}
+        slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
+        penalised = samples.mean(value * samples.mu0 - self.bounds.M * slack.clamp_min(0.0))
+        return {"value": -psi - self.augmentation * penalised, "density": psi}
 
 
 class AugmentedSaddle(Objective):
-    r"""The value player minimises `-(L + k F_M(V))`, the density player `L + k J(w, mu)`, with `k = augmentation > 0`.
+    r"""The value player minimises `-(c L + k F_M(V))`, the density player `E[max(l, 0)] + k J(w, mu)`.
 
-    The saddle point does not move. Let `(V*, w*, mu*)` be the optimal triple. For the value player against `(w*, mu*)`:
-    Liouville's equation makes `L(V; w*, mu*) = E[(f + R(u*)) mu*] = OPT` for every `V`, and `F_M(V) <= OPT = F_M(V*)` once
-    `M >= sup mu*`, so `V*` maximises the sum. For the density player against `V*`: the Hamilton-Jacobi-Bellman equation
-    makes the integrand of `L(V*; w, mu) - OPT` non-negative, zero at `(w*, mu*)` (Lemma 4), and `J(w, mu) >= OPT = J(w*,
-    mu*)` once `C_V >= sup V*`, so `(w*, mu*)` minimises the sum. Neither can gain: it is an equilibrium still, and each
-    player's own term, no longer linear along `L`'s flat directions, is what damps the rotation of the plain game.
+    ``augmentation`` is `k > 0`, ``coupling`` is `c >= 0`. Let `(V*, w*, mu*)` be optimal. The saddle point does not move:
 
-    Convexity: `L + k J` is convex in `(w, mu)` (a perspective plus linear terms and a hinge of them) and `L + k F_M` is
-    concave in `V`. The game is no longer zero-sum, but its operator is that of `L`, which is monotone, plus the
-    subgradients of `-k F_M` and `k J`, which are monotone too. In `log mu` convexity is lost, as in a network's weights.
+    * Value player, against `(w*, mu*)`: Liouville's equation makes `L(V; w*, mu*) = E[(f + R(u*)) mu*] = OPT` for every
+      `V`, and `F_M(V) <= OPT = F_M(V*)` once `M >= sup mu*`. So `V*` maximises `c L + k F_M`, for every `c`.
+    * Density player, against `V*`: the Hamilton-Jacobi-Bellman equation makes `l >= 0` pointwise for every `(w, mu)`, and
+      `l = 0` at `(w*, mu*)` (Lemma 4); so there `E[max(l, 0)] = L - OPT`, and `J(w, mu) >= OPT = J(w*, mu*)` once
+      `C_V >= sup V*`. So `(w*, mu*)` minimises the sum.
+
+    Why each change: the penalties are not linear along the flat directions of `L`, and damp the rotation of the plain
+    game. Against a `V` that is no subsolution yet, `L` is unbounded below in `mu`; `max(l, 0)` is not. With `c = 0` the
+    value player ignores a density player that has not arrived yet (the game is then a dual ascent with a best response),
+    and nothing is lost at the equilibrium, where `L` is flat in `V`.
+
+    Convexity: `l` is a perspective plus linear terms, so `max(l, 0)` and `J` are convex in `(w, mu)`, and `c L + k F_M` is
+    concave in `V`. For `c = 1` and where `l >= 0` the operator of the game is that of `L`, which is monotone, plus
+    subgradients of convex functions, which are too. In `log mu`, as in a network's weights, convexity is lost.
     """
 
     players = {"value": (VALUE,), "density": (CONTROL_DENSITY, LOG_OCCUPATION)}
     needs_divergences = True
     occupation = control_laws.NETWORK
 
-    def __init__(self, problem: Problem, bounds: Bounds, augmentation: float) -> None:
+    def __init__(self, problem: Problem, bounds: Bounds, augmentation: float, coupling: float = 0.0) -> None:
         super().__init__(problem, bounds)
-        self.augmentation = augmentation
+        self.augmentation, self.coupling = augmentation, coupling
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         k, M, C_V = self.augmentation, self.bounds.M, self.bounds.C_V
         value, gradient = calculus.value_and_gradient(fields.value, samples.x)
         slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
-        penalised = value * samples.mu0 - M * slack.clamp_min(0.0)
+        of_value = k * (value * samples.mu0 - M * slack.clamp_min(0.0))
         w, inflow = formulas.controlled_inflow(samples, fields.control_density, self.rho)
         mu, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
         running = samples.f * mu + self.cost.perspective(w, mu)
         hinged = running + C_V * (inflow - loss).clamp_min(0.0)
-        lagrangian = lambda v, g, cost, m, c: cost + formulas.lagrange_term(samples, v, g, m, c, self.rho)
         # Each player sees the other as data.
-        of_value = lagrangian(value, gradient, running.detach(), mu.detach(), w.detach())
-        of_density = lagrangian(value.detach(), gradient.detach(), running, mu, w)
-        return {
-            "value": -samples.mean(of_value + k * penalised),
-            "density": samples.mean(of_density + k * hinged),
-        }
+        local = running + formulas.multiplier_term(samples, value.detach(), gradient.detach(), mu, w, self.rho)
+        if self.coupling > 0.0:
+            seen = formulas.multiplier_term(samples, value, gradient, mu.detach(), w.detach(), self.rho)
+            of_value = of_value + self.coupling * (value * samples.mu0 + seen)
+        return {"value": -samples.mean(of_value), "density": samples.mean(local.clamp_min(0.0) + k * hinged)}
 
 
-def saddle(problem: Problem, bounds: Bounds, augmentation: float = 1.0) -> Objective:
-    """The paper's saddle for ``augmentation = 0``, the augmented one otherwise. Raises `InputError` if negative."""
+def saddle(problem: Problem, bounds: Bounds, augmentation: float = 0.25, coupling: float = 0.0) -> Objective:
+    """The paper's saddle for ``augmentation = 0``, the augmented one otherwise.
+
+    Without divergences of `a` and `B` the augmentation is that of the value player alone, and a note says so. Raises
+    `InputError` for negative weights.
+    """
     weight = require_number("method.augmentation", augmentation, at_least=0.0)
-    return AugmentedSaddle(problem, bounds, weight) if weight > 0.0 else Saddle(problem, bounds)
+    coupling = require_number("method.coupling", coupling, at_least=0.0)
+    if weight == 0.0:
+        return Saddle(problem, bounds)
+    if problem.gives_divergences:
+        return AugmentedSaddle(problem, bounds, weight, coupling)
+    objective = Saddle(problem, bounds, weight)
+    objective.notes = ("this problem gives no divergences of a and B: pd trains w alone, with mu in closed form.",)
+    return objective

@@ -77,6 +77,12 @@ class Problem:
         tangents = torch.func.vmap(along)(basis)  # (d, N, d, m): derivative of B along coordinate i
         return torch.einsum("inim->nm", tangents)
 
+    @property
+    def gives_divergences(self) -> bool:
+        """Whether `div a` and `div B` are to be had."""
+        x = torch.full((1, self.dim), 0.5, dtype=torch.float64)
+        return self.drift_divergence(x) is not None and self.control_divergence(x) is not None
+
     # Exact truth, where known: `None` otherwise.
     def exact_value(self, x: Tensor) -> Tensor | None:
         """`V*(x)`, ``(N,)``."""

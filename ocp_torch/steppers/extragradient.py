@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from ocp_torch.steppers.stepper import Draw, StepReport, Stepper, Visit
+from ocp_torch.steppers.stepper import Draw, Stepper, StepReport, Visit
 
 
 class Extragradient(Stepper):
@@ -27,4 +27,4 @@ class Extragradient(Stepper):
             torch._foreach_copy_(everything, origin)
         self._update()
         self._advance_schedules()
-        return StepReport(losses, norms, len(first) + len(second))
+        return StepReport(losses, norms, second, len(first) + len(second))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ocp_torch.steppers.stepper import Draw, StepReport, Stepper, Visit
+from ocp_torch.steppers.stepper import Draw, Stepper, StepReport, Visit
 
 
 class Simultaneous(Stepper):
@@ -14,4 +14,4 @@ class Simultaneous(Stepper):
         visit()
         self._update()
         self._advance_schedules()
-        return StepReport(losses, norms, len(samples))
+        return StepReport(losses, norms, samples, len(samples))

@@ -30,7 +30,8 @@ class StepReport:
 
     losses: dict[str, Tensor]
     gradient_norms: dict[str, Tensor]
-    samples: int
+    batch: Samples  # where they were seen
+    samples: int  # states drawn
 
 
 class Stepper(ABC):

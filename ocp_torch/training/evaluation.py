@@ -43,5 +43,5 @@ def certify_saved(controller: Controller, settings: CertificateSettings, seed: i
         run = Run(**{**vars(run), "seed": require_integer("seed", seed, 0)})
     trained = Trained(controller.fields, controller.occupation, build_network(controller.model))
     certificate = certify_fields(controller.problem, trained, controller.bounds, settings, run)
-    log.info("\n%s", table(certificate.to_dict()))
+    log.info("\n%s", table(certificate.to_dict(), certificate.searches))
     return certificate

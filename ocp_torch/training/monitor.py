@@ -28,7 +28,7 @@ class Silent:
 
 class Monitor(Silent):
     """Progress bar (terminals only), log lines, and TensorBoard scalars in the groups bounds, performance, loss, lr,
-    gradient_norm and throughput."""
+    gradient_norm, violation and throughput."""
 
     def __init__(self, folder: Path, steps: int, progress: bool = True) -> None:
         self.writer = SummaryWriter(str(folder))
@@ -52,6 +52,8 @@ class Monitor(Silent):
         for player in report.losses:
             self.writer.add_scalar(f"loss/{player}", float(report.losses[player]), step)
             self.writer.add_scalar(f"gradient_norm/{player}", float(report.gradient_norms[player]), step)
+        for name, value in trainer.objective.diagnostics(trainer.fields, report.batch).items():
+            self.writer.add_scalar(f"violation/{name}", float(value), step)
         for player, rate in trainer.stepper.learning_rates().items():
             self.writer.add_scalar(f"lr/{player}", rate, step)
         now, (then, before) = time.perf_counter(), self._mark

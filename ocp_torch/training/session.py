@@ -45,7 +45,7 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, con
             drawn = figures.draw(trainer.problem, trainer.averaged_fields, trainer.bounds, trainer.objective.occupation)
             figures.save(drawn, folder / "figures")
             monitor.figures(drawn, trainer.step)
-    log.info("\n%s", table(certificate.to_dict()))
+    log.info("\n%s", table(certificate.to_dict(), certificate.searches))
     log.info("controller from %s, %.0f s in all, in %s", kind, time.perf_counter() - started, folder)
     return certificate
 
@@ -75,7 +75,7 @@ def summary(trainer: Trainer) -> str:
         f"{method}: {', '.join(trainer.objective.fields)}, {weights:,} weights, {settings.dtype} on {settings.torch_device}",
         f"{settings.steps:,} steps of {settings.batch} states, seed {trainer.seed}",
         f"bounds: {used}",
-        *(f"warning: {warning}" for warning in bounds.warnings),
+        *(f"warning: {warning}" for warning in (*bounds.warnings, *trainer.objective.notes)),
     ]
     width = shutil.get_terminal_size().columns
     return "\n".join(["", *(line if len(line) <= 2 * width else line[: 2 * width] for line in lines)])
