@@ -2,8 +2,9 @@
 
 import pytest
 import torch
-import zoo
 from hypothesis import settings
+
+import zoo
 
 # The same examples on every run: a failure is then a change in the code, never luck.
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-import zoo
-
 from ocp_torch import calculus
 from ocp_torch.fields import PeriodicMLP
 from ocp_torch.samples import Samples
+
+import zoo
 
 # A step of 1e-5 leaves h^2 = 1e-10 times third derivatives (of order 1e3 here), and rounding of 1e-16 / 1e-5.
 STEP, TOLERANCE = 1e-5, dict(rtol=1e-6, atol=1e-6)
@@ -72,7 +72,12 @@ def test_everything_is_differentiable_again_in_the_parameters(device):
         value, gradient = calculus.value_and_gradient(first, x)
         _, derivative = calculus.directional_derivative(network, x, x)
         _, flux = calculus.control_flux_divergence(network, x, B, torch.ones_like(x))
-        squares = [gradient.square().sum(-1), derivative.square().sum(-1), flux**2, calculus.divergence(network, x) ** 2]
+        squares = [
+            gradient.square().sum(-1),
+            derivative.square().sum(-1),
+            flux**2,
+            calculus.divergence(network, x) ** 2,
+        ]
         return (value + sum(squares)).mean()
 
     for weight in (network.head.weight, network.body[0].weight):

@@ -114,6 +114,7 @@ WRONG = [
     "method.occupation_bound=-2",
     "method.value_bound=0",
     "method.control_bound=abc",
+    "method.augmentation=-1",
     "problem=manufactured method=primal method.occupation=closed",
     "method=primal method.occupation=maybe",
     "optimizer.name=adamw",
@@ -141,6 +142,9 @@ WRONG = [
     "certificate.replicates=1",
     "certificate.trajectories=-1",
     "certificate.ascents=0",
+    "certificate.stage=3",
+    "certificate.stage.steps=-1",
+    "certificate.stage.lr=0",
     "seed=-1",
     "seed=abc",
     "problem.discount=1e300",
@@ -181,7 +185,10 @@ def assert_one_sentence(sentence: str):
         ("+problem.discuont=3", ("problem.discuont", "did you mean 'discount'?")),
         ("+optimizer.player_lr.valeu=1.0e-3", ("optimizer.player_lr", "valeu", "did you mean 'value'?")),
         ("+optimizer.player_lr.value=-1", ("optimizer", "lr", "-1")),
-        ("seed=???", ("seed", "missing")),
+        ("seed=???", ("seed is missing",)),
+        ("sampler.name=???", ("sampler.name is missing",)),
+        ("trainer.steps=3=4", ("trainer.steps=3=4",)),
+        ("trainer.steps=4,5", ("trainer.steps=4,5",)),
         ("trainer.steps=${nowhere}", ("nowhere",)),
     ],
 )
@@ -214,7 +221,7 @@ JUNK = st.one_of(
 
 
 @pytest.mark.slow
-@examples(max_examples=300)
+@examples(max_examples=200)
 @given(where=st.sampled_from(PROBLEM_FIELDS + OTHER_FIELDS), junk=JUNK)
 def test_junk_is_accepted_or_refused_in_one_sentence_but_never_breaks(where, junk):
     problem, field = where

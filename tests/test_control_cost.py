@@ -7,7 +7,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-
 from ocp_torch.control_cost import PowerCost
 from ocp_torch.errors import InputError
 

@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-import zoo
-
 from ocp_torch import calculus
 from ocp_torch.errors import InputError
 from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fields, PeriodicMLP
 from ocp_torch.problems import Circle, Problem
+
+import zoo
 
 NAMES = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION)
 
@@ -95,7 +95,9 @@ def test_fields_start_in_the_units_of_the_problem():
     plain, scaled = build(zoo.Swing()), build(InOtherUnits(k, c))
     x = zoo.states(zoo.Swing(), 100, dtype=torch.float32)
     torch.testing.assert_close(scaled.value(x), k * plain.value(x) + c, rtol=1e-5, atol=1e-2)
-    torch.testing.assert_close(scaled.control_density(x), k ** (1.0 / q) * plain.control_density(x), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        scaled.control_density(x), k ** (1.0 / q) * plain.control_density(x), rtol=1e-5, atol=1e-5
+    )
     assert torch.equal(scaled.log_occupation(x), plain.log_occupation(x))
 
 

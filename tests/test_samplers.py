@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-
 from ocp_torch import samplers
 from ocp_torch.samplers import SobolSampler, UniformSampler, derive_seed, evaluation_points, scrambled_sobol
 
@@ -26,7 +25,9 @@ def test_states_fill_the_unit_cube_uniformly(make, dtype):
     error = 4.0 / 2**7
     torch.testing.assert_close(x.mean(dim=0).double(), torch.full((3,), 0.5).double(), rtol=0.0, atol=0.29 * error)
     second = (x.T @ x / len(x)).double()
-    torch.testing.assert_close(second, torch.full((3, 3), 0.25).double() + torch.eye(3) / 12.0, rtol=0.0, atol=0.3 * error)
+    torch.testing.assert_close(
+        second, torch.full((3, 3), 0.25).double() + torch.eye(3) / 12.0, rtol=0.0, atol=0.3 * error
+    )
 
 
 class NearlyOne:

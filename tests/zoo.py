@@ -1,11 +1,10 @@
 """The test problems that all tests share, by readable names; each is built once, when first asked for."""
 
 import math
-from functools import lru_cache, partial
+from functools import cache, partial
 
 import pytest
 import torch
-
 from ocp_torch.fields import PeriodicMLP
 from ocp_torch.problems import Circle, Manufactured, Problem, Torus
 from ocp_torch.problems.torus import SHEARS
@@ -39,7 +38,11 @@ _KINKED = {
     **{f"torus {d}-d {shear}": partial(Torus, dim=d, shear=shear, seed=1) for d in (1, 2, 3) for shear in SHEARS},
 }
 _SMOOTH = {
-    **{f"manufactured {d}-d q={q:g}": partial(Manufactured, dim=d, exponent=q) for d in (1, 2, 3) for q in (2, 1.5, 1.2)},
+    **{
+        f"manufactured {d}-d q={q:g}": partial(Manufactured, dim=d, exponent=q)
+        for d in (1, 2, 3)
+        for q in (2, 1.5, 1.2)
+    },
     "manufactured 3-d m=2": partial(Manufactured, dim=3, control_dim=2),
     "manufactured 2-d B(x)": partial(Manufactured, state_dependent_control=True),
     "manufactured 3-d m=2 B(x) q=1.5": partial(
@@ -58,7 +61,7 @@ FEW_SMOOTH = ("manufactured 1-d q=2", "manufactured 2-d mu0", "manufactured 3-d 
 FEW = ("circle rho=2", "torus 2-d chain", "torus 3-d random", *FEW_SMOOTH)
 
 
-@lru_cache(maxsize=None)
+@cache
 def build(name: str) -> Problem:
     return _CASES[name]()
 

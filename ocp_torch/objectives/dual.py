@@ -5,17 +5,37 @@ from __future__ import annotations
 from torch import Tensor
 
 from ocp_torch import calculus, formulas
+from ocp_torch.bounds import Bounds
+from ocp_torch.errors import require_number
 from ocp_torch.fields.fields import VALUE, Fields
 from ocp_torch.objectives.objective import Objective
+from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
 
 
 class Dual(Objective):
-    r"""Maximise `F_M(V) = E[V mu0 - M max(Q, 0)]`: at most `OPT` for every `V` once `M >= sup mu*` (Proposition 3)."""
+    r"""Maximise `F_M(V) = E[V mu0 - M max(Q, 0)]`: at most `OPT` for every `V` once `M >= sup mu*` (Proposition 3).
+
+    With ``residual`` `k > 0` also `-(k/s) E[Q^2]`, `s` the scale of the `V` network. `V*` is optimal for that too, since
+    `Q = 0` almost everywhere there; unlike the hinge it has a gradient on both sides of the solution. The paper's dual is
+    ``residual = 0``.
+    """
 
     players = {"value": (VALUE,)}
+
+    def __init__(self, problem: Problem, bounds: Bounds, residual: float = 0.3) -> None:
+        super().__init__(problem, bounds)
+        self.residual = require_number("method.residual", residual, at_least=0.0)
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         value, gradient = calculus.value_and_gradient(fields.value, samples.x)
         slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
-        return {"value": -samples.mean(value * samples.mu0 - self.bounds.M * slack.clamp_min(0.0))}
+        return {"value": -samples.mean(dual_integrand(fields, samples, value, slack, self.bounds.M, self.residual))}
+
+
+def dual_integrand(fields: Fields, samples: Samples, value: Tensor, slack: Tensor, M: float, residual: float) -> Tensor:
+    """`V mu0 - M max(Q, 0) - (residual / s) Q^2`, ``(N,)``: what a value player on its own maximises."""
+    penalised = value * samples.mu0 - M * slack.clamp_min(0.0)
+    if residual == 0.0:
+        return penalised
+    return penalised - residual / getattr(fields.value, "scale", 1.0) * slack.square()

@@ -11,6 +11,7 @@ from ocp_torch import calculus, control_laws, formulas
 from ocp_torch.bounds import Bounds
 from ocp_torch.errors import require_number
 from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fields
+from ocp_torch.objectives.dual import dual_integrand
 from ocp_torch.objectives.objective import Objective
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
@@ -39,14 +40,15 @@ class Saddle(Objective):
         if self.augmentation == 0.0:
             return {"value": -psi, "density": psi}
         slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
-        penalised = samples.mean(value * samples.mu0 - self.bounds.M * slack.clamp_min(0.0))
-        return {"value": -psi - self.augmentation * penalised, "density": psi}
+        own = samples.mean(dual_integrand(fields, samples, value, slack, self.bounds.M, residual=0.0))
+        return {"value": -psi - self.augmentation * own, "density": psi}
 
 
 class AugmentedSaddle(Objective):
     r"""The value player minimises `-(c L + k F_M(V))`, the density player `E[max(l, 0)] + k J(w, mu)`.
 
-    ``augmentation`` is `k > 0`, ``coupling`` is `c >= 0`. Let `(V*, w*, mu*)` be optimal. The saddle point does not move:
+    ``augmentation`` is `k > 0`, ``coupling`` is `c >= 0`, ``residual`` as for `Dual`. Let `(V*, w*, mu*)` be optimal. The
+    saddle point does not move:
 
     * Value player, against `(w*, mu*)`: Liouville's equation makes `L(V; w*, mu*) = E[(f + R(u*)) mu*] = OPT` for every
       `V`, and `F_M(V) <= OPT = F_M(V*)` once `M >= sup mu*`. So `V*` maximises `c L + k F_M`, for every `c`.
@@ -68,15 +70,15 @@ class AugmentedSaddle(Objective):
     needs_divergences = True
     occupation = control_laws.NETWORK
 
-    def __init__(self, problem: Problem, bounds: Bounds, augmentation: float, coupling: float = 0.0) -> None:
+    def __init__(self, problem: Problem, bounds: Bounds, augmentation: float, coupling: float, residual: float) -> None:
         super().__init__(problem, bounds)
-        self.augmentation, self.coupling = augmentation, coupling
+        self.augmentation, self.coupling, self.residual = augmentation, coupling, residual
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         k, M, C_V = self.augmentation, self.bounds.M, self.bounds.C_V
         value, gradient = calculus.value_and_gradient(fields.value, samples.x)
         slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
-        of_value = k * (value * samples.mu0 - M * slack.clamp_min(0.0))
+        of_value = k * dual_integrand(fields, samples, value, slack, M, self.residual)
         w, inflow = formulas.controlled_inflow(samples, fields.control_density, self.rho)
         mu, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
         running = samples.f * mu + self.cost.perspective(w, mu)
@@ -89,7 +91,9 @@ class AugmentedSaddle(Objective):
         return {"value": -samples.mean(of_value), "density": samples.mean(local.clamp_min(0.0) + k * hinged)}
 
 
-def saddle(problem: Problem, bounds: Bounds, augmentation: float = 0.25, coupling: float = 0.0) -> Objective:
+def saddle(
+    problem: Problem, bounds: Bounds, augmentation: float = 0.25, coupling: float = 0.0, residual: float = 0.3
+) -> Objective:
     """The paper's saddle for ``augmentation = 0``, the augmented one otherwise.
 
     Without divergences of `a` and `B` the augmentation is that of the value player alone, and a note says so. Raises
@@ -97,10 +101,11 @@ def saddle(problem: Problem, bounds: Bounds, augmentation: float = 0.25, couplin
     """
     weight = require_number("method.augmentation", augmentation, at_least=0.0)
     coupling = require_number("method.coupling", coupling, at_least=0.0)
+    residual = require_number("method.residual", residual, at_least=0.0)
     if weight == 0.0:
         return Saddle(problem, bounds)
     if problem.gives_divergences:
-        return AugmentedSaddle(problem, bounds, weight, coupling)
+        return AugmentedSaddle(problem, bounds, weight, coupling, residual)
     objective = Saddle(problem, bounds, weight)
     objective.notes = ("this problem gives no divergences of a and B: pd trains w alone, with mu in closed form.",)
     return objective
