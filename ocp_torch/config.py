@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from ocp_torch.bounds import resolve_bounds
+from ocp_torch.budgets import fill
 from ocp_torch.certificate import CertificateSettings, StageSettings
 from ocp_torch.controller import problem_name
 from ocp_torch.errors import InputError, nearest, require_choice, require_integer, require_number
@@ -64,9 +65,10 @@ def build_problem(section: dict) -> Problem:
 def build_trainer(config: dict) -> Trainer:
     """Everything a run needs, in the order in which data flows. Raises `InputError` for any wrong field."""
     seed = require_integer("seed", config["seed"], 0)
+    problem = build_problem(config["problem"])
+    config = fill(config, problem)
     settings = call(TrainerSettings, "trainer", config["trainer"])
     torch.set_num_threads(settings.threads)
-    problem = build_problem(config["problem"])
     method = dict(config["method"])
     name = require_choice("method.name", method.pop("name", None), METHODS)
     bounds = resolve_bounds(problem, **{field: method.pop(field, None) for field in BOUND_FIELDS})
@@ -79,7 +81,9 @@ def build_trainer(config: dict) -> Trainer:
     sampler_name = require_choice("sampler.name", config["sampler"].get("name"), SAMPLERS)
     sampler = SAMPLERS[sampler_name](problem.dim, seed, settings.torch_dtype)
     names = (problem_name(problem), name)
-    return Trainer(problem, fields, objective, bounds, stepper, average, sampler, settings, network, seed, names)
+    return Trainer(
+        problem, fields, objective, bounds, stepper, average, sampler, settings, network, seed, names, config
+    )
 
 
 def build_network(model: dict) -> Callable[..., nn.Module]:

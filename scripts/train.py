@@ -10,12 +10,13 @@ from omegaconf import DictConfig
 
 
 def build(config: dict):
-    return build_trainer(config), build_certificate_settings(config)
+    trainer = build_trainer(config)
+    return trainer, build_certificate_settings(trainer.config)
 
 
 def train(config: dict, folder) -> None:
     trainer, certificate_settings = build(config)
-    run_session(trainer, certificate_settings, config, folder)
+    run_session(trainer, certificate_settings, folder)
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="train")

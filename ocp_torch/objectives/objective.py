@@ -26,6 +26,8 @@ class Objective(ABC):
     needs_divergences: bool = False
     occupation: str | None = None
     notes: tuple[str, ...] = ()
+    resting: dict[str, float] = {}  # player -> the part of the run it rests at the start
+    progress: float = 1.0  # the part of the run that is done, kept up to date by the trainer
 
     def __init__(self, problem: Problem, bounds: Bounds) -> None:
         self.rho, self.cost, self.bounds = problem.discount, problem.control_cost, bounds
@@ -37,7 +39,7 @@ class Objective(ABC):
 
     @abstractmethod
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        """One scalar loss per player, each a mean over ``samples``."""
+        """One scalar loss per player, each a mean over ``samples``; a player without one rests."""
 
     @torch.no_grad()
     def diagnostics(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:

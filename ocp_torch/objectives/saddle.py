@@ -59,7 +59,8 @@ class AugmentedSaddle(Objective):
     Why each change: the penalties are not linear along the flat directions of `L`, and damp the rotation of the plain
     game. Against a `V` that is no subsolution yet, `L` is unbounded below in `mu`; `max(l, 0)` is not. With `c = 0` the
     value player ignores a density player that has not arrived yet (the game is then a dual ascent with a best response),
-    and nothing is lost at the equilibrium, where `L` is flat in `V`.
+    and nothing is lost at the equilibrium, where `L` is flat in `V`. With ``warm_start`` and `c = 0` the density player
+    even rests for that part of the run: what it would answer to is not there yet.
 
     Convexity: `l` is a perspective plus linear terms, so `max(l, 0)` and `J` are convex in `(w, mu)`, and `c L + k F_M` is
     concave in `V`. For `c = 1` and where `l >= 0` the operator of the game is that of `L`, which is monotone, plus
@@ -70,15 +71,20 @@ class AugmentedSaddle(Objective):
     needs_divergences = True
     occupation = control_laws.NETWORK
 
-    def __init__(self, problem: Problem, bounds: Bounds, augmentation: float, coupling: float, residual: float) -> None:
+    def __init__(
+        self, problem: Problem, bounds: Bounds, augmentation: float, coupling: float, residual: float, warm_start: float
+    ) -> None:
         super().__init__(problem, bounds)
         self.augmentation, self.coupling, self.residual = augmentation, coupling, residual
+        self.resting = {"density": warm_start if coupling == 0.0 else 0.0}
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         k, M, C_V = self.augmentation, self.bounds.M, self.bounds.C_V
         value, gradient = calculus.value_and_gradient(fields.value, samples.x)
         slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
         of_value = k * dual_integrand(fields, samples, value, slack, M, self.residual)
+        if self.progress < self.resting["density"]:
+            return {"value": -samples.mean(of_value)}
         w, inflow = formulas.controlled_inflow(samples, fields.control_density, self.rho)
         mu, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
         running = samples.f * mu + self.cost.perspective(w, mu)
@@ -92,7 +98,12 @@ class AugmentedSaddle(Objective):
 
 
 def saddle(
-    problem: Problem, bounds: Bounds, augmentation: float = 0.25, coupling: float = 0.0, residual: float = 0.3
+    problem: Problem,
+    bounds: Bounds,
+    augmentation: float = 0.25,
+    coupling: float = 0.0,
+    residual: float = 0.3,
+    warm_start: float = 0.4,
 ) -> Objective:
     """The paper's saddle for ``augmentation = 0``, the augmented one otherwise.
 
@@ -102,10 +113,11 @@ def saddle(
     weight = require_number("method.augmentation", augmentation, at_least=0.0)
     coupling = require_number("method.coupling", coupling, at_least=0.0)
     residual = require_number("method.residual", residual, at_least=0.0)
+    warm_start = require_number("method.warm_start", warm_start, at_least=0.0, at_most=1.0)
     if weight == 0.0:
         return Saddle(problem, bounds)
     if problem.gives_divergences:
-        return AugmentedSaddle(problem, bounds, weight, coupling, residual)
+        return AugmentedSaddle(problem, bounds, weight, coupling, residual, warm_start)
     objective = Saddle(problem, bounds, weight)
     objective.notes = ("this problem gives no divergences of a and B: pd trains w alone, with mu in closed form.",)
     return objective

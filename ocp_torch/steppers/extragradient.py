@@ -18,13 +18,13 @@ class Extragradient(Stepper):
         everything = [p for parameters in self.parameters.values() for p in parameters]
         origin = [p.detach().clone() for p in everything]
         first = draw()
-        self._differentiate(first)
-        self._update()
+        ahead, _ = self._differentiate(first)
+        self._update(ahead)
         visit()
         second = draw()
         losses, norms = self._differentiate(second)
         with torch.no_grad():
             torch._foreach_copy_(everything, origin)
-        self._update()
-        self._advance_schedules()
+        self._update(losses)
+        self._advance_schedules(losses)
         return StepReport(losses, norms, second, len(first) + len(second))

@@ -12,6 +12,6 @@ class Simultaneous(Stepper):
         samples = draw()
         losses, norms = self._differentiate(samples)
         visit()
-        self._update()
-        self._advance_schedules()
+        self._update(losses)
+        self._advance_schedules(losses)
         return StepReport(losses, norms, samples, len(samples))

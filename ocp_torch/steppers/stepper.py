@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
@@ -37,7 +37,8 @@ class StepReport:
 class Stepper(ABC):
     """Moves every player of ``objective`` by its own optimiser and schedule.
 
-    ``optimizers`` maps a player to a maker of its optimiser, ``schedule`` makes the learning-rate schedule of each;
+    ``optimizers`` maps a player to a maker of its optimiser, ``schedule`` makes the learning-rate schedule of each, given
+    the part of the run the player rests;
     ``radius``, if given, is the Euclidean ball each player's parameters are projected on after every update (the paper's
     proximal operator); ``clip``, if given, is the largest gradient norm of a player.
     """
@@ -47,14 +48,15 @@ class Stepper(ABC):
         fields: Fields,
         objective: Objective,
         optimizers: dict[str, Callable[[list[Tensor]], Optimizer]],
-        schedule: Callable[[Optimizer], LRScheduler],
+        schedule: Callable[[Optimizer, float], LRScheduler],
         radius: float | None = None,
         clip: float | None = None,
     ) -> None:
         self.fields, self.objective, self.radius, self.clip = fields, objective, radius, clip
         self.parameters = {player: fields.parameters_of(names) for player, names in objective.players.items()}
         self.optimizers = {player: optimizers[player](self.parameters[player]) for player in objective.players}
-        self.schedules = {player: schedule(optimizer) for player, optimizer in self.optimizers.items()}
+        resting = objective.resting
+        self.schedules = {p: schedule(optimizer, resting.get(p, 0.0)) for p, optimizer in self.optimizers.items()}
 
     @abstractmethod
     def step(self, draw: Draw, visit: Visit) -> StepReport:
@@ -78,19 +80,20 @@ class Stepper(ABC):
     def _differentiate(self, samples: Samples) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Set each parameter's gradient to that of its own player's loss; losses and gradient norms per player."""
         losses = self.objective.losses(self.fields, samples)
+        moving = {player: self.parameters[player] for player in losses}
         gradients = {}
-        for i, (player, parameters) in enumerate(self.parameters.items()):
-            more = i < len(self.parameters) - 1
+        for i, (player, parameters) in enumerate(moving.items()):
+            more = i < len(moving) - 1
             gradients[player] = torch.autograd.grad(losses[player], parameters, retain_graph=more, allow_unused=True)
         norms = {}
-        for player, parameters in self.parameters.items():
+        for player, parameters in moving.items():
             for parameter, gradient in zip(parameters, gradients[player], strict=True):
                 # A bias that only shifts V gets no gradient where only grad V matters.
                 parameter.grad = torch.zeros_like(parameter) if gradient is None else gradient
             norms[player] = torch.nn.utils.get_total_norm([p.grad for p in parameters])
         self._guard(losses, norms)
         if self.clip is not None:
-            for player, parameters in self.parameters.items():
+            for player, parameters in moving.items():
                 torch.nn.utils.clip_grads_with_norm_(parameters, self.clip, norms[player])
         return {player: loss.detach() for player, loss in losses.items()}, norms
 
@@ -102,16 +105,17 @@ class Stepper(ABC):
         what = f"the loss of player {bad_loss[0]!r}" if bad_loss else "a gradient"
         raise NonFiniteError(f"{what} is not finite; try a smaller optimizer.lr, or stepper.clip.")
 
-    def _update(self) -> None:
-        """One update of every player with the gradients in place, then the projection."""
-        for player, optimizer in self.optimizers.items():
-            optimizer.step()
+    def _update(self, players: Iterable[str]) -> None:
+        """One update of ``players`` with the gradients in place, then the projection."""
+        for player in players:
+            self.optimizers[player].step()
             if self.radius is not None:
                 project_on_ball(self.parameters[player], self.radius)
 
-    def _advance_schedules(self) -> None:
-        for schedule in self.schedules.values():
-            schedule.step()
+    def _advance_schedules(self, players: Iterable[str]) -> None:
+        """A player's schedule counts its own moves."""
+        for player in players:
+            self.schedules[player].step()
 
 
 @torch.no_grad()

@@ -19,10 +19,10 @@ from ocp_torch.training.trainer import Trainer
 log = logging.getLogger(__name__)
 
 
-def run_session(trainer: Trainer, certificate_settings: CertificateSettings, config: dict, folder: Path) -> Certificate:
+def run_session(trainer: Trainer, certificate_settings: CertificateSettings, folder: Path) -> Certificate:
     """Fill ``folder`` with a run: events, `checkpoints/last.pt`, `certificate.json`, `controller.safetensors`, figures.
 
-    ``config`` is the resolved configuration as plain data. Raises `InputError` when a loss stops being finite.
+    Raises `InputError` when a loss stops being finite.
     """
     started = time.perf_counter()
     settings = trainer.settings
@@ -34,13 +34,13 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, con
             raise InputError(f"Training stopped at step {trainer.step}, before the update: {error}") from None
         certificate = trainer.certify(certificate_settings)
         monitor.record(certificate, trainer.step)
-        monitor.hyper_parameters(flatten(config), certificate)
+        monitor.hyper_parameters(flatten(trainer.config), certificate)
         certificate.save(folder / "certificate.json")
         if certificate.best_perf is not None:
             kind = certificate.best_perf[0]
         else:
             kind = "value" if trainer.averaged_fields.value is not None else "density"
-        controller_of(trainer, certificate, config, kind).save(folder / "controller.safetensors")
+        controller_of(trainer, certificate, kind).save(folder / "controller.safetensors")
         if settings.figures:
             drawn = figures.draw(trainer.problem, trainer.averaged_fields, trainer.bounds, trainer.objective.occupation)
             figures.save(drawn, folder / "figures")
@@ -50,7 +50,7 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, con
     return certificate
 
 
-def controller_of(trainer: Trainer, certificate: Certificate, config: dict, kind: str) -> Controller:
+def controller_of(trainer: Trainer, certificate: Certificate, kind: str) -> Controller:
     """The controller of law ``kind`` that ``trainer`` hands out, from its averaged fields."""
     return Controller(
         problem=trainer.problem,
@@ -58,9 +58,9 @@ def controller_of(trainer: Trainer, certificate: Certificate, config: dict, kind
         bounds=trainer.bounds,
         occupation=trainer.objective.occupation,
         kind=kind,
-        model=config["model"],
+        model=trainer.config["model"],
         certificate=certificate.to_dict(),
-        config=config,
+        config=trainer.config,
     )
 
 

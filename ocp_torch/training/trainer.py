@@ -24,7 +24,7 @@ QUICK = CertificateSettings(points=1024, replicates=2, trajectories=0, ascents=8
 
 class Trainer:
     """Everything a run is made of. ``average`` is a `torch.optim.swa_utils.AveragedModel` of ``fields``; ``sampler``
-    draws states; ``monitor`` is told what happens."""
+    draws states; ``config`` is the configuration all this was built from, as plain data without nulls to fill."""
 
     def __init__(
         self,
@@ -39,10 +39,11 @@ class Trainer:
         network: Callable[..., nn.Module],
         seed: int,
         names: tuple[str, str],
+        config: dict,
     ) -> None:
         self.problem, self.fields, self.objective, self.bounds = problem, fields, objective, bounds
         self.stepper, self.average, self.sampler, self.settings = stepper, average, sampler, settings
-        self.network, self.seed, self.names = network, seed, names
+        self.network, self.seed, self.names, self.config = network, seed, names, config
         self.step, self.samples, self.seconds = 0, 0, 0.0
 
     @property
@@ -66,6 +67,7 @@ class Trainer:
         settings = self.settings
         while self.step < settings.steps:
             started = time.perf_counter()
+            self.objective.progress = self.step / settings.steps
             report = self.stepper.step(self.draw, lambda: self.average.update_parameters(self.fields))
             self.step += 1
             self.samples += report.samples

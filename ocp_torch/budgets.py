@@ -1,0 +1,50 @@
+"""Sizes and budgets by dimension, for every field of the configuration that is null: what won in measurements."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+from ocp_torch.problems import Problem
+
+
+@dataclass(frozen=True)
+class Budget:
+    """One row: up to ``dim`` coordinates, for a run and for its certification stage."""
+
+    dim: float
+    modes: int
+    width: int
+    steps: int
+    batch: int
+    stage_steps: int
+    stage_batch: int
+
+
+# Kinks want Fourier modes, and modes are affordable in one and two dimensions; many dimensions want width and samples.
+BUDGETS = (
+    Budget(2, modes=6, width=96, steps=5000, batch=256, stage_steps=2000, stage_batch=512),
+    Budget(4, modes=3, width=128, steps=4000, batch=384, stage_steps=1500, stage_batch=512),
+    Budget(float("inf"), modes=2, width=192, steps=4000, batch=512, stage_steps=1200, stage_batch=512),
+)
+
+
+def fill(config: dict, problem: Problem) -> dict:
+    """``config`` with the fields that are null, and have a default by dimension, filled in."""
+    budget = next(b for b in BUDGETS if problem.dim <= b.dim)
+    filled = copy.deepcopy(config)
+    defaults = {
+        ("model", "modes"): budget.modes,
+        ("model", "width"): budget.width,
+        ("trainer", "steps"): budget.steps,
+        ("trainer", "batch"): budget.batch,
+        ("certificate", "stage", "steps"): budget.stage_steps,
+        ("certificate", "stage", "batch"): budget.stage_batch,
+    }
+    for (*path, name), value in defaults.items():
+        section = filled
+        for key in path:
+            section = section.setdefault(key, {})
+        if section.get(name) is None:
+            section[name] = value
+    return filled
