@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -42,17 +43,19 @@ def optimizer_maker(name: str, lr: float, **options) -> Callable[[list[Tensor]],
     return lambda parameters: make(parameters, lr=rate, **options)
 
 
-def schedule_maker(
-    name: str, steps: int, decay: float = 0.75, every: int = 20000
-) -> Callable[[Optimizer], LRScheduler]:
-    """A maker of the learning-rate schedule: ``constant``; ``cosine`` to zero over ``steps``; or ``decay``, a factor
-    ``decay`` every ``every`` steps (the paper decreases by 25 % every 20,000)."""
+def schedule_maker(name: str, steps: int, decay: float = 0.75, every: int = 20000) -> Callable[..., LRScheduler]:
+    """A maker of the learning-rate schedule of an optimiser whose player rests for the part ``resting`` of ``steps``:
+    ``constant``; ``cosine`` to zero over its own moves; or ``decay``, a factor ``decay`` every ``every`` moves (the paper
+    decreases by 25 % every 20,000)."""
     require_choice("schedule.name", name, ("constant", "cosine", "decay"))
     factor = require_number("schedule.decay", decay, above=0.0, at_most=1.0)
     period = require_integer("schedule.every", every, 1)
-    makers = {
-        "constant": lambda optimizer: LambdaLR(optimizer, lambda _: 1.0),
-        "cosine": lambda optimizer: CosineAnnealingLR(optimizer, T_max=steps),
-        "decay": lambda optimizer: StepLR(optimizer, step_size=period, gamma=factor),
-    }
-    return makers[name]
+
+    def make(optimizer: Optimizer, resting: float = 0.0) -> LRScheduler:
+        if name == "cosine":
+            return CosineAnnealingLR(optimizer, T_max=max(1, steps - math.ceil(resting * steps)))
+        if name == "decay":
+            return StepLR(optimizer, step_size=period, gamma=factor)
+        return LambdaLR(optimizer, lambda _: 1.0)
+
+    return make
