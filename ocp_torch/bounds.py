@@ -53,7 +53,9 @@ def resolve_bounds(
             chosen[name] = require_number(fields[name], configured[name], above=0.0)
             sources[name] = FROM_CONFIGURATION
         elif known[name] is not None and math.isfinite(known[name]):
-            chosen[name], sources[name] = float(known[name]), FROM_PROBLEM
+            # J bounds the cost of a controller that is not quite optimal only if C_V leaves it room above V*.
+            room = MARGIN if name == "C_V" else 1.0
+            chosen[name], sources[name] = room * float(known[name]), FROM_PROBLEM
         else:
             chosen[name], why = _ESTIMATES[name](problem)
             sources[name] = ESTIMATED

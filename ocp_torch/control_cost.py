@@ -70,7 +70,9 @@ class PowerCost:
     def perspective(self, w: Tensor, mu: Tensor) -> Tensor:
         """`mu R(w / mu)`, with its closure at `mu = 0`: 0 if `w = 0`, infinity otherwise; ``(N, m), (N,) -> (N,)``."""
         positive = mu > 0
-        inside = norm_power(w, self.q) * torch.where(positive, mu, 1.0) ** (1.0 - self.q) / self.q
+        safe = torch.where(positive, mu, 1.0)
+        # Literally mu R(w / mu): powers of a small mu on their own overflow in the backward pass.
+        inside = safe * self.cost(w / safe.unsqueeze(-1))
         outside = torch.where((w != 0).any(dim=-1), math.inf, 0.0).to(mu)
         return torch.where(positive, inside, outside)
 

@@ -53,6 +53,8 @@ def supremum(
         candidate = x + step.unsqueeze(-1) * direction
         with torch.no_grad():
             reached = function(candidate)
+        if torch.isnan(reached).any():
+            return Extremum(float("nan"), candidate[int(torch.isnan(reached).nonzero()[0])], len(points), count)
         better = reached > best
         x = torch.where(better.unsqueeze(-1), candidate, x)
         best = torch.where(better, reached, best)

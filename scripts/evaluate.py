@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hydra
+from omegaconf import DictConfig
+
 from ocp_torch.launch import job, launch
 from ocp_torch.training.evaluation import certify_saved, load_run, settings_for
-from omegaconf import DictConfig
 
 
 def check(config: dict):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hydra
+from omegaconf import DictConfig
+
 from ocp_torch.config import build_certificate_settings, build_trainer
 from ocp_torch.launch import finish, job, launch
 from ocp_torch.training.session import run_session
-from omegaconf import DictConfig
 
 
 def build(config: dict):

@@ -2,12 +2,15 @@
 
 import pytest
 import torch
-from hypothesis import settings
+from hypothesis import Phase, settings
 
 import zoo
 
-# The same examples on every run: a failure is then a change in the code, never luck.
-settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
+# The same examples on every run: a failure is then a change in the code, never luck. No shrinking: most examples are
+# seeds of networks, and a smaller seed is not a simpler network.
+settings.register_profile(
+    "repeatable", derandomize=True, deadline=None, database=None, phases=(Phase.explicit, Phase.generate)
+)
 settings.load_profile("repeatable")
 
 

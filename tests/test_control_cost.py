@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+
 from ocp_torch.control_cost import PowerCost
 from ocp_torch.errors import InputError
 
@@ -29,12 +30,12 @@ def two_dimensional(sizes: torch.Tensor) -> torch.Tensor:
 def lowest(objective, low: float, high: float) -> torch.Tensor:
     """The least value of each row's convex ``objective(mu)`` over ``[low, high]``: a log-spaced grid, refined thrice."""
     start, stop = math.log10(low), math.log10(high)
-    grid = torch.linspace(start, stop, 4001, dtype=torch.float64).unsqueeze(0)
+    grid = torch.linspace(start, stop, 2001, dtype=torch.float64).unsqueeze(0)
     for _ in range(4):
         values = objective(10.0**grid)
         at = values.argmin(dim=1, keepdim=True)
-        left, right = (grid.expand_as(values).gather(1, (at + s).clamp(0, 4000)) for s in (-1, 1))
-        grid = left + (right - left) * torch.linspace(0.0, 1.0, 4001, dtype=torch.float64)
+        left, right = (grid.expand_as(values).gather(1, (at + s).clamp(0, 2000)) for s in (-1, 1))
+        grid = left + (right - left) * torch.linspace(0.0, 1.0, 2001, dtype=torch.float64)
     return values.amin(dim=1)
 
 
@@ -46,7 +47,10 @@ def primal_objective(size, f, residual, q):
 
 SIZES = (0.0, 1e-3, 0.3, 1.0, 20.0)
 COSTS = (0.0, 1e-3, 0.5, BOUND, 1.2 * BOUND, 10.0 * BOUND)
-RESIDUALS = (-5.0, 0.0, 1e-3, 0.4, 1.0, 50.0)
+# Dense enough that some case lies just before, and some just after, each switch between formulas.
+DENSE = tuple(torch.logspace(-4.0, 1.5, 40).tolist())
+RESIDUALS = (-5.0, 0.0, *DENSE)
+BETAS = (-4.0, -1e-3, 0.0, *DENSE)
 
 
 @each_exponent
@@ -78,7 +82,7 @@ def test_primal_occupation_attains_the_primal_minimum(q):
 @each_exponent
 def test_saddle_minimum_is_the_least_value_up_to_the_bound(q):
     cost = PowerCost(q)
-    size, beta = columns(SIZES, (-4.0, -1e-3, 0.0, 1e-3, 0.2, 1.0, 30.0))
+    size, beta = columns(SIZES, BETAS)
     objective = lambda mu: beta.unsqueeze(-1) * mu + mu * (size.unsqueeze(-1) / mu) ** q / q
     brute = lowest(objective, 1e-14, BOUND)
     at_zero = torch.where(size == 0.0, 0.0, math.inf)
@@ -89,7 +93,7 @@ def test_saddle_minimum_is_the_least_value_up_to_the_bound(q):
 @each_exponent
 def test_saddle_occupation_attains_the_saddle_minimum_and_is_the_bound_where_beta_is_not_positive(q):
     cost = PowerCost(q)
-    size, beta = columns(SIZES, (-4.0, -1e-3, 0.0, 1e-3, 0.2, 1.0, 30.0))
+    size, beta = columns(SIZES, BETAS)
     w = two_dimensional(size)
     mu = cost.saddle_occupation(w, beta, BOUND)
     assert ((mu >= 0.0) & (mu <= BOUND)).all()
@@ -197,9 +201,9 @@ def test_float32_agrees_with_float64_in_value_and_gradient_at_every_edge(q, name
         inputs = [t.float() for t in (w, *rest)]
         found = [t.double() for t in value_and_gradients(function, *inputs)]
         truth = value_and_gradients(function, *(t.double() for t in inputs))
-        moderate = torch.stack([t.abs().reshape(len(w), -1).amax(dim=1) < 1e15 for t in truth]).all(dim=0)
+        huge = torch.stack([t.abs().reshape(len(w), -1).amax(dim=1) >= 1e15 for t in truth]).any(dim=0)
         for got, exact in zip(found, truth, strict=True):
-            torch.testing.assert_close(got[moderate], exact[moderate], rtol=1e-4, atol=1e-12)
+            torch.testing.assert_close(got[~huge], exact[~huge], rtol=1e-4, atol=1e-12)
 
 
 @pytest.mark.parametrize("q", [1.0, 0.5, 2.1, math.nan, "2", True])

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+
 from ocp_torch.extremum import batched, supremum
 from ocp_torch.samplers import scrambled_sobol
 

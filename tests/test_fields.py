@@ -2,12 +2,12 @@
 
 import pytest
 import torch
+
+import zoo
 from ocp_torch import calculus
 from ocp_torch.errors import InputError
 from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fields, PeriodicMLP
 from ocp_torch.problems import Circle, Problem
-
-import zoo
 
 NAMES = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION)
 

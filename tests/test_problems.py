@@ -5,6 +5,8 @@ import math
 
 import pytest
 import torch
+
+import zoo
 from ocp_torch import calculus, formulas
 from ocp_torch.certificate.sides import lower_side, upper_side
 from ocp_torch.errors import InputError
@@ -12,8 +14,6 @@ from ocp_torch.extremum import supremum
 from ocp_torch.problems import Circle, Manufactured, Problem, Torus
 from ocp_torch.samplers import evaluation_points
 from ocp_torch.samples import Samples
-
-import zoo
 
 # Pure float64 arithmetic, with no approximation but rounding.
 ROUNDING = dict(rtol=1e-9, atol=1e-9)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+
 from ocp_torch import samplers
 from ocp_torch.samplers import SobolSampler, UniformSampler, derive_seed, evaluation_points, scrambled_sobol
 

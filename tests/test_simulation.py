@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 import torch
+
+import zoo
 from ocp_torch.certificate.assumptions import occupation_along_flow
 from ocp_torch.certificate.performance import SIMULATION_REPLICATE, simulate_performance
 from ocp_torch.certificate.simulation import discounted_integral
 from ocp_torch.samplers import evaluation_points
-
-import zoo
 
 TURN = 2.0 * math.pi
 

@@ -252,6 +252,23 @@ def test_a_non_finite_loss_stops_before_any_parameter_changed(stepper, draw):
         np.testing.assert_array_equal(now, then)
 
 
+class LoneGame(MatrixGame):
+    """The value player's half of the game: the density player rests."""
+
+    def losses(self, fields, samples):
+        return {"value": super().losses(fields, samples)["value"]}
+
+
+@both_steppers
+def test_a_player_without_a_loss_rests_and_so_does_its_schedule(stepper):
+    game = Game(stepper, batches(2), objective=LoneGame(), schedule=schedule_maker("decay", 8, decay=0.5, every=1))
+    report = game.step()
+    assert report.losses.keys() == {"value"}
+    assert not np.array_equal(game.point[0], A0)
+    np.testing.assert_array_equal(game.point[1], B0)
+    assert game.stepper.learning_rates() == pytest.approx({"value": 0.05, "density": 0.1})
+
+
 class RootGame(MatrixGame):
     """A finite loss whose gradient is infinite where the first entry of `a` is zero."""
 

@@ -8,7 +8,6 @@ import pytest
 import torch
 from matplotlib.image import imread
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from test_config import configured
 
 from ocp_torch.certificate import certify
 from ocp_torch.config import build_certificate_settings, build_trainer
@@ -17,8 +16,16 @@ from ocp_torch.errors import InputError
 from ocp_torch.training.checkpoint import load_checkpoint
 from ocp_torch.training.monitor import Silent
 from ocp_torch.training.session import run_session
+from test_config import configured
 
-SMALL = ("experiment=debug", "model.width=8", "trainer.steps=20", "trainer.batch=16", "trainer.evaluate_every=0")
+SMALL = (
+    "experiment=debug",
+    "model.width=8",
+    "trainer.steps=20",
+    "trainer.batch=16",
+    "trainer.evaluate_every=0",
+    "trainer.device=cpu",
+)
 METHODS = {
     "dual": ("method=dual",),
     "primal, mu closed": ("method=primal",),
@@ -36,6 +43,10 @@ WAYS = [
 
 def small(*overrides: str):
     return build_trainer(configured(*SMALL, *overrides))
+
+
+def session(trainer, folder):
+    return run_session(trainer, build_certificate_settings(trainer.config), folder)
 
 
 def state_of(trainer) -> dict:
@@ -118,7 +129,7 @@ def test_no_state_of_a_training_batch_is_ever_used_for_evaluation(sampler, seed,
     monkeypatch.setattr(certify, "fit_closed_loop", fit_closed_loop)
     trainer.fit(Silent())
     phase.append("evaluation")
-    trainer.certify(build_certificate_settings(configured(*SMALL)))
+    trainer.certify(build_certificate_settings(trainer.config))
     assert len(met["training"]) == 20 * 16
     assert len(met["stage"]) > 500
     assert len(met["evaluation"]) > 500
@@ -154,10 +165,10 @@ RUNS = {
 @pytest.fixture(scope="module", params=RUNS, ids=lambda d: f"d={d}")
 def run(request, tmp_path_factory):
     """A finished run in its folder, and its configuration."""
-    config = configured(*SMALL, *RUNS[request.param], "certificate.points=64", "certificate.ascents=2", "seed=5")
+    trainer = small(*RUNS[request.param], "certificate.points=64", "certificate.ascents=2", "seed=5")
     folder = tmp_path_factory.mktemp("run")
-    run_session(build_trainer(config), build_certificate_settings(config), config, folder)
-    return folder, config
+    session(trainer, folder)
+    return folder, trainer.config
 
 
 def test_a_run_leaves_exactly_the_documented_files(run):
@@ -254,9 +265,9 @@ def test_tensorboard_shows_every_group_of_scalars_and_the_exact_optimum(run):
 
 
 def test_a_run_that_diverges_says_so_and_never_saves_what_is_not_finite(tmp_path):
-    config = configured(*SMALL, "method=dual", "optimizer=sgd", "optimizer.lr=1e30", "trainer.checkpoint_every=1")
+    trainer = small("method=dual", "optimizer=sgd", "optimizer.lr=1e30", "trainer.checkpoint_every=1")
     with pytest.raises(InputError, match="Training stopped at step .* the loss of player 'value'") as stopped:
-        run_session(build_trainer(config), build_certificate_settings(config), config, tmp_path)
+        session(trainer, tmp_path)
     assert "\n" not in str(stopped.value)
     assert not (tmp_path / "controller.safetensors").exists()
     saved = load_checkpoint(tmp_path / "checkpoints" / "last.pt")["fields"]

@@ -8,6 +8,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+import zoo
 from ocp_torch import calculus, formulas
 from ocp_torch.bounds import Bounds, resolve_bounds
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
@@ -15,14 +17,11 @@ from ocp_torch.certificate.lagrangian import closed_loop_bounds
 from ocp_torch.certificate.sides import lower_side, slack_function, upper_side
 from ocp_torch.control_laws import CLOSED, NETWORK, occupation_density
 from ocp_torch.fields import Fields
-from ocp_torch.objectives import METHODS, Dual, primal
+from ocp_torch.objectives import Dual, primal, saddle
 from ocp_torch.objectives.primal import ClosedPrimal, NetworkPrimal
-from ocp_torch.objectives.saddle import Saddle
 from ocp_torch.problems import Problem
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.samples import Samples
-
-import zoo
 
 # Eight scramblings: beyond six standard errors no sampling noise is left to blame.
 ERRORS = 6.0
@@ -36,6 +35,11 @@ def sets_of(name: str) -> list[Samples]:
 @cache
 def bounds_of(name: str) -> Bounds:
     return resolve_bounds(zoo.build(name))
+
+
+def paper_dual(problem: Problem, bounds: Bounds) -> Dual:
+    """`F_M` alone, without what training may add to it."""
+    return Dual(problem, bounds, residual=0.0)
 
 
 def random_fields(problem: Problem, seed: int, size: float = 1.0) -> Fields:
@@ -57,11 +61,11 @@ def random_value(name: str, seed: int, size: float, near: bool):
     return (lambda x: problem.exact_value(x) + network(x)) if near else network
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(**case)
 def test_no_value_function_gives_a_penalised_bound_above_the_optimum(name, seed, size, near):
     problem, fields = zoo.build(name), SimpleNamespace(value=random_value(name, seed, size, near))
-    dual = Dual(problem, replace(bounds_of(name), M=problem.occupation_bound))
+    dual = paper_dual(problem, replace(bounds_of(name), M=problem.occupation_bound))
     F_M = Estimate.of([-float(dual.losses(fields, samples)["value"]) for samples in sets_of(name)])
     assert F_M.value <= problem.exact_optimum + ERRORS * F_M.se + 1e-9
 
@@ -74,7 +78,7 @@ def test_no_value_function_gives_a_shifted_bound_above_the_optimum(name, seed, s
     assert shifted.value <= problem.exact_optimum + ERRORS * shifted.se + 1e-9
 
 
-@settings(max_examples=50)
+@settings(max_examples=40)
 @given(**case)
 def test_no_densities_give_an_upper_bound_below_the_optimum(name, seed, size, near):
     problem = zoo.build(name)
@@ -91,7 +95,7 @@ def test_no_densities_give_an_upper_bound_below_the_optimum(name, seed, size, ne
         assert problem.exact_optimum - ERRORS * G.se - 1e-9 <= G.value <= J.value * (1.0 + 1e-12)
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(**{**case, "name": st.sampled_from(zoo.SMOOTH)})
 def test_no_value_and_density_give_a_closed_loop_bound_below_the_optimum(name, seed, size, near):
     """For any regular controller, `V` and `mu`: the Lagrangian bound, and `J` with the `C_V` that these prove."""
@@ -102,7 +106,7 @@ def test_no_value_and_density_give_a_closed_loop_bound_below_the_optimum(name, s
     mistake = fields.control_density
     loop = ClosedLoop(problem, lambda x: problem.exact_control(x) + 0.1 * mistake(x))
     sets = [Samples.of(loop, samples.x) for samples in sets_of(name)]
-    bounds = closed_loop_bounds(loop, value, log_mu, sets, ascents=16, controller="value")
+    bounds = closed_loop_bounds(loop, value, log_mu, sets, ascents=8, controller="value")
     for bound in (bounds.lagrangian, bounds.J):
         assert bound.value >= problem.exact_optimum - ERRORS * bound.se - 1e-9
 
@@ -116,16 +120,17 @@ def test_the_lagrangian_bound_at_the_exact_truth_is_the_optimum(problem):
     )
     expected = Estimate.of([float((problem.exact_value(s.x) * s.mu0).mean()) for s in sets])
     assert exact.lagrangian.value == pytest.approx(expected.value, rel=1e-9)
+    assert exact.residual < 1e-9
 
 
-@settings(max_examples=20)
+@settings(max_examples=15)
 @given(name=st.sampled_from(zoo.ALL), seed=st.integers(0, 10**6), size=st.sampled_from([0.1, 1.0, 5.0]))
 def test_losses_are_the_numbers_of_the_certificate(name, seed, size):
     problem, sets = zoo.build(name), sets_of(name)[:2]
     fields, bounds = random_fields(problem, seed, size), bounds_of(name)
     mean = lambda objective, player: Estimate.of([float(objective.losses(fields, s)[player]) for s in sets]).value
     F_M = lower_side(problem, fields.value, sets, bounds.M, ascents=1).F_M.value
-    assert mean(Dual(problem, bounds), "value") == pytest.approx(-F_M, rel=1e-9, abs=1e-9)
+    assert mean(paper_dual(problem, bounds), "value") == pytest.approx(-F_M, rel=1e-9, abs=1e-9)
     J, G = upper_side(
         problem, fields.control_density, occupation_density(NETWORK, problem, fields, bounds), sets, bounds.C_V
     )
@@ -135,11 +140,6 @@ def test_losses_are_the_numbers_of_the_certificate(name, seed, size):
         closed = occupation_density(CLOSED, problem, fields, bounds)
         attained, least = upper_side(problem, fields.control_density, closed, sets, bounds.C_V)
         assert attained.value == pytest.approx(least.value, rel=1e-9)
-    # The saddle's players add their own exact penalty, `-F_M` and `J`, with the weight they are told.
-    once, twice = (METHODS["pd"](problem, bounds, augmentation=weight) for weight in (1.0, 2.0))
-    for player, added in (("value", -F_M), ("density", J.value)):
-        scale = abs(mean(once, player)) + abs(added)
-        assert mean(twice, player) - mean(once, player) == pytest.approx(added, abs=1e-9 * scale)
 
 
 def test_the_primal_takes_the_closed_form_exactly_where_there_is_no_drift():
@@ -164,14 +164,15 @@ def test_the_saddle_is_never_below_the_dual_and_meets_it_at_the_best_response(na
     class BestResponse(torch.nn.Module):
         forward = staticmethod(best_response)
 
+    paper_saddle = saddle(problem, bounds, augmentation=0.0)
     best = Fields({"value": fields.value, "control_density": BestResponse()})
     for samples in sets[:2]:
-        dual = -float(Dual(problem, bounds).losses(fields, samples)["value"])
-        losses = Saddle(problem, bounds).losses(fields, samples)
+        dual = -float(paper_dual(problem, bounds).losses(fields, samples)["value"])
+        losses = paper_saddle.losses(fields, samples)
         rounding = 1e-9 * (1.0 + abs(dual))
         assert float(losses["density"]) >= dual - rounding
         assert float(losses["value"]) == -float(losses["density"])
-        assert float(Saddle(problem, bounds).losses(best, samples)["density"]) == pytest.approx(dual, abs=rounding)
+        assert float(paper_saddle.losses(best, samples)["density"]) == pytest.approx(dual, abs=rounding)
 
 
 @zoo.on(zoo.FEW)
@@ -186,6 +187,19 @@ def test_a_constant_is_worth_its_size_until_every_state_is_penalised(problem):
     assert F_M(penalised + 1.0) - F_M(penalised) == pytest.approx(mass - M, abs=1e-9)
     # Concave in between.
     assert 2.0 * F_M(0.5 * (free + penalised)) >= F_M(free) + F_M(penalised)
+
+
+@zoo.on(zoo.FEW)
+def test_the_shifted_bound_undoes_a_constant_that_violates_the_constraint(problem):
+    """The climbs are the same for every constant, up to rounding in which step is called better."""
+    samples = Samples.of(problem, zoo.states(problem, 256))
+    network = random_fields(problem, seed=1).value
+    above = 1.0 - float(slack_function(problem, network)(samples.x).max())
+    shifted = [
+        lower_side(problem, lambda x, c=c: network(x) + c, [samples] * 2, 1.0, ascents=1).shifted.value
+        for c in (above, above + 3.0)
+    ]
+    assert shifted[1] - shifted[0] == pytest.approx(3.0 * (float(samples.mu0.mean()) - 1.0), abs=1e-6)
 
 
 @zoo.on(zoo.FEW)

@@ -5,6 +5,7 @@ from functools import cache, partial
 
 import pytest
 import torch
+
 from ocp_torch.fields import PeriodicMLP
 from ocp_torch.problems import Circle, Manufactured, Problem, Torus
 from ocp_torch.problems.torus import SHEARS

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import nn
 
 from ocp_torch.bounds import Bounds
-from ocp_torch.certificate.assumptions import check_assumptions, estimated_sup_occupation
+from ocp_torch.certificate.assumptions import Assumptions, check_assumptions, estimated_sup_occupation
 from ocp_torch.certificate.certificate import Certificate, Run
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
@@ -103,7 +103,7 @@ def certify_fields(
         problem, bounds, sup_occupation, sup_control, largest_value, uses=(has_value, J is not None)
     )
     warnings = list(bounds.warnings) + notes + warnings
-    J, assumptions = _tighter_J(J, stage, assumptions)
+    J, G, assumptions = _tighter_upper(J, G, stage, assumptions)
     perf = {name: simulated[name].perf if name in simulated else None for name in ("value", "density")}
     warnings += _plausibility(perf, zero)
     return Certificate(
@@ -141,15 +141,23 @@ def certification_stage(
     loop = ClosedLoop(problem, control_laws(trained.occupation, problem, fields, bounds)[kind])
     loop_sets = [Samples.concatenate([Samples.of(loop, x) for x in s.x.split(8192)]) for s in sets]
     value = fields.value if fields.value is not None else fitted.value
-    return closed_loop_bounds(loop, value, fitted.log_occupation, loop_sets, settings.ascents, kind), []
+    found = closed_loop_bounds(loop, value, fitted.log_occupation, loop_sets, settings.ascents, kind)
+    if problem.driftless:
+        mu = lambda x: fitted.log_occupation(x).exp()
+        _, G = upper_side(problem, lambda x: mu(x).unsqueeze(-1) * loop.law(x), mu, sets, found.C_V)
+        found = replace(found, G=G)
+    return found, []
 
 
-def _tighter_J(J: Estimate | None, stage: ClosedLoopBounds | None, assumptions):
-    """The smaller `J` whose `C_V` holds, and the assumptions with the `C_V` that was used for it."""
+def _tighter_upper(J: Estimate | None, G: Estimate | None, stage: ClosedLoopBounds | None, assumptions: Assumptions):
+    """The smaller `J` and `G` whose `C_V` holds, and the assumptions with the `C_V` that was used."""
     if stage is None:
-        return J, assumptions
-    trained_is_best = J is not None and J.finite and assumptions.value_holds and J.value <= stage.J.value
-    return (J, assumptions) if trained_is_best else (stage.J, assumptions.with_value_bound(stage.C_V))
+        return J, G, assumptions
+    trained = [e for e in (J, G) if e is not None and e.finite]
+    fitted = [e for e in (stage.J, stage.G) if e is not None and e.finite]
+    if assumptions.value_holds and trained and min(e.value for e in trained) <= min(e.value for e in fitted):
+        return J, G, assumptions
+    return stage.J, stage.G, assumptions.with_value_bound(stage.C_V)
 
 
 def _searches(lower: LowerSide | None, stage: ClosedLoopBounds | None) -> list[str]:

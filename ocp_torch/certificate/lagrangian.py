@@ -39,6 +39,7 @@ class ClosedLoopBounds:
     eps_hi: Extremum
     eps_lo: Extremum
     residual: float  # E[|r|]
+    G: Estimate | None = None  # min_mu J(mu u, .), where there is no drift
 
 
 def closed_loop_bounds(
@@ -48,11 +49,11 @@ def closed_loop_bounds(
     values = [_integrands(loop, value, log_occupation, samples) for samples in sets]
     states = torch.cat([samples.x for samples in sets])
     slack_all = torch.cat([slack for *_, slack in values])
-    largest = torch.cat([v for v, *_ in values]).max()
+    top = _climbed(value, torch.cat([v for v, *_ in values]), states, ascents)
     slack = slack_function(loop, value)
     eps_lo = _climbed(slack, slack_all, states, ascents)
     eps_hi = _climbed(lambda x: -slack(x), -slack_all, states, ascents)
-    C_V = float(largest) + eps_hi.value
+    C_V = top.value + eps_hi.value
     lagrangian, J, residual = [], [], []
     for samples, (v, low_variance, r, _) in zip(sets, values, strict=True):
         gain, loss = r.clamp_min(0.0), (-r).clamp_min(0.0)
