@@ -287,3 +287,17 @@ def test_a_checkpoint_that_cannot_be_read_is_refused_in_one_sentence(tmp_path):
         assert "\n" not in str(refused.value)
     with pytest.raises(InputError, match="does not exist"):
         small("trainer.steps=2").resume(tmp_path / "nowhere.pt")
+
+
+def test_one_flipped_bit_in_a_checkpoint_is_noticed(tmp_path):
+    file = tmp_path / "last.pt"
+    small("method=dual", "trainer.steps=2").fit(Silent(), file)
+    whole = file.read_bytes()
+    for position in range(0, len(whole), 101):
+        damaged = bytearray(whole)
+        damaged[position] ^= 1 << position % 8
+        file.write_bytes(damaged)
+        with pytest.raises(InputError, match=r"last\.pt"):
+            load_checkpoint(file)
+    file.write_bytes(whole)
+    assert load_checkpoint(file)["step"] == 2

@@ -68,7 +68,6 @@ class AugmentedSaddle(Objective):
     """
 
     players = {"value": (VALUE,), "density": (CONTROL_DENSITY, LOG_OCCUPATION)}
-    needs_divergences = True
     occupation = control_laws.NETWORK
 
     def __init__(
@@ -78,12 +77,17 @@ class AugmentedSaddle(Objective):
         self.augmentation, self.coupling, self.residual = augmentation, coupling, residual
         self.resting = {"density": warm_start if coupling == 0.0 else 0.0}
 
+    @property
+    def needs_divergences(self) -> bool:
+        """Only once the density player moves."""
+        return self.progress >= self.resting["density"]
+
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         k, M, C_V = self.augmentation, self.bounds.M, self.bounds.C_V
         value, gradient = calculus.value_and_gradient(fields.value, samples.x)
         slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
         of_value = k * dual_integrand(fields, samples, value, slack, M, self.residual)
-        if self.progress < self.resting["density"]:
+        if not self.needs_divergences:
             return {"value": -samples.mean(of_value)}
         w, inflow = formulas.controlled_inflow(samples, fields.control_density, self.rho)
         mu, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
@@ -103,7 +107,7 @@ def saddle(
     augmentation: float = 0.25,
     coupling: float = 0.0,
     residual: float = 0.3,
-    warm_start: float = 0.4,
+    warm_start: float = 0.6,
 ) -> Objective:
     """The paper's saddle for ``augmentation = 0``, the augmented one otherwise.
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ocp_torch.control_cost import norm_power
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
 from ocp_torch.extremum import supremum
 from ocp_torch.problems.problem import Problem
@@ -131,12 +132,46 @@ class Manufactured(Problem):
         pushed = torch.einsum("ndm,nm->nd", self.control_matrix(x), self.exact_control(x))
         return self._closed_loop(x) - pushed
 
+    def drift_divergence(self, x: Tensor) -> Tensor:
+        """`div a = div g* - div(B u*)`, with `div g* = (rho (mu0 - mu*) - grad mu* . g*) / mu*` by Liouville's equation."""
+        density = self._mu(x)
+        outflow = self.discount * (self._mu0(x) - density) - (self._mu.gradient(x) * self._closed_loop(x)).sum(dim=-1)
+        return outflow / density - self._pushed_divergence(x)
+
+    def _pushed_divergence(self, x: Tensor) -> Tensor:
+        """`div(B u*) = (div B) . u* + sum_k (d u*_k along column k of B)`, ``(N,)``, in closed form."""
+        B, dB = self.control_matrix(x), self._control_matrix_slopes(x)
+        p, u = self._pull_back(x), self.exact_control(x)
+        # Jacobian of p = -B^T grad V0 / rho: entry (k, i) along coordinate i; B_ik varies with one coordinate only.
+        jacobian = torch.einsum("nik,nij->nkj", B, self._V0.hessian(x))
+        moving = dB * self._V0.gradient(x).unsqueeze(-1)
+        hot = torch.nn.functional.one_hot(self._B_coordinate.to(x.device), self.dim).to(x)
+        jacobian = -(jacobian + torch.einsum("nik,ikj->nkj", moving, hot)) / self.discount
+        # D grad R*(p) = |p|^{q'-2} (I + (q'-2) n n^T) with n = p / |p|.
+        power = self.control_cost.conjugate_exponent - 2.0
+        direction = torch.nn.functional.normalize(p, dim=-1, eps=1e-30)
+        bent = jacobian + power * direction.unsqueeze(-1) * torch.einsum("nk,nkj->nj", direction, jacobian).unsqueeze(1)
+        scale = norm_power(p, power) if power > 0.0 else torch.ones_like(p[:, 0])
+        return (self.control_divergence(x) * u).sum(dim=-1) + scale * torch.einsum("njk,nkj->n", B, bent)
+
     def control_matrix(self, x: Tensor) -> Tensor:
         B0 = self._like(x, "B0", self._B0)
         if not self.state_dependent_control:
             return B0.expand(len(x), -1, -1)
-        angle = 2.0 * torch.pi * (x[:, self._B_coordinate.to(x.device)] + self._like(x, "phase", self._B_phase))
-        return B0 * (1.0 + 0.3 * angle.cos())
+        return B0 * (1.0 + 0.3 * self._B_angle(x).cos())
+
+    def control_divergence(self, x: Tensor) -> Tensor:
+        own = self._B_coordinate.to(x.device) == torch.arange(self.dim, device=x.device).unsqueeze(-1)
+        return (self._control_matrix_slopes(x) * own).sum(dim=1)
+
+    def _B_angle(self, x: Tensor) -> Tensor:
+        return 2.0 * torch.pi * (x[:, self._B_coordinate.to(x.device)] + self._like(x, "phase", self._B_phase))
+
+    def _control_matrix_slopes(self, x: Tensor) -> Tensor:
+        """The derivative of each entry of `B` along the one coordinate it varies with, ``(N, d, m)``."""
+        if not self.state_dependent_control:
+            return x.new_zeros(len(x), self.dim, self.control_dim)
+        return -0.6 * torch.pi * self._like(x, "B0", self._B0) * self._B_angle(x).sin()
 
     def initial_density(self, x: Tensor) -> Tensor:
         return self._mu0(x)

@@ -47,6 +47,11 @@ class TrigonometricPolynomial:
         slopes = -2.0 * math.pi * self.amplitudes.to(x) * self._angle(x).sin()
         return slopes @ self.waves.to(x)
 
+    def hessian(self, x: Tensor) -> Tensor:
+        """Second derivatives of `p`, ``(N, d, d)``."""
+        curvatures = -((2.0 * math.pi) ** 2) * self.amplitudes.to(x) * self._angle(x).cos()
+        return torch.einsum("nj,ji,jk->nik", curvatures, self.waves.to(x), self.waves.to(x))
+
 
 def random_waves(dim: int, interaction: int, count: int, generator: torch.Generator) -> Tensor:
     """``count`` wave vectors, each with exactly `min(interaction, dim)` non-zero entries, that together use every
