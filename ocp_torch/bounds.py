@@ -30,6 +30,10 @@ class Bounds:
     sources: dict[str, str]
     warnings: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        for name in ("M", "C_V", "C_u"):
+            require_number(name, getattr(self, name), above=0.0)
+
 
 def resolve_bounds(
     problem: Problem,

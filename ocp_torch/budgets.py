@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass
 
+from ocp_torch.errors import require_section
 from ocp_torch.problems import Problem
 
 
@@ -15,17 +16,18 @@ class Budget:
     dim: float
     modes: int
     width: int
+    gated: bool
     steps: int
     batch: int
     stage_steps: int
     stage_batch: int
 
 
-# Kinks want Fourier modes, and modes are affordable in one and two dimensions; many dimensions want width and samples.
+# Kinks want Fourier modes, affordable in one and two dimensions; many dimensions want products, width and samples.
 BUDGETS = (
-    Budget(2, modes=6, width=96, steps=5000, batch=256, stage_steps=2000, stage_batch=512),
-    Budget(4, modes=3, width=128, steps=4000, batch=384, stage_steps=1500, stage_batch=512),
-    Budget(float("inf"), modes=2, width=192, steps=4000, batch=512, stage_steps=1200, stage_batch=512),
+    Budget(2, modes=6, width=96, gated=False, steps=5000, batch=256, stage_steps=2000, stage_batch=512),
+    Budget(4, modes=3, width=128, gated=False, steps=4000, batch=384, stage_steps=1500, stage_batch=512),
+    Budget(float("inf"), modes=1, width=128, gated=True, steps=5000, batch=512, stage_steps=1200, stage_batch=512),
 )
 
 
@@ -36,6 +38,7 @@ def fill(config: dict, problem: Problem) -> dict:
     defaults = {
         ("model", "modes"): budget.modes,
         ("model", "width"): budget.width,
+        ("model", "gated"): budget.gated,
         ("trainer", "steps"): budget.steps,
         ("trainer", "batch"): budget.batch,
         ("certificate", "stage", "steps"): budget.stage_steps,
@@ -43,8 +46,9 @@ def fill(config: dict, problem: Problem) -> dict:
     }
     for (*path, name), value in defaults.items():
         section = filled
-        for key in path:
-            section = section.setdefault(key, {})
+        for depth, key in enumerate(path, start=1):
+            require_section(".".join(path[:depth]), section.setdefault(key, {}))
+            section = section[key]
         if section.get(name) is None:
             section[name] = value
     return filled

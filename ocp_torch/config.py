@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 from collections.abc import Callable
 
 import torch
@@ -13,12 +14,20 @@ from ocp_torch.bounds import resolve_bounds
 from ocp_torch.budgets import fill
 from ocp_torch.certificate import CertificateSettings, StageSettings
 from ocp_torch.controller import problem_name
-from ocp_torch.errors import InputError, nearest, require_choice, require_integer, require_number
+from ocp_torch.errors import (
+    InputError,
+    call,
+    nearest,
+    require_choice,
+    require_integer,
+    require_number,
+    require_section,
+)
 from ocp_torch.fields import MODELS, Fields
-from ocp_torch.objectives import METHODS
+from ocp_torch.objectives import METHODS, Objective
 from ocp_torch.problems import Problem
 from ocp_torch.samplers import SAMPLERS, derive_seed
-from ocp_torch.steppers import STEPPERS, averaged, optimizer_maker, schedule_maker
+from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.trainer import Trainer
 
@@ -27,27 +36,9 @@ WEIGHTS_STREAM = 2
 BOUND_FIELDS = ("occupation_bound", "value_bound", "control_bound")
 
 
-def call(what, field: str, options: dict, **given):
-    """``what(**given, **options)``; an option it does not take is an `InputError` that names ``field``."""
-    taken = inspect.signature(what).parameters
-    if not any(p.kind is p.VAR_KEYWORD for p in taken.values()):
-        for name in options:
-            if name not in taken:
-                known = [n for n in taken if n not in given]
-                raise InputError(
-                    f"{field}.{name} is not a field of {field}{nearest(name, known)}; it takes {', '.join(known)}."
-                )
-        missing = [n for n, p in taken.items() if p.default is p.empty and n not in options and n not in given]
-        if missing and inspect.isclass(what):
-            raise InputError(f"{field}.{missing[0]} is missing; {what.__name__} needs it.")
-    return what(**given, **options)
-
-
-def build_problem(section: dict) -> Problem:
-    """The problem ``_target_`` names, made with the other fields as arguments; any `Problem` subclass will do."""
-    options = {k: v for k, v in section.items() if k != "_target_"}
-    target = section.get("_target_")
-    if not isinstance(target, str) or "." not in target:
+def problem_class(target: object) -> type[Problem]:
+    """The `Problem` subclass that ``target``, as in my_module.MyProblem, names."""
+    if not isinstance(target, str) or not re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+", target):
         raise InputError(f"problem._target_ is {target!r}, but must be a class, as in my_module.MyProblem.")
     module_name, _, class_name = target.rpartition(".")
     try:
@@ -56,10 +47,15 @@ def build_problem(section: dict) -> Problem:
         raise InputError(f"problem._target_ = {target} cannot be imported: {error}.") from None
     known = [n for n, c in vars(module).items() if inspect.isclass(c) and issubclass(c, Problem) and c is not Problem]
     if class_name not in known:
-        raise InputError(
-            f"problem._target_ = {target} is not a Problem subclass in that module{nearest(class_name, known)}."
-        )
-    return call(getattr(module, class_name), "problem", options)
+        hint = nearest(class_name, known)
+        raise InputError(f"problem._target_ = {target} is not a Problem subclass in that module{hint}.")
+    return getattr(module, class_name)
+
+
+def build_problem(section: object) -> Problem:
+    """The problem ``_target_`` names, made with the other fields as arguments; any `Problem` subclass will do."""
+    options = require_section("problem", section)
+    return call(problem_class(options.pop("_target_", None)), "problem", options)
 
 
 def build_trainer(config: dict) -> Trainer:
@@ -67,9 +63,9 @@ def build_trainer(config: dict) -> Trainer:
     seed = require_integer("seed", config["seed"], 0)
     problem = build_problem(config["problem"])
     config = fill(config, problem)
-    settings = call(TrainerSettings, "trainer", config["trainer"])
+    settings = call(TrainerSettings, "trainer", require_section("trainer", config["trainer"]))
     torch.set_num_threads(settings.threads)
-    method = dict(config["method"])
+    method = require_section("method", config["method"])
     name = require_choice("method.name", method.pop("name", None), METHODS)
     bounds = resolve_bounds(problem, **{field: method.pop(field, None) for field in BOUND_FIELDS})
     objective = call(METHODS[name], "method", method, problem=problem, bounds=bounds)
@@ -77,38 +73,43 @@ def build_trainer(config: dict) -> Trainer:
     fields = Fields.build(problem, objective.fields, network, derive_seed(seed, WEIGHTS_STREAM))
     fields = fields.to(dtype=settings.torch_dtype, device=settings.torch_device)
     stepper = _build_stepper(config, fields, objective, settings.steps)
-    average = call(averaged, "averaging", config["averaging"], fields=fields)
-    sampler_name = require_choice("sampler.name", config["sampler"].get("name"), SAMPLERS)
-    sampler = SAMPLERS[sampler_name](problem.dim, seed, settings.torch_dtype)
+    average = call(averaged, "averaging", require_section("averaging", config["averaging"]), fields=fields)
+    sampler_section = require_section("sampler", config["sampler"])
+    sampler_name = require_choice("sampler.name", sampler_section.pop("name", None), SAMPLERS)
+    given = {"dim": problem.dim, "seed": seed, "dtype": settings.torch_dtype}
+    sampler = call(SAMPLERS[sampler_name], "sampler", sampler_section, **given)
     names = (problem_name(problem), name)
     return Trainer(
         problem, fields, objective, bounds, stepper, average, sampler, settings, network, seed, names, config
     )
 
 
-def build_network(model: dict) -> Callable[..., nn.Module]:
-    """A maker of networks of the configured ``model``, given what a field needs of them."""
-    network = MODELS[require_choice("model.name", model.get("name"), MODELS)]
-    options = {k: v for k, v in model.items() if k != "name"}
+def build_network(model: object) -> Callable[..., nn.Module]:
+    """A maker of networks of the configured ``model``, given the form a field wants."""
+    options = require_section("model", model)
+    network = MODELS[require_choice("model.name", options.pop("name", None), MODELS)]
     return lambda **form: call(network, "model", options, **form)
 
 
 def build_certificate_settings(config: dict) -> CertificateSettings:
     """How much the final certificate may cost."""
-    section = dict(config["certificate"])
-    stage = call(StageSettings, "certificate.stage", section.pop("stage", None) or {})
+    section = require_section("certificate", config["certificate"])
+    stage_section = require_section("certificate.stage", section.pop("stage", {}))
+    stage = call(StageSettings, "certificate.stage", stage_section)
     return call(CertificateSettings, "certificate", section, stage=stage)
 
 
-def _build_stepper(config: dict, fields: Fields, objective, steps: int):
-    options = dict(config["optimizer"])
-    player_lr = options.pop("player_lr", None) or {}
-    for player in player_lr:
-        require_choice("optimizer.player_lr", player, objective.players)
+def _build_stepper(config: dict, fields: Fields, objective: Objective, steps: int) -> Stepper:
+    options = require_section("optimizer", config["optimizer"])
+    player_lr = require_section("optimizer.player_lr", options.pop("player_lr", {}))
+    for player, rate in player_lr.items():
+        if rate is not None:
+            require_choice("optimizer.player_lr", player, objective.players)
     lr = options.pop("lr", None)
-    makers = {p: call(optimizer_maker, "optimizer", options, lr=player_lr.get(p, lr)) for p in objective.players}
-    schedule = call(schedule_maker, "schedule", config["schedule"], steps=steps)
-    section = dict(config["stepper"])
+    rates = {player: lr if player_lr.get(player) is None else player_lr[player] for player in objective.players}
+    makers = {player: call(optimizer_maker, "optimizer", options, lr=rate) for player, rate in rates.items()}
+    schedule = call(schedule_maker, "schedule", require_section("schedule", config["schedule"]), steps=steps)
+    section = require_section("stepper", config["stepper"])
     stepper = STEPPERS[require_choice("stepper.name", section.pop("name", None), STEPPERS)]
     for field in ("radius", "clip"):
         if section.get(field) is not None:

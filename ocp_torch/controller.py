@@ -75,8 +75,10 @@ class Controller:
 
 
 def problem_name(problem: Problem) -> str:
-    """The name of a built-in problem, or the class name of a user's own in lower case."""
-    return next((n for n, c in PROBLEMS.items() if c is type(problem)), type(problem).__name__.lower())
+    """The name of a built-in problem, or the class name of a user's own in lower case (with its module if that is taken)."""
+    cls = type(problem)
+    own = cls.__name__.lower()
+    return next((n for n, c in PROBLEMS.items() if c is cls), own if own not in PROBLEMS else f"{cls.__module__}.{own}")
 
 
 def load_controller(path: str | Path, problem: Problem | None = None, device: str = "cpu") -> Controller:
@@ -92,7 +94,7 @@ def load_controller(path: str | Path, problem: Problem | None = None, device: st
         raise InputError(f"{path} has schema {schema!r}, but this version of ocp_torch reads up to {SCHEMA}.")
     try:
         return _rebuild(path, tensors, metadata, problem, device)
-    except (KeyError, TypeError, AttributeError, RuntimeError, ValueError) as error:
+    except (KeyError, TypeError, AttributeError, RuntimeError, ValueError, ArithmeticError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path} does not describe a controller ({type(error).__name__}: {error}).") from None

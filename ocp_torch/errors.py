@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import difflib
+import inspect
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 
 class InputError(ValueError):
     """A mistake in what the user asked for; its message is one sentence, fit to be printed without a traceback."""
 
 
-def require_integer(name: str, value: object, minimum: int) -> int:
-    """Return ``value`` if it is a whole number of at least ``minimum``; raise `InputError` otherwise."""
+def require_integer(name: str, value: object, minimum: int, maximum: int = 2**31 - 1) -> int:
+    """Return ``value`` if it is a whole number from ``minimum`` to ``maximum``; raise `InputError` otherwise."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise InputError(f"{name} is {value!r}, but must be a whole number of at least {minimum}.")
     if value < minimum:
         raise InputError(f"{name} is {value}, but must be at least {minimum}.")
+    if value > maximum:
+        raise InputError(f"{name} is {value:.6g}, but must be at most {maximum}.")
     return value
 
 
@@ -64,3 +67,31 @@ def nearest(word: str, known: Iterable[str]) -> str:
     """The suffix `` (did you mean 'circle'?)``, or nothing when no known name is close."""
     close = difflib.get_close_matches(word, list(known), n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def require_section(name: str, value: object) -> dict:
+    """Return a copy of ``value`` if it is a group of named fields; raise `InputError` otherwise."""
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        raise InputError(f"{name} is {value!r}, but must be a group of fields.")
+    return dict(value)
+
+
+def require_call(what: Callable, field: str, options: dict, **given) -> None:
+    """Check that ``what(**given, **options)`` has a name for each argument; raise `InputError`, naming ``field``, if not."""
+    parameters = inspect.signature(what).parameters
+    known = [name for name in parameters if name not in given]
+    if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+        for name in options:
+            if name not in known:
+                takes = ", ".join(known) or "nothing"
+                raise InputError(f"{field}.{name} is not a field of {field}{nearest(name, known)}; it takes {takes}.")
+    for name, parameter in parameters.items():
+        required = parameter.default is parameter.empty and parameter.kind is parameter.POSITIONAL_OR_KEYWORD
+        if required and name not in options and name not in given:
+            raise InputError(f"{field}.{name} is missing; give {field}.{name}=... on the command line.")
+
+
+def call(what: Callable, field: str, options: dict, **given):
+    """``what(**given, **options)``; an argument it does not take or lacks is an `InputError` that names ``field``."""
+    require_call(what, field, options, **given)
+    return what(**given, **options)

@@ -12,12 +12,17 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
+from hydra.errors import (
+    ConfigCompositionException,
+    HydraException,
+    MissingConfigException,
+    OverrideParseException,
+)
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ocp_torch.config import build_problem
+from ocp_torch.config import problem_class
 from ocp_torch.errors import InputError, nearest
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -43,16 +48,9 @@ def drop_unclaimed(problem: dict, overrides: list[str]) -> dict:
     target = str(problem.get("_target_"))
     if target.startswith("ocp_torch."):
         return problem
-    named = {
-        o.lstrip("+").split("=")[0].removeprefix("problem.") for o in overrides if o.lstrip("+").startswith("problem.")
-    }
-    module, _, name = target.rpartition(".")
-    try:
-        build_problem({"_target_": target, "\0": None})
-    except InputError as error:
-        if "cannot be imported" in str(error) or "is not a Problem subclass" in str(error):
-            raise
-    taken = inspect.signature(getattr(sys.modules[module], name)).parameters
+    own = [o.lstrip("+") for o in overrides if o.lstrip("+").startswith("problem.")]
+    named = {o.split("=")[0].removeprefix("problem.") for o in own}
+    taken = inspect.signature(problem_class(problem.get("_target_"))).parameters
     return {k: v for k, v in problem.items() if k == "_target_" or k in taken or k in named}
 
 
@@ -70,21 +68,31 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object]) -
     ):
         overrides = [a for a in arguments if not a.startswith("-")]
         try:
-            with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-                data = plain(compose(config_name, overrides))
-            check(prepared(data, overrides))
+            check(composed(config_name, overrides))
         except InputError as error:
             fail(str(error))
-        except (HydraException, OmegaConfBaseException) as error:
-            fail(explain(error, config_name))
-        finally:
-            GlobalHydra.instance().clear()
     entry()
+
+
+def composed(config_name: str, overrides: list[str]) -> dict:
+    """What the job will be given; whatever Hydra or OmegaConf has against it becomes an `InputError` of one sentence."""
+    try:
+        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+            return prepared(plain(compose(config_name, overrides)), overrides)
+    except (HydraException, OmegaConfBaseException, ValueError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
+        known = isinstance(error, HydraException | OmegaConfBaseException)
+        # Hydra has no exception of its own for some slips, and does not say where they are.
+        sentence = explain(error, config_name) if known else f"{' '.join(overrides)} cannot be composed: {error}."
+        raise InputError(sentence) from None
+    finally:
+        GlobalHydra.instance().clear()
 
 
 def prepared(data: dict, overrides: list[str]) -> dict:
     """``data`` with the problem's fields reduced to those its class takes."""
-    if "_target_" in data.get("problem", {}):
+    if isinstance(data.get("problem"), dict) and "_target_" in data["problem"]:
         data["problem"] = drop_unclaimed(data["problem"], overrides)
     return data
 
@@ -133,7 +141,10 @@ def explain(error: Exception, config_name: str) -> str:
         return f"{field} is not a field of the configuration{hint}; write +{field}=... to add an argument of your own."
     missing = re.search(r"Missing mandatory value: ([\w.]+)", text)
     if missing:
-        return f"{missing.group(1)} is missing; give {missing.group(1)}=... on the command line."
+        field = getattr(error, "full_key", None) or missing.group(1)
+        return f"{field} is missing; give {field}=... on the command line."
+    if isinstance(error, OverrideParseException):
+        return f"{error.override!r} cannot be read; write field=value, and quote a value that holds signs of its own."
     return " ".join(text.split()).rstrip(".") + "."
 
 

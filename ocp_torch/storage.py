@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import tempfile
 from collections.abc import Callable
@@ -37,6 +38,15 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
             temporary.unlink()
 
 
+def finite(data):
+    """``data`` with infinities and NaN, which JSON cannot hold, as the words inf, -inf and nan."""
+    if isinstance(data, dict):
+        return {key: finite(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [finite(value) for value in data]
+    return str(data) if isinstance(data, float) and not math.isfinite(data) else data
+
+
 def digest(tensors: dict[str, Tensor], metadata: str) -> str:
     """SHA-256 over names, types, shapes and bytes of ``tensors`` and over ``metadata``."""
     sha = hashlib.sha256(metadata.encode())
@@ -49,7 +59,7 @@ def digest(tensors: dict[str, Tensor], metadata: str) -> str:
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict) -> None:
     """Write ``tensors`` and JSON ``metadata`` to ``path`` atomically, with their digest."""
-    text = json.dumps(metadata, allow_nan=False)
+    text = json.dumps(finite(metadata), allow_nan=False)
     tensors = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
     header = {METADATA_KEY: text, DIGEST_KEY: digest(tensors, text)}
     write_atomically(path, lambda temporary: save_file(tensors, str(temporary), metadata=header))
@@ -76,7 +86,7 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict]:
         raise InputError(f"{path} is damaged: its contents do not match the digest it carries.")
     try:
         metadata = json.loads(header[METADATA_KEY])
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         raise InputError(f"{path} is damaged: its metadata is not JSON.") from None
     if not isinstance(metadata, dict):
         raise InputError(f"{path} is damaged: its metadata is not a JSON object.")

@@ -109,6 +109,7 @@ def test_evaluate_reproduces_the_numbers_of_the_certificate(finished, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_evaluate_on_another_seed_takes_other_states(finished, tmp_path):
     file = finished[0] / "controller.safetensors"
     cheap = ("certificate.trajectories=0", "certificate.stage.steps=0")

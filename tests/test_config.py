@@ -2,17 +2,14 @@
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.errors import HydraException
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from ocp_torch.config import build_certificate_settings, build_trainer
 from ocp_torch.errors import InputError
-from ocp_torch.launch import CONFIGS, explain, known_fields, plain, prepared, register_resolvers
+from ocp_torch.launch import CONFIGS, composed, known_fields, register_resolvers
 from ocp_torch.training.trainer import Trainer
 
 register_resolvers()
@@ -20,8 +17,7 @@ register_resolvers()
 
 def configured(*overrides: str) -> dict:
     """What `scripts/train.py` makes of ``overrides``."""
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        return prepared(plain(compose("train", list(overrides))), list(overrides))
+    return composed("train", list(overrides))
 
 
 def outcome(*overrides: str) -> Trainer | str:
@@ -32,8 +28,6 @@ def outcome(*overrides: str) -> Trainer | str:
         return trainer
     except InputError as error:
         return str(error)
-    except (HydraException, OmegaConfBaseException) as error:
-        return explain(error, "train")
 
 
 CHOICES = sorted(f"{path.parent.name}={path.stem}" for path in CONFIGS.glob("*/*.yaml"))

@@ -18,7 +18,7 @@ class FourierEmbedding(nn.Module):
 
     def __init__(self, dim: int, modes: int) -> None:
         super().__init__()
-        self.modes = require_integer("model.modes", modes, 1)
+        self.modes = require_integer("model.modes", modes, 1, maximum=1024)
         self.width = 2 * dim * modes
         # Whole numbers are exact in every precision; multiples of pi would not survive a change of it.
         self.register_buffer("wave_numbers", torch.arange(1.0, modes + 1.0), persistent=False)

@@ -49,7 +49,8 @@ class Objective(ABC):
             value, gradient = calculus.value_and_gradient(fields.value, samples.x)
             slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho).clamp_min(0.0)
             shown |= {"slack_mean_positive": samples.mean(slack), "slack_maximum": slack.max()}
-        if fields.control_density is not None and fields.log_occupation is not None:
+        given = samples.div_a is not None and samples.div_B is not None
+        if given and fields.control_density is not None and fields.log_occupation is not None:
             _, inflow = formulas.controlled_inflow(samples, fields.control_density, self.rho)
             _, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
             shown["residual_mean_absolute"] = samples.mean((inflow - loss).abs())

@@ -14,6 +14,9 @@ from ocp_torch import calculus
 from ocp_torch.control_cost import PowerCost
 from ocp_torch.errors import InputError, require_integer, require_number
 
+# Beyond this, B alone would fill the memory.
+MOST_COORDINATES = 1024
+
 
 class Problem:
     """Base class: override `state_cost`, and whatever else differs from `dx/dt = u` with a uniform start.
@@ -28,9 +31,13 @@ class Problem:
     """
 
     def __init__(self, dim: int, control_dim: int | None = None, discount: float = 2.0, exponent: float = 2.0) -> None:
-        self.dim = require_integer("problem.dim", dim, 1)
-        self.control_dim = self.dim if control_dim is None else require_integer("problem.control_dim", control_dim, 1)
-        self.discount = require_number("problem.discount", discount, above=0.0)
+        self.dim = require_integer("problem.dim", dim, 1, maximum=MOST_COORDINATES)
+        self.control_dim = (
+            self.dim
+            if control_dim is None
+            else require_integer("problem.control_dim", control_dim, 1, maximum=MOST_COORDINATES)
+        )
+        self.discount = require_number("problem.discount", discount, above=0.0, at_least=1e-6, at_most=1e6)
         self.exponent = require_number("problem.exponent", exponent, above=1.0, at_most=2.0)
         self.control_cost = PowerCost(self.exponent)
         self.state_cost_bound: float | None = None

@@ -22,9 +22,12 @@ class Extragradient(Stepper):
         self._update(ahead)
         visit()
         second = draw()
-        losses, norms = self._differentiate(second)
-        with torch.no_grad():
-            torch._foreach_copy_(everything, origin)
+        try:
+            losses, norms = self._differentiate(second)
+        finally:
+            # Also when the look-ahead point turns out bad: a failed step leaves the parameters where it began.
+            with torch.no_grad():
+                torch._foreach_copy_(everything, origin)
         self._update(losses)
         self._advance_schedules(losses)
         return StepReport(losses, norms, second, len(first) + len(second))

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import CosineAnnealingLR, LambdaLR, LRScheduler, StepLR
 
-from ocp_torch.errors import require_choice, require_integer, require_number
+from ocp_torch.errors import InputError, require_call, require_choice, require_integer, require_number
 
 
 def _sgd(parameters: list[Tensor], lr: float, momentum: float = 0.0) -> Optimizer:
@@ -29,7 +29,9 @@ def _soap(parameters: list[Tensor], lr: float, betas=(0.95, 0.95), precondition_
 
 
 def _betas(betas) -> tuple[float, float]:
-    first, second = (require_number("optimizer.betas", b, at_least=0.0, at_most=1.0) for b in betas)
+    if not isinstance(betas, list | tuple) or len(betas) != 2:
+        raise InputError(f"optimizer.betas is {betas!r}, but must be two numbers, as in [0.95, 0.95].")
+    first, second = (require_number("optimizer.betas", b, at_least=0.0, at_most=0.999999) for b in betas)
     return first, second
 
 
@@ -40,6 +42,7 @@ def optimizer_maker(name: str, lr: float, **options) -> Callable[[list[Tensor]],
     """A maker of the optimiser ``name`` with learning rate ``lr``; other options as in its configuration file."""
     make = OPTIMIZERS[require_choice("optimizer.name", name, OPTIMIZERS)]
     rate = require_number("optimizer.lr", lr, above=0.0)
+    require_call(make, "optimizer", options, parameters=None, lr=rate)
     return lambda parameters: make(parameters, lr=rate, **options)
 
 

@@ -6,7 +6,10 @@ from dataclasses import dataclass
 
 import torch
 
-from ocp_torch.errors import InputError, require_choice, require_integer
+from ocp_torch.errors import InputError, require_choice, require_flag, require_integer
+
+# More threads than any machine has crash the thread pool.
+MOST_THREADS = 1024
 
 
 @dataclass(frozen=True)
@@ -25,8 +28,11 @@ class TrainerSettings:
     progress: bool  # a progress bar, where the output is a terminal
 
     def __post_init__(self) -> None:
-        for name, minimum in (("steps", 1), ("batch", 1), ("threads", 1), ("log_every", 1)):
-            require_integer(f"trainer.{name}", getattr(self, name), minimum)
+        for name in ("steps", "batch", "log_every"):
+            require_integer(f"trainer.{name}", getattr(self, name), 1)
+        require_integer("trainer.threads", self.threads, 1, maximum=MOST_THREADS)
+        for name in ("figures", "progress"):
+            require_flag(f"trainer.{name}", getattr(self, name))
         for name in ("evaluate_every", "checkpoint_every"):
             require_integer(f"trainer.{name}", getattr(self, name), 0)
         require_choice("trainer.dtype", self.dtype, ("float32", "float64"))
