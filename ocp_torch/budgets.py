@@ -19,28 +19,35 @@ class Budget:
     gated: bool
     steps: int
     batch: int
+    lr: float
     stage_steps: int
     stage_batch: int
 
 
 # Kinks want Fourier modes, affordable in one and two dimensions; many dimensions want products, width and samples.
 BUDGETS = (
-    Budget(2, modes=6, width=96, gated=False, steps=5000, batch=256, stage_steps=2000, stage_batch=512),
-    Budget(4, modes=3, width=128, gated=False, steps=4000, batch=384, stage_steps=1500, stage_batch=512),
-    Budget(float("inf"), modes=1, width=128, gated=True, steps=5000, batch=512, stage_steps=1200, stage_batch=512),
+    Budget(2, modes=6, width=96, gated=False, steps=5000, batch=256, lr=3e-3, stage_steps=2000, stage_batch=512),
+    Budget(4, modes=3, width=128, gated=False, steps=4000, batch=384, lr=3e-3, stage_steps=1500, stage_batch=512),
+    Budget(
+        float("inf"), modes=1, width=128, gated=True, steps=5000, batch=512, lr=1e-2, stage_steps=1200, stage_batch=512
+    ),
 )
 
 
 def fill(config: dict, problem: Problem) -> dict:
     """``config`` with the fields that are null, and have a default by dimension, filled in."""
     budget = next(b for b in BUDGETS if problem.dim <= b.dim)
+    for name in ("model", "trainer", "optimizer", "certificate"):
+        require_section(name, config.get(name))
     filled = copy.deepcopy(config)
     defaults = {
         ("model", "modes"): budget.modes,
         ("model", "width"): budget.width,
         ("model", "gated"): budget.gated,
+        ("trainer", "rounds"): 2 if config["trainer"].get("steps") is None else 1,
         ("trainer", "steps"): budget.steps,
         ("trainer", "batch"): budget.batch,
+        ("optimizer", "lr"): budget.lr,
         ("certificate", "stage", "steps"): budget.stage_steps,
         ("certificate", "stage", "batch"): budget.stage_batch,
     }

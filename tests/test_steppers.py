@@ -204,8 +204,8 @@ def test_the_decay_schedule_takes_a_quarter_off_every_20000_steps():
     assert rates[40000] == 0.75**2
 
 
-def test_the_cosine_schedule_goes_from_one_through_a_half_to_zero():
-    wanted = [0.5 + 0.5 * math.cos(math.pi * k / 100) for k in range(101)]
+def test_the_cosine_schedule_falls_from_one_towards_zero_and_starts_again_after_its_last_step():
+    wanted = [0.5 + 0.5 * math.cos(math.pi * k / 100) for k in range(100)] + [1.0]
     np.testing.assert_allclose(rates_over("cosine", 100), wanted, atol=1e-12)
     assert set(rates_over("constant", 5)) == {1.0}
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 from torch.optim import Optimizer
-from torch.optim.lr_scheduler import CosineAnnealingLR, LambdaLR, LRScheduler, StepLR
+from torch.optim.lr_scheduler import CosineAnnealingWarmRestarts, LambdaLR, LRScheduler, StepLR
 
 from ocp_torch.errors import InputError, require_call, require_choice, require_integer, require_number
 
@@ -47,16 +47,19 @@ def optimizer_maker(name: str, lr: float, **options) -> Callable[[list[Tensor]],
 
 
 def schedule_maker(name: str, steps: int, decay: float = 0.75, every: int = 20000) -> Callable[..., LRScheduler]:
-    """A maker of the learning-rate schedule of an optimiser whose player rests for the part ``resting`` of ``steps``:
-    ``constant``; ``cosine`` to zero over its own moves; or ``decay``, a factor ``decay`` every ``every`` moves (the paper
-    decreases by 25 % every 20,000)."""
+    """A maker of the learning-rate schedule of an optimiser whose player rests for the part ``resting`` of ``steps``.
+
+    ``constant``; ``cosine`` to zero over the player's own moves, and again over twice as many in each further round; or
+    ``decay``, a factor ``decay`` every ``every`` moves (the paper decreases by 25 % every 20,000).
+    """
     require_choice("schedule.name", name, ("constant", "cosine", "decay"))
     factor = require_number("schedule.decay", decay, above=0.0, at_most=1.0)
     period = require_integer("schedule.every", every, 1)
 
     def make(optimizer: Optimizer, resting: float = 0.0) -> LRScheduler:
         if name == "cosine":
-            return CosineAnnealingLR(optimizer, T_max=max(1, steps - math.ceil(resting * steps)))
+            moves = max(1, steps - math.ceil(resting * steps))
+            return CosineAnnealingWarmRestarts(optimizer, T_0=moves, T_mult=2)
         if name == "decay":
             return StepLR(optimizer, step_size=period, gamma=factor)
         return LambdaLR(optimizer, lambda _: 1.0)

@@ -25,6 +25,9 @@ class Silent:
     def evaluated(self, trainer, certificate: Certificate) -> None:
         """The bounds were looked at."""
 
+    def extended(self, trainer) -> None:
+        """Another round begins."""
+
 
 class Monitor(Silent):
     """Progress bar (terminals only), log lines, and TensorBoard scalars in the groups bounds, performance, loss, lr,
@@ -71,6 +74,10 @@ class Monitor(Silent):
             values["gap"] = f"{100 * gap:.2f}%"
         self._show(**values)
         log.debug("step %d: %s", trainer.step, ", ".join(f"{k} {v}" for k, v in values.items()))
+
+    def extended(self, trainer) -> None:
+        self.bar.total = trainer.end
+        log.info("the gap is not good yet: training goes on to step %d", trainer.end)
 
     def record(self, certificate: Certificate, step: int) -> None:
         """All numbers of ``certificate`` as scalars at ``step``."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from ocp_torch.errors import InputError, require_choice, require_flag, require_integer
+from ocp_torch.errors import InputError, require_choice, require_flag, require_integer, require_number
 
 # More threads than any machine has crash the thread pool.
 MOST_THREADS = 1024
@@ -16,7 +16,9 @@ MOST_THREADS = 1024
 class TrainerSettings:
     """Budget, precision, device and rhythm of a run. Raises `InputError`, naming the field, on a wrong value."""
 
-    steps: int  # updates of every player
+    steps: int  # updates of every player, in the first round
+    rounds: int  # rounds at most, each twice as long as the one before; the next starts only while good_gap is not met
+    good_gap: float  # relative gap between the lower bound and the simulated performance that needs no further round
     batch: int  # states per draw
     dtype: str  # float32 or float64, for networks and samples; certificates are always float64
     device: str  # auto (a GPU where there is one), cpu or cuda
@@ -30,6 +32,8 @@ class TrainerSettings:
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "log_every"):
             require_integer(f"trainer.{name}", getattr(self, name), 1)
+        require_integer("trainer.rounds", self.rounds, 1, maximum=16)
+        require_number("trainer.good_gap", self.good_gap, above=0.0)
         require_integer("trainer.threads", self.threads, 1, maximum=MOST_THREADS)
         for name in ("figures", "progress"):
             require_flag(f"trainer.{name}", getattr(self, name))

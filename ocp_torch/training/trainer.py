@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from torch import nn
@@ -20,6 +21,8 @@ from ocp_torch.training.settings import TrainerSettings
 
 # What a look at the bounds during training costs: enough for a curve, not for a claim.
 QUICK = CertificateSettings(points=1024, replicates=2, trajectories=0, ascents=8, stage=StageSettings(steps=0))
+# A look at the controller as well: what decides on another round.
+GLANCE = replace(QUICK, trajectories=64)
 
 
 class Trainer:
@@ -44,7 +47,7 @@ class Trainer:
         self.problem, self.fields, self.objective, self.bounds = problem, fields, objective, bounds
         self.stepper, self.average, self.sampler, self.settings = stepper, average, sampler, settings
         self.network, self.seed, self.names, self.config = network, seed, names, config
-        self.step, self.samples, self.seconds = 0, 0, 0.0
+        self.step, self.round, self.samples, self.seconds = 0, 0, 0, 0.0
 
     @property
     def averaged_fields(self) -> Fields:
@@ -62,23 +65,51 @@ class Trainer:
         x = self.sampler.draw(self.settings.batch).to(self.settings.torch_device)
         return Samples.of(self.problem, x, divergences=self.objective.needs_divergences)
 
+    @property
+    def end(self) -> int:
+        """The step at which the present round ends: round `k` (from 0) is `2^k` times as long as the first."""
+        return self.settings.steps * (2 ** (self.round + 1) - 1)
+
+    @property
+    def progress(self) -> float:
+        """The part of the present round that is done."""
+        length = self.settings.steps * 2**self.round
+        return 1.0 - (self.end - self.step) / length
+
     def fit(self, monitor, checkpoint: Path | None = None) -> None:
-        """Train up to ``settings.steps``; save to ``checkpoint`` on the way and at the end."""
+        """Train for the first round, and for further ones as `settings` allow; save to ``checkpoint`` on the way."""
+        while True:
+            while self.step < self.end:
+                self._advance(monitor, checkpoint)
+            if not self._wants_another_round():
+                break
+            self.round += 1
+            monitor.extended(self)
+        if checkpoint is not None:
+            save_checkpoint(checkpoint, self.state_dict())
+
+    def _advance(self, monitor, checkpoint: Path | None) -> None:
+        """One step, and what is due after it."""
         settings = self.settings
-        while self.step < settings.steps:
-            started = time.perf_counter()
-            self.objective.progress = self.step / settings.steps
-            report = self.stepper.step(self.draw, lambda: self.average.update_parameters(self.fields))
-            self.step += 1
-            self.samples += report.samples
-            self.seconds += time.perf_counter() - started
-            last = self.step == settings.steps
-            monitor.stepped(self, report, log=self.step % settings.log_every == 0 or last)
-            if settings.evaluate_every and self.step % settings.evaluate_every == 0 and not last:
-                monitor.evaluated(self, self.certify(QUICK))
-            due = settings.checkpoint_every and self.step % settings.checkpoint_every == 0
-            if checkpoint is not None and (due or last):
-                save_checkpoint(checkpoint, self.state_dict())
+        started = time.perf_counter()
+        self.objective.progress = self.progress
+        report = self.stepper.step(self.draw, lambda: self.average.update_parameters(self.fields))
+        self.step += 1
+        self.samples += report.samples
+        self.seconds += time.perf_counter() - started
+        last = self.step == self.end
+        monitor.stepped(self, report, log=self.step % settings.log_every == 0 or last)
+        if settings.evaluate_every and self.step % settings.evaluate_every == 0 and not last:
+            monitor.evaluated(self, self.certify(QUICK))
+        if checkpoint is not None and settings.checkpoint_every and self.step % settings.checkpoint_every == 0:
+            save_checkpoint(checkpoint, self.state_dict())
+
+    def _wants_another_round(self) -> bool:
+        """Whether rounds are left and the gap is not good yet; never without a lower bound to measure it by."""
+        if self.round + 1 >= self.settings.rounds or self.fields.value is None:
+            return False
+        gap = self.certify(GLANCE).gap["simulated"]
+        return gap is None or gap > self.settings.good_gap
 
     def certify(self, settings: CertificateSettings) -> Certificate:
         """The certificate of the averaged fields as they stand."""
@@ -89,6 +120,7 @@ class Trainer:
         """Everything needed to go on exactly."""
         return {
             "step": self.step,
+            "round": self.round,
             "samples": self.samples,
             "seconds": self.seconds,
             "fields": self.fields.state_dict(),
@@ -98,7 +130,8 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        self.step, self.samples, self.seconds = state["step"], state["samples"], state["seconds"]
+        self.step, self.round = state["step"], state["round"]
+        self.samples, self.seconds = state["samples"], state["seconds"]
         self.fields.load_state_dict(state["fields"])
         self.average.load_state_dict(state["average"])
         self.stepper.load_state_dict(state["stepper"])
