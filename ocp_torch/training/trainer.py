@@ -20,7 +20,7 @@ from ocp_torch.training.checkpoint import load_checkpoint, save_checkpoint
 from ocp_torch.training.settings import TrainerSettings
 
 # What a look at the bounds during training costs: enough for a curve, not for a claim.
-QUICK = CertificateSettings(points=1024, replicates=2, trajectories=0, ascents=8, stage=StageSettings(steps=0))
+QUICK = CertificateSettings(points=2048, replicates=2, trajectories=0, ascents=8, stage=StageSettings(steps=0))
 # A look at the controller as well: what decides on another round.
 GLANCE = replace(QUICK, trajectories=64)
 
