@@ -68,10 +68,13 @@ def occupation_along_flow(problem: Problem, law: ControlLaw, x: Tensor, horizon:
     return density
 
 
-def estimated_sup_occupation(problem: Problem, law: ControlLaw, end_states: Tensor, count: int = 96) -> float:
+def estimated_sup_occupation(problem: Problem, law: ControlLaw, end_states: Tensor, states: int) -> float:
     """The largest `mu^u` met at the ends of trajectories, where mass accumulates, and at uniform states."""
+    count = max(1, 2 * states // 3)
     picked = end_states[:: max(1, len(end_states) // count)][:count]
-    uniform = torch.rand(count // 2, problem.dim, dtype=picked.dtype, generator=torch.Generator().manual_seed(0))
+    uniform = torch.rand(
+        states - len(picked), problem.dim, dtype=picked.dtype, generator=torch.Generator().manual_seed(0)
+    )
     x = torch.cat([picked, uniform.to(picked.device)])
     horizon = 8.0 / problem.discount
     speed = float(problem.velocity(x, law(x)).norm(dim=-1).max())

@@ -38,6 +38,7 @@ class CertificateSettings:
     replicates: int = 8  # independent randomised point sets behind each standard error
     trajectories: int = 256  # simulated starts per replicate; 0 skips every simulation
     ascents: int = 32  # local ascents from the worst sampled states
+    occupation_states: int = 144  # where the supremum of the occupation density is looked for; 0 skips it
     stage: StageSettings = field(default_factory=StageSettings)  # the fit to the closed loop
 
     def __post_init__(self) -> None:
@@ -45,6 +46,7 @@ class CertificateSettings:
         require_integer("certificate.replicates", self.replicates, 2)
         require_integer("certificate.trajectories", self.trajectories, 0)
         require_integer("certificate.ascents", self.ascents, 1)
+        require_integer("certificate.occupation_states", self.occupation_states, 0)
 
 
 @dataclass(frozen=True)
@@ -101,8 +103,9 @@ def certify_fields(
         warnings += notes
     with torch.no_grad():
         sup_control = max(float(laws[best](samples.x[:4096]).norm(dim=-1).max()) for samples in few)
-        if best in finite:
-            sup_occupation = estimated_sup_occupation(problem, laws[best], finite[best].end_states)
+        if best in finite and settings.occupation_states:
+            ends, states = finite[best].end_states, settings.occupation_states
+            sup_occupation = estimated_sup_occupation(problem, laws[best], ends, states)
     largest_value = finite[best].largest_value if best in finite else None
     assumptions, notes = check_assumptions(
         problem, bounds, sup_occupation, sup_control, largest_value, uses=(has_value, J is not None)

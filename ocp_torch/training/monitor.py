@@ -69,9 +69,9 @@ class Monitor(Silent):
         self.record(certificate, trainer.step)
         shown = {name: e for name, e in {**certificate.lower, **certificate.upper}.items() if e is not None}
         values = {name: f"{shown[name].value:.6f}" for name in ("F_M", "J") if name in shown}
-        gap = certificate.gap["certified"]
-        if gap is not None:
-            values["gap"] = f"{100 * gap:.2f}%"
+        gaps = [gap for gap in (certificate.gap["certified"], certificate.gap["simulated"]) if gap is not None]
+        if gaps:
+            values["gap"] = f"{100 * min(gaps):.2f}%"
         self._show(**values)
         log.debug("step %d: %s", trainer.step, ", ".join(f"{k} {v}" for k, v in values.items()))
 
