@@ -63,7 +63,7 @@ def resolve_bounds(
         else:
             chosen[name], why = _ESTIMATES[name](problem)
             sources[name] = ESTIMATED
-            notes.append(f"{name} is not known: {chosen[name]:.4g} is {why}; set {fields[name]} if you know better.")
+            notes.append(f"{name} is not known: {chosen[name]:.4g} is {why}; {fields[name]} sets it.")
     if sources["M"] == FROM_CONFIGURATION and problem.occupation_bound is not None:
         if chosen["M"] < problem.occupation_bound:
             true = f"{problem.occupation_bound:.4g}" if math.isfinite(problem.occupation_bound) else "infinite"
@@ -101,7 +101,7 @@ def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
 
 def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
     largest = float(problem.initial_density(_search_points(problem)).max())
-    return OCCUPATION_GUESS * largest, f"a guess, {OCCUPATION_GUESS:g} times sup mu0, that F_M cannot be trusted on"
+    return OCCUPATION_GUESS * largest, f"a guess to train with, {OCCUPATION_GUESS:g} times sup mu0"
 
 
 _ESTIMATES = {"M": _estimate_occupation_bound, "C_V": _estimate_value_bound, "C_u": _estimate_control_bound}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from math import inf
 
 from ocp_torch.errors import require_section
 from ocp_torch.problems import Problem
@@ -28,9 +29,8 @@ class Budget:
 BUDGETS = (
     Budget(2, modes=6, width=96, gated=False, steps=5000, batch=256, lr=3e-3, stage_steps=2000, stage_batch=512),
     Budget(4, modes=3, width=128, gated=False, steps=4000, batch=384, lr=3e-3, stage_steps=1500, stage_batch=512),
-    Budget(
-        float("inf"), modes=1, width=128, gated=True, steps=5000, batch=512, lr=1e-2, stage_steps=1200, stage_batch=512
-    ),
+    Budget(8, modes=1, width=128, gated=True, steps=5000, batch=512, lr=1e-2, stage_steps=1200, stage_batch=512),
+    Budget(inf, modes=1, width=128, gated=True, steps=8000, batch=512, lr=1e-2, stage_steps=1600, stage_batch=512),
 )
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import nn
 
-from ocp_torch.bounds import Bounds
+from ocp_torch.bounds import ESTIMATED, Bounds
 from ocp_torch.certificate.assumptions import Assumptions, check_assumptions, estimated_sup_occupation
 from ocp_torch.certificate.certificate import Certificate, Run
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
@@ -28,6 +29,8 @@ from ocp_torch.samples import Samples
 BASELINE_FACTOR = 2
 # What costs `m` tangents through a network at each state, upper sides and residuals, is done on this part of the states.
 TANGENT_PART = 4
+# Head-room of an M that is estimated from the learned controller's occupation density.
+OCCUPATION_ROOM = 1.25
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,9 @@ def certify_fields(
         if best in finite and settings.occupation_states:
             ends, states = finite[best].end_states, settings.occupation_states
             sup_occupation = estimated_sup_occupation(problem, laws[best], ends, states)
+    if lower is not None:
+        bounds = raised(bounds, sup_occupation)
+        lower = replace(lower, M=bounds.M)
     largest_value = finite[best].largest_value if best in finite else None
     assumptions, notes = check_assumptions(
         problem, bounds, sup_occupation, sup_control, largest_value, uses=(has_value, J is not None)
@@ -125,6 +131,17 @@ def certify_fields(
         warnings=warnings,
         searches=_searches(lower, stage),
     )
+
+
+def raised(bounds: Bounds, sup_occupation: float | None) -> Bounds:
+    """``bounds`` with an `M` that nobody gave raised above the occupation density met under the learned controller."""
+    if bounds.sources["M"] != ESTIMATED or sup_occupation is None or not math.isfinite(sup_occupation):
+        return bounds
+    M = OCCUPATION_ROOM * sup_occupation
+    if M <= bounds.M:
+        return bounds
+    note = f"F_M uses M = {M:.4g}, {OCCUPATION_ROOM:g} times the occupation density met under the learned controller."
+    return replace(bounds, M=M, warnings=(*bounds.warnings, note))
 
 
 def certification_stage(

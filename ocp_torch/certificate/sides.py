@@ -21,12 +21,20 @@ CHUNK = 8192
 
 @dataclass(frozen=True)
 class LowerSide:
-    """`F_M` rests on `M`; `shifted` on the supremum of the slack; `initial` holds `E[V mu0]` per point set."""
+    """`F_M` rests on `M`, `shifted` on the supremum of the slack; per point set, `E[V mu0]` and `E[max(Q, 0)]`."""
 
-    F_M: Estimate
-    shifted: Estimate
+    M: float
     initial: list[float]
+    violation: list[float]
     largest_slack: Extremum
+
+    @property
+    def F_M(self) -> Estimate:
+        return Estimate.of([e - self.M * v for e, v in zip(self.initial, self.violation, strict=True)])
+
+    @property
+    def shifted(self) -> Estimate:
+        return Estimate.of([e - max(self.largest_slack.value, 0.0) for e in self.initial])
 
 
 def slack_function(problem: Problem, value: Field):
@@ -52,20 +60,19 @@ def lower_side(problem: Problem, value: Field, sets: list[Samples], M: float, as
     The second needs no `M`: `V` minus its largest positive slack is a subsolution, because a constant shifts `Q` by
     itself. Its supremum is sampled on all of ``sets`` and climbed, hence an estimate.
     """
-    penalised, initial, worst = [], [], None
+    violation, initial, worst = [], [], None
     for samples in sets:
         v, gradient = chunked_gradient(value, samples.x)
         slack = formulas.hjb_slack(samples, v, gradient, problem.control_cost, problem.discount)
         initial.append(integral(samples, v * samples.mu0))
-        penalised.append(integral(samples, v * samples.mu0 - M * slack.clamp_min(0.0)))
+        violation.append(integral(samples, slack.clamp_min(0.0)))
         top = slack.topk(min(ascents, len(slack)))
         found = torch.cat([top.values.unsqueeze(-1), samples.x[top.indices]], dim=-1)
         worst = found if worst is None else torch.cat([worst, found])
     start = worst[worst[:, 0].topk(min(ascents, len(worst))).indices, 1:]
     largest = supremum(slack_function(problem, value), start, ascents=ascents)
     largest = Extremum(largest.value, largest.x, sum(len(s) for s in sets), largest.ascents)
-    shifted = [e - max(largest.value, 0.0) for e in initial]
-    return LowerSide(Estimate.of(penalised), Estimate.of(shifted), initial, largest)
+    return LowerSide(M, initial, violation, largest)
 
 
 def upper_side(

@@ -77,7 +77,7 @@ class Monitor(Silent):
 
     def extended(self, trainer) -> None:
         self.bar.total = trainer.end
-        log.info("the gap is not good yet: training goes on to step %d", trainer.end)
+        log.info("not good yet: training goes on to step %d, with M = %.4g", trainer.end, trainer.bounds.M)
 
     def record(self, certificate: Certificate, step: int) -> None:
         """All numbers of ``certificate`` as scalars at ``step``."""

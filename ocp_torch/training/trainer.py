@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from torch import nn
 
 from ocp_torch.bounds import Bounds
-from ocp_torch.certificate import Certificate, CertificateSettings, Run, StageSettings, Trained, certify_fields
+from ocp_torch.certificate import Certificate, CertificateSettings, Run, StageSettings, Trained, certify_fields, raised
 from ocp_torch.fields import Fields
 from ocp_torch.objectives import Objective
 from ocp_torch.problems import Problem
@@ -104,11 +105,22 @@ class Trainer:
             save_checkpoint(checkpoint, self.state_dict())
 
     def _wants_another_round(self) -> bool:
-        """Whether rounds are left and the gap is not good yet; never without a lower bound to measure it by."""
+        """Whether rounds are left and the gap is not good yet; never without a lower bound to measure it by.
+
+        An `M` that was a guess and turned out too small is raised for the next round.
+        """
         if self.round + 1 >= self.settings.rounds or self.fields.value is None:
             return False
-        gap = self.certify(QUICK).gap["simulated"]
+        certificate = self.certify(replace(QUICK, occupation_states=CertificateSettings.occupation_states))
+        better = raised(self.bounds, certificate.assumptions.estimated_sup_occupation)
+        if better.M > self.bounds.M:
+            self._use(better)
+            return True
+        gap = certificate.gap["simulated"]
         return gap is None or gap > self.settings.good_gap
+
+    def _use(self, bounds: Bounds) -> None:
+        self.bounds = self.objective.bounds = bounds
 
     def certify(self, settings: CertificateSettings) -> Certificate:
         """The certificate of the averaged fields as they stand."""
@@ -120,6 +132,7 @@ class Trainer:
         return {
             "step": self.step,
             "round": self.round,
+            "M": self.bounds.M,
             "samples": self.samples,
             "seconds": self.seconds,
             "fields": self.fields.state_dict(),
@@ -131,6 +144,7 @@ class Trainer:
     def load_state_dict(self, state: dict) -> None:
         self.step, self.round = state["step"], state["round"]
         self.samples, self.seconds = state["samples"], state["seconds"]
+        self._use(replace(self.bounds, M=state["M"]))
         self.fields.load_state_dict(state["fields"])
         self.average.load_state_dict(state["average"])
         self.stepper.load_state_dict(state["stepper"])
