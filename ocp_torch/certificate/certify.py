@@ -27,7 +27,8 @@ from ocp_torch.samples import Samples
 
 # The zero controller costs a fraction of a learned one to simulate, and has no control variate.
 BASELINE_FACTOR = 2
-# What costs `m` tangents through a network at each state, upper sides and residuals, is done on this part of the states.
+# What costs `m` tangents through a network at each state, upper sides and residuals, is done on a quarter of the states
+# at most, and from eight dimensions on on one in `d / 2`.
 TANGENT_PART = 4
 # Head-room of an M that is estimated from the learned controller's occupation density.
 OCCUPATION_ROOM = 1.25
@@ -81,7 +82,8 @@ def certify_fields(
     if has_value:
         sets = replicated_samples(problem, settings.points, count, seed, divergences=False)
         lower = lower_side(problem, fields.value, sets, bounds.M, settings.ascents)
-    few = replicated_samples(problem, max(1, settings.points // TANGENT_PART), count, seed, divergences=True)
+    part = max(TANGENT_PART, problem.dim // 2)
+    few = replicated_samples(problem, max(1, settings.points // part), count, seed, divergences=True)
     J = G = None
     if has_density and problem.gives_divergences:
         mu = occupation_density(occupation, problem, fields, bounds)
