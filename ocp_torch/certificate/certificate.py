@@ -30,7 +30,7 @@ class Certificate:
     """`F_M <= OPT <= Perf(u) <= J`: each number an `Estimate`, or `None` where it does not apply.
 
     ``lower``, ``upper``, ``perf`` and ``baseline`` map the names of `certificate.json` to estimates; ``searches`` says how
-    each supremum behind them was found.
+    each supremum behind them was found, ``speaks`` whether `J` and `G` are about the controller that is handed out.
     """
 
     run: Run
@@ -42,6 +42,7 @@ class Certificate:
     assumptions: Assumptions
     warnings: list[str] = field(default_factory=list)
     searches: list[str] = field(default_factory=list)
+    speaks: dict[str, bool] = field(default_factory=dict)
 
     @property
     def best_lower(self) -> tuple[str, float] | None:
@@ -51,9 +52,10 @@ class Certificate:
 
     @property
     def best_upper(self) -> tuple[str, float] | None:
-        """Name and value of the smallest upper bound whose assumptions hold; no simulation in it."""
+        """The smallest upper bound of the controller handed out whose assumptions hold; no simulation in it."""
         holds = self.assumptions.value_holds
-        return _best(min, self.upper, {"J": holds, "G": holds, "lagrangian": True})
+        usable = {name: holds and self.speaks.get(name, True) for name in ("J", "G")}
+        return _best(min, self.upper, {**usable, "lagrangian": True})
 
     @property
     def best_perf(self) -> tuple[str, float] | None:

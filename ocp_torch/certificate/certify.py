@@ -11,14 +11,14 @@ import torch
 from torch import nn
 
 from ocp_torch.bounds import ESTIMATED, Bounds
-from ocp_torch.certificate.assumptions import Assumptions, check_assumptions, estimated_sup_occupation
+from ocp_torch.certificate.assumptions import check_assumptions, estimated_sup_occupation
 from ocp_torch.certificate.certificate import Certificate, Run
-from ocp_torch.certificate.estimate import Estimate, replicated_samples
+from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.performance import Simulated, simulate_performance
 from ocp_torch.certificate.sides import LowerSide, lower_side, upper_side
 from ocp_torch.certificate.stage import StageSettings, fit_closed_loop
-from ocp_torch.control_laws import control_laws, occupation_density, zero_law
+from ocp_torch.control_laws import CLOSED, control_laws, occupation_density, zero_law
 from ocp_torch.errors import require_integer
 from ocp_torch.fields.fields import Fields
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -84,10 +84,6 @@ def certify_fields(
         lower = lower_side(problem, fields.value, sets, bounds.M, settings.ascents)
     part = max(TANGENT_PART, problem.dim // 2)
     few = replicated_samples(problem, max(1, settings.points // part), count, seed, divergences=True)
-    J = G = None
-    if has_density and problem.gives_divergences:
-        mu = occupation_density(occupation, problem, fields, bounds)
-        J, G = upper_side(problem, fields.control_density, mu, few, bounds.C_V)
     laws = control_laws(occupation, problem, fields, bounds)
     simulated: dict[str, Simulated] = {}
     zero = sup_control = sup_occupation = stage = None
@@ -103,6 +99,10 @@ def certify_fields(
         ).perf
     finite = {name: s for name, s in simulated.items() if s.perf.finite}
     best = min(finite, key=lambda n: finite[n].perf.above, default=next(iter(laws)))
+    J = G = None
+    if has_density and problem.gives_divergences:
+        mu = occupation_density(occupation, problem, fields, bounds)
+        J, G = upper_side(problem, fields.control_density, mu, few, bounds.C_V)
     if settings.stage.steps:
         stage, notes = certification_stage(problem, trained, fields, bounds, settings, few, lower, best, seed)
         warnings += notes
@@ -119,7 +119,12 @@ def certify_fields(
         problem, bounds, sup_occupation, sup_control, largest_value, uses=(has_value, J is not None)
     )
     warnings = list(bounds.warnings) + notes + warnings
-    J, G, assumptions = _tighter_upper(J, G, stage, assumptions)
+    # J bounds the performance of w / mu and G that of w over the mu of Lemma 2: of nothing else.
+    speaks = {"J": best == "density", "G": best == "density" and occupation == CLOSED and assumptions.value_holds}
+    if stage is not None and not (speaks["J"] and assumptions.value_holds and J.value <= stage.J.value):
+        J, assumptions, speaks["J"] = stage.J, assumptions.with_value_bound(stage.C_V), True
+    if G is not None and not speaks["G"]:
+        warnings.append("G bounds OPT, but not the controller that is handed out: the gap does not use it.")
     perf = {name: simulated[name].perf if name in simulated else None for name in ("value", "density")}
     warnings += _plausibility(perf, zero)
     return Certificate(
@@ -132,6 +137,7 @@ def certify_fields(
         assumptions=assumptions,
         warnings=warnings,
         searches=_searches(lower, stage),
+        speaks=speaks,
     )
 
 
@@ -170,23 +176,7 @@ def certification_stage(
     loop_sets = [Samples.concatenate([Samples.of(loop, x) for x in s.x.split(8192)]) for s in sets]
     value = fields.value if fields.value is not None else fitted.value
     initial = lower.initial if lower is not None else None
-    found = closed_loop_bounds(loop, value, fitted.log_occupation, loop_sets, settings.ascents, kind, initial)
-    if problem.driftless:
-        mu = lambda x: fitted.log_occupation(x).exp()
-        _, G = upper_side(problem, lambda x: mu(x).unsqueeze(-1) * loop.law(x), mu, sets, found.C_V)
-        found = replace(found, G=G)
-    return found, []
-
-
-def _tighter_upper(J: Estimate | None, G: Estimate | None, stage: ClosedLoopBounds | None, assumptions: Assumptions):
-    """The smaller `J` and `G` whose `C_V` holds, and the assumptions with the `C_V` that was used."""
-    if stage is None:
-        return J, G, assumptions
-    trained = [e for e in (J, G) if e is not None and e.finite]
-    fitted = [e for e in (stage.J, stage.G) if e is not None and e.finite]
-    if assumptions.value_holds and trained and min(e.value for e in trained) <= min(e.value for e in fitted):
-        return J, G, assumptions
-    return stage.J, stage.G, assumptions.with_value_bound(stage.C_V)
+    return closed_loop_bounds(loop, value, fitted.log_occupation, loop_sets, settings.ascents, kind, initial), []
 
 
 def _searches(lower: LowerSide | None, stage: ClosedLoopBounds | None) -> list[str]:

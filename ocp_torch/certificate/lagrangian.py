@@ -39,7 +39,6 @@ class ClosedLoopBounds:
     eps_hi: Extremum
     eps_lo: Extremum
     residual: float  # E[|r|]
-    G: Estimate | None = None  # min_mu J(mu u, .), where there is no drift
 
 
 def closed_loop_bounds(
