@@ -68,14 +68,13 @@ class AugmentedSaddle(Objective):
     """
 
     players = {"value": (VALUE,), "density": (CONTROL_DENSITY, LOG_OCCUPATION)}
+    occupation = control_laws.NETWORK
 
     def __init__(
         self, problem: Problem, bounds: Bounds, augmentation: float, coupling: float, residual: float, warm_start: float
     ) -> None:
         super().__init__(problem, bounds)
         self.augmentation, self.coupling, self.residual = augmentation, coupling, residual
-        # Without drift the best mu for a given w is pointwise, and J(w, mu) is then G(w) (Lemma 2).
-        self.occupation = control_laws.CLOSED if problem.driftless else control_laws.NETWORK
         self.resting = {"density": warm_start if coupling == 0.0 else 0.0}
 
     @property
