@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 
@@ -105,8 +105,3 @@ def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
 
 
 _ESTIMATES = {"M": _estimate_occupation_bound, "C_V": _estimate_value_bound, "C_u": _estimate_control_bound}
-
-
-def with_value_bound(bounds: Bounds, value: float, source: str) -> Bounds:
-    """The same bounds with another `C_V`."""
-    return replace(bounds, C_V=value, sources={**bounds.sources, "C_V": source})

@@ -103,6 +103,12 @@ def certify_fields(
     if has_density and problem.gives_divergences:
         mu = occupation_density(occupation, problem, fields, bounds)
         J, G = upper_side(problem, fields.control_density, mu, few, bounds.C_V)
+        with torch.no_grad():
+            vanishes = any(bool((mu(samples.x[:4096]) <= 0.0).any()) for samples in few)
+        if best == "density" and vanishes:
+            warnings.append(
+                "mu is 0 at sampled states, where w / mu is not regular: J and G may miss what it costs there."
+            )
     if settings.stage.steps:
         stage, notes = certification_stage(problem, trained, fields, bounds, settings, few, lower, best, seed)
         warnings += notes
