@@ -22,8 +22,8 @@ class Budget:
     steps: int
     batch: int
     lr: float
+    good_gap: float
     stage_steps: int
-    stage_batch: int
 
 
 # A plain and a gated network: products of tanh learn terms that couple many coordinates several times faster.
@@ -31,10 +31,10 @@ PLAIN, GATED = dict(gated=False, activation="gelu", lr=3e-3), dict(gated=True, a
 
 # Kinks want Fourier modes, affordable in one and two dimensions; many dimensions want products and samples.
 BUDGETS = (
-    Budget(2, modes=6, width=96, **PLAIN, steps=5000, batch=256, stage_steps=2000, stage_batch=512),
-    Budget(4, modes=3, width=128, **PLAIN, steps=4000, batch=384, stage_steps=1500, stage_batch=512),
-    Budget(8, modes=1, width=128, **GATED, steps=5000, batch=512, stage_steps=1200, stage_batch=512),
-    Budget(inf, modes=1, width=128, **GATED, steps=8000, batch=512, stage_steps=1600, stage_batch=512),
+    Budget(2, modes=6, width=96, **PLAIN, steps=2500, batch=256, good_gap=0.002, stage_steps=600),
+    Budget(4, modes=3, width=128, **PLAIN, steps=2500, batch=384, good_gap=0.005, stage_steps=600),
+    Budget(8, modes=1, width=128, **GATED, steps=3500, batch=512, good_gap=0.01, stage_steps=600),
+    Budget(inf, modes=1, width=128, **GATED, steps=5000, batch=512, good_gap=0.02, stage_steps=800),
 )
 
 
@@ -50,11 +50,11 @@ def fill(config: dict, problem: Problem) -> dict:
         ("model", "gated"): budget.gated,
         ("model", "activation"): budget.activation,
         ("trainer", "rounds"): 2 if config["trainer"].get("steps") is None else 1,
+        ("trainer", "good_gap"): budget.good_gap,
         ("trainer", "steps"): budget.steps,
         ("trainer", "batch"): budget.batch,
         ("optimizer", "lr"): budget.lr,
         ("certificate", "stage", "steps"): budget.stage_steps,
-        ("certificate", "stage", "batch"): budget.stage_batch,
     }
     for (*path, name), value in defaults.items():
         section = filled

@@ -7,7 +7,6 @@ import inspect
 import re
 from collections.abc import Callable
 
-import torch
 from torch import nn
 
 from ocp_torch.bounds import resolve_bounds
@@ -26,6 +25,7 @@ from ocp_torch.errors import (
 from ocp_torch.fields import MODELS, Fields
 from ocp_torch.objectives import METHODS, Objective
 from ocp_torch.problems import Problem
+from ocp_torch.process import prepare
 from ocp_torch.samplers import SAMPLERS, derive_seed
 from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training.settings import TrainerSettings
@@ -64,7 +64,7 @@ def build_trainer(config: dict) -> Trainer:
     problem = build_problem(config["problem"])
     config = fill(config, problem)
     settings = call(TrainerSettings, "trainer", require_section("trainer", config["trainer"]))
-    torch.set_num_threads(settings.threads)
+    prepare(settings.threads)
     method = require_section("method", config["method"])
     name = require_choice("method.name", method.pop("name", None), METHODS)
     bounds = resolve_bounds(problem, **{field: method.pop(field, None) for field in BOUND_FIELDS})

@@ -20,7 +20,7 @@ class Extremum:
 
 
 @torch.no_grad()
-def batched(function: Callable[[Tensor], Tensor], x: Tensor, chunk: int = 8192) -> Tensor:
+def batched(function: Callable[[Tensor], Tensor], x: Tensor, chunk: int = 1024) -> Tensor:
     """``function`` over the rows of ``x`` in chunks, so that memory stays bounded."""
     return torch.cat([function(part) for part in x.split(chunk)])
 

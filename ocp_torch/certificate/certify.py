@@ -16,7 +16,7 @@ from ocp_torch.certificate.certificate import Certificate, Run
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.performance import Simulated, simulate_performance
-from ocp_torch.certificate.sides import LowerSide, lower_side, upper_side
+from ocp_torch.certificate.sides import CHUNK, LowerSide, lower_side, upper_side
 from ocp_torch.certificate.stage import StageSettings, fit_closed_loop
 from ocp_torch.control_laws import CLOSED, control_laws, occupation_density, zero_law
 from ocp_torch.errors import require_integer
@@ -25,11 +25,11 @@ from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
 
-# The zero controller costs a fraction of a learned one to simulate, and has no control variate.
-BASELINE_FACTOR = 2
-# What costs `m` tangents through a network at each state, upper sides and residuals, is done on a quarter of the states
-# at most, and from eight dimensions on on one in `d / 2`.
-TANGENT_PART = 4
+# Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories.
+BASELINE_PART = 4
+# What costs `m` tangents through a network at each state, upper sides and residuals, is done on one state in
+# eight, and beyond sixteen dimensions on one in `d / 2`.
+TANGENT_PART = 8
 # Head-room of an M that is estimated from the learned controller's occupation density.
 OCCUPATION_ROOM = 1.25
 
@@ -95,7 +95,7 @@ def certify_fields(
                 problem, law, settings.trajectories, count, seed, value=fields.value, initial=initial
             )
         zero = simulate_performance(
-            problem, zero_law(problem), BASELINE_FACTOR * settings.trajectories, count, seed
+            problem, zero_law(problem), max(2, settings.trajectories // BASELINE_PART), count, seed
         ).perf
     finite = {name: s for name, s in simulated.items() if s.perf.finite}
     best = min(finite, key=lambda n: finite[n].perf.above, default=next(iter(laws)))
@@ -179,7 +179,7 @@ def certification_stage(
         return None, [f"the certification stage failed: {error}"]
     fitted = in_float64(fitted)
     loop = ClosedLoop(problem, control_laws(trained.occupation, problem, fields, bounds)[kind])
-    loop_sets = [Samples.concatenate([Samples.of(loop, x) for x in s.x.split(8192)]) for s in sets]
+    loop_sets = [Samples.concatenate([Samples.of(loop, x) for x in s.x.split(CHUNK)]) for s in sets]
     value = fields.value if fields.value is not None else fitted.value
     initial = lower.initial if lower is not None else None
     return closed_loop_bounds(loop, value, fitted.log_occupation, loop_sets, settings.ascents, kind, initial), []

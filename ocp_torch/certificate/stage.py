@@ -7,7 +7,10 @@ from dataclasses import dataclass
 
 import torch
 
+from ocp_torch import calculus, formulas
 from ocp_torch.bounds import Bounds
+from ocp_torch.calculus import Field
+from ocp_torch.certificate.sides import CHUNK
 from ocp_torch.control_laws import ControlLaw
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
@@ -22,18 +25,28 @@ from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule
 STAGE_STREAM = 3
 # The closed loop's data are computed once on so many states at most: their divergences cost more than a step.
 POOL = 2**16
+# Where the stage looks at its own excess after a round.
+EXCESS_STATES = 4096
 
 
 @dataclass(frozen=True)
 class StageSettings:
     """Budget of the certification stage. Raises `InputError` on a wrong value."""
 
-    steps: int = 2000  # least-squares steps; 0 for no stage
-    batch: int = 512  # states per step
-    lr: float = 3.0e-3  # learning rate, with cosine decay
+    steps: int = 600  # least-squares steps in the first round; 0 for no stage
+    rounds: int = (
+        2  # rounds at most, each twice as long as the one before; the next starts only while `good_excess` is not met
+    )
+    good_excess: float = (
+        1e-3  # part of the Lagrangian bound that comes from the residual, where no further round is needed
+    )
+    batch: int = 256  # states per step
+    lr: float = 1.0e-2  # learning rate, with cosine decay in each round
 
     def __post_init__(self) -> None:
         require_integer("certificate.stage.steps", self.steps, 0)
+        require_integer("certificate.stage.rounds", self.rounds, 1, maximum=16)
+        require_number("certificate.stage.good_excess", self.good_excess, above=0.0)
         require_integer("certificate.stage.batch", self.batch, 1)
         require_number("certificate.stage.lr", self.lr, above=0.0)
 
@@ -59,18 +72,56 @@ def fit_closed_loop(
     fitted = Fields.build(problem, names, network, derive_seed(seed, STAGE_STREAM, 0)).to(like)
     if fields.log_occupation is not None:
         fitted.log_occupation.load_state_dict(fields.log_occupation.state_dict())
-    pool = _pool(loop, min(POOL, settings.steps * settings.batch), derive_seed(seed, STAGE_STREAM, 1), like)
-    picker = torch.Generator().manual_seed(derive_seed(seed, STAGE_STREAM, 2))
-    draw = lambda: pool.take(torch.randint(len(pool), (settings.batch,), generator=picker).to(like.device))
+    pool = Pool(loop, derive_seed(seed, STAGE_STREAM, 1), derive_seed(seed, STAGE_STREAM, 2), like)
+    draw = lambda: pool.draw(settings.batch)
     optimizer = optimizer_maker("soap", settings.lr, betas=(0.95, 0.95))
     makers = {player: optimizer for player in objective.players}
     stepper = Simultaneous(fitted, objective, makers, schedule_maker("cosine", settings.steps))
     average = averaged(fitted, decay=0.98)
-    for _ in range(settings.steps):
-        stepper.step(draw, lambda: average.update_parameters(fitted))
+    for k in range(settings.rounds):
+        steps = settings.steps * 2**k
+        pool.grow(min(POOL, steps * settings.batch))
+        for _ in range(steps):
+            stepper.step(draw, lambda: average.update_parameters(fitted))
+        value = fields.value if fields.value is not None else average.module.value
+        excess = relative_excess(loop, value, average.module.log_occupation, pool.samples.take(slice(EXCESS_STATES)))
+        if excess <= settings.good_excess:
+            break
     return average.module
 
 
-def _pool(loop: ClosedLoop, count: int, seed: int, like: torch.Tensor) -> Samples:
-    x = UniformSampler(loop.dim, seed, like.dtype).draw(count).to(like.device)
-    return Samples.concatenate([Samples.of(loop, part) for part in x.split(4096)])
+class Pool:
+    """Samples of a closed loop that are drawn from again and again, and grow when more are wanted."""
+
+    def __init__(self, loop: ClosedLoop, states_seed: int, draws_seed: int, like: torch.Tensor) -> None:
+        self.loop, self.device = loop, like.device
+        self.states = UniformSampler(loop.dim, states_seed, like.dtype)
+        self.picker = torch.Generator().manual_seed(draws_seed)
+        self.samples: Samples | None = None
+
+    def grow(self, count: int) -> None:
+        """Fresh states up to ``count`` in all."""
+        missing = count - (0 if self.samples is None else len(self.samples))
+        if missing > 0:
+            fresh = self.states.draw(missing).to(self.device).split(CHUNK)
+            kept = [] if self.samples is None else [self.samples]
+            self.samples = Samples.concatenate([*kept, *(Samples.of(self.loop, x) for x in fresh)])
+
+    def draw(self, count: int) -> Samples:
+        """``count`` of them, with replacement."""
+        index = torch.randint(len(self.samples), (count,), generator=self.picker)
+        return self.samples.take(index.to(self.device))
+
+
+@torch.no_grad()
+def relative_excess(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples) -> float:
+    """`(eps_hi E[max(r, 0)] + eps_lo E[max(-r, 0)]) / |E[V mu0]|` on ``samples``: what the residual costs.
+
+    That is the part of the Lagrangian bound above `E[V mu0 - mu Q_u]`.
+    """
+    v, gradient = calculus.value_and_gradient(value, samples.x)
+    slack = formulas.hjb_slack(samples, v, gradient, loop.control_cost, loop.discount)
+    r = samples.mu0 - formulas.drifting_loss(samples, log_occupation, loop.discount)[1]
+    missing, surplus = samples.mean(r.clamp_min(0.0)), samples.mean((-r).clamp_min(0.0))
+    excess = (-slack).max().clamp_min(0.0) * missing + slack.max().clamp_min(0.0) * surplus
+    return float(excess / samples.mean(v * samples.mu0).abs().clamp_min(1e-30))

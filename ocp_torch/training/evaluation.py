@@ -5,12 +5,11 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-import torch
-
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields, table
 from ocp_torch.config import build_certificate_settings, build_network, build_problem
 from ocp_torch.controller import Controller, load_controller
 from ocp_torch.errors import InputError, require_integer
+from ocp_torch.process import prepare
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +38,7 @@ def settings_for(controller: Controller, config: dict) -> CertificateSettings:
 
 def certify_saved(controller: Controller, settings: CertificateSettings, seed: int | None = None) -> Certificate:
     """Print and return the certificate of ``controller``; with its own ``seed`` the numbers are those of its run."""
-    torch.set_num_threads(int(controller.config.get("trainer", {}).get("threads", 1)))
+    prepare(int(controller.config.get("trainer", {}).get("threads", 1)))
     before = controller.certificate
     run = Run(**{name: before[name] for name in Run.__dataclass_fields__})
     if seed is not None:
