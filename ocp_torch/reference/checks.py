@@ -23,7 +23,7 @@ def grid_sides(dim: int, side: int | None, memory: float) -> tuple[int, int, int
     """Nodes per coordinate of the three grids, the finest ``side`` (None: by dimension); ``memory`` in gigabytes."""
     if dim > MOST_DIMENSIONS:
         raise InputError(
-            f"problem.dim is {dim}, but a grid needs at most {MOST_DIMENSIONS} coordinates; in more, the certificate is the check."
+            f"problem.dim is {dim}, but a grid needs at most {MOST_DIMENSIONS} coordinates; beyond, certificates remain."
         )
     ratio = RATIO[dim]
     finest = FINEST[dim] if side is None else require_integer("side", side, 1)

@@ -13,7 +13,7 @@ OFFSETS = 4  # nodes of the cubic stencil per coordinate
 
 @dataclass(frozen=True)
 class Stencil:
-    """Nodes around ``N`` points and their weights, each ``(N, 4^d)``: multilinear ones (zero outside the cell), cubic ones."""
+    """Nodes around ``N`` points, and their multilinear (zero outside the cell) and cubic weights; each ``(N, 4^d)``."""
 
     index: Tensor
     linear: Tensor

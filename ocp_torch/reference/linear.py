@@ -1,4 +1,4 @@
-"""`V = beta W V + c` for the interpolation matrix `W` of one policy: direct if small, else bi-conjugate gradients and sweeps."""
+"""`V = beta W V + c` for the interpolation matrix `W` of one policy: direct if small, else by iteration."""
 
 from __future__ import annotations
 

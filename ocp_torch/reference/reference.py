@@ -68,11 +68,15 @@ def solve_reference(problem: Problem, side: int | None = None, memory: float = 4
     with torch.no_grad():
         require_solvable(problem, Grid(problem.dim, sides[0]))
         start, pace = _speed(problem, sides[0])
+        rise = float(start.value.max() - start.value.min())
         solutions = []
         for n in sides:
             grid = Grid(problem.dim, n)
             value, control = _carried(start, grid)
-            start = SemiLagrangian(problem, grid, pace * grid.spacing).solve(value, control, TOLERANCE)
+            # The monotone scheme first: from a rough policy the clipped one may not settle.
+            rough = SemiLagrangian(problem, grid, pace * grid.spacing).solve(value, control, ROUGH)
+            scheme = SemiLagrangian(problem, grid, pace * grid.spacing, rise)
+            start = scheme.solve(rough.value, rough.control, TOLERANCE)
             solutions.append(start)
         estimates = tuple(_mean(problem, s) for s in solutions)
         change = float((_carried(solutions[1], start.grid)[0] - start.value).abs().max())
@@ -94,7 +98,7 @@ def _speed(problem: Problem, coarsest: int) -> tuple[GridSolution, float]:
     step = min(longest, CELLS * grid.spacing / max(fastest, 1e-300))
     value, control = scheme.f.clone(), scheme.f.new_zeros(grid.count, problem.control_dim)
     for _ in range(SPEED_ROUNDS):
-        scheme = SemiLagrangian(problem, grid, step, monotone=True)
+        scheme = SemiLagrangian(problem, grid, step)
         rough = scheme.solve(value, control, ROUGH)
         value, control = rough.value, rough.control
         speed = max(scheme.speed(control), 1e-300)

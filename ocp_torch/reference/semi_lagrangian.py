@@ -5,7 +5,7 @@ Dynamic programming over a step `tau` with the control held constant, `beta = e^
     V(x) = min_u  int_0^tau rho e^{-rho t} (f(x_t) + |u|^q / q) dt + beta V(x_tau)
 
 The path is a midpoint step, the integral a quadrature of Simpson's kind. `V(x_tau)` is interpolated: multilinearly plus the
-difference to cubic interpolation, clipped at `CLIP osc(f) h^{3/2}`. Multilinear interpolation alone makes the scheme
+difference to cubic interpolation, clipped at `CLIP osc(V) h^{3/2}`. Multilinear interpolation alone makes the scheme
 monotone, so that it converges to the viscosity solution; what is clipped stays `O(h^{1/2})` of it after division by
 `1 - beta`, so the clipped scheme converges to the same limit. Where `V` is smooth nothing is clipped, and with `tau`
 proportional to `h` the error is `O(tau^2)`.
@@ -27,7 +27,7 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.reference.grid import Grid
 from ocp_torch.reference.linear import solve_fixed_point
 
-CLIP = 8.0
+CLIP = 4.0
 # Nodes worked on at a time: the stencils of a piece stay in the cache.
 PIECE = 2**14
 MOST_POLICIES = 40
@@ -63,7 +63,7 @@ def minimiser(s: Tensor, q: float) -> Tensor:
 
 
 def discounted_weights(rho: float, tau: float) -> list[float]:
-    """`int_0^tau rho e^{-rho t} l_i(t) dt` for the quadratic `l_i` through `0, tau/2, tau`; they sum to `1 - e^{-rho tau}`."""
+    """`int_0^tau rho e^{-rho t} l_i(t) dt`, `l_i` quadratic with nodes `0, tau/2, tau`; their sum is `1 - e^{-rho tau}`."""
     s, w = np.polynomial.legendre.leggauss(12)
     s = 0.5 * (s + 1.0)
     density = 0.5 * w * rho * tau * np.exp(-rho * tau * s)
@@ -71,10 +71,10 @@ def discounted_weights(rho: float, tau: float) -> list[float]:
 
 
 class SemiLagrangian:
-    """The scheme on one grid. ``step`` is `tau`, in units of time; ``monotone`` clips all of the cubic correction, so that
-    each policy lowers `V` whatever it starts from."""
+    """The scheme on one grid. ``step`` is `tau`, in units of time; ``rise`` is `osc V`, to which clipping is relative. At
+    0 all of the cubic correction is clipped: the scheme is monotone, and each policy lowers `V` whatever it starts from."""
 
-    def __init__(self, problem: Problem, grid: Grid, step: float, monotone: bool = False) -> None:
+    def __init__(self, problem: Problem, grid: Grid, step: float, rise: float = 0.0) -> None:
         self.problem, self.grid, self.step = problem, grid, step
         self.rho, self.q = problem.discount, problem.exponent
         self.weights = discounted_weights(self.rho, step)
@@ -86,8 +86,8 @@ class SemiLagrangian:
             for function in (problem.state_cost, problem.drift, problem.control_matrix)
         )
         self.scale = float(self.f.max() - self.f.min())
-        self.clip = 0.0 if monotone else CLIP * self.scale * grid.spacing**1.5
-        self.monotone = monotone
+        self.clip = CLIP * rise * grid.spacing**1.5
+        self.monotone = rise == 0.0
 
     def speed(self, control: Tensor) -> float:
         """Root mean square over the nodes of the largest component of `a + B u`."""
