@@ -59,7 +59,7 @@ class Reference:
 
 
 def solve_reference(problem: Problem, side: int | None = None, memory: float = 4.0) -> Reference:
-    """Solve ``problem`` on three grids, the finest with ``side`` nodes per coordinate (None: 1024, 192, 54 by dimension).
+    """Solve ``problem`` on three grids, the finest with ``side`` nodes per coordinate (None: 1024, 192, 48 by dimension).
 
     ``memory`` in gigabytes is what the finest may take. Raises `InputError` for more than three dimensions, a grid that
     does not fit, functions that are not finite or not periodic, and a control cost other than `|u|^q / q`.

@@ -33,6 +33,8 @@ PIECE = 2**14
 MOST_POLICIES = 40
 # A candidate that moves the end of the path by less than this many cells is no other control; one that fails is halved.
 NEGLIGIBLE, HALVINGS = 1e-3, 8
+# A neighbour whose control moves that end by less would lead to the same minimum.
+DIFFERENT = 0.1
 
 
 @dataclass(frozen=True)
@@ -122,11 +124,11 @@ class SemiLagrangian:
         constant = self._paid(part, u, middle, end) + self.beta * constant
         return constant + self.beta * (weights * value[index]).sum(dim=-1), index, weights, constant
 
-    def _closed_form(self, slope: Tensor, part: slice, u: Tensor) -> Tensor:
+    def _closed_form(self, slope: Tensor, part: slice | Tensor, u: Tensor) -> Tensor:
         """The minimiser that `grad V` gives midway along the path under ``u``."""
         return minimiser(self._pull(slope, part, u), self.q)
 
-    def _pull(self, slope: Tensor, part: slice, u: Tensor) -> Tensor:
+    def _pull(self, slope: Tensor, part: slice | Tensor, u: Tensor) -> Tensor:
         """`-B^T grad V / rho`, ``(N, m)``, midway along the path under ``u``; ``slope`` is `grad V` at the nodes."""
         middle, _ = self._move(part, u)
         stencil = self.grid.stencil(middle)
@@ -137,25 +139,31 @@ class SemiLagrangian:
         """The best of the candidates at each node and the right side it gives."""
         grid = self.grid
         slope = grid.gradient(value)
-        starts = [control, *(grid.shifted(control, k, cells) for k in range(grid.dim) for cells in (-1, 1))]
+        neighbours = [grid.shifted(control, k, cells) for k in range(grid.dim) for cells in (-1, 1)]
         controls, rights = [], []
         for first in range(0, grid.count, PIECE):
             part = slice(first, first + PIECE)
             held = control[part]
             right = self._judged(value, part, held)[0]
-            for number, start in enumerate(starts):
-                u = self._closed_form(slope, part, start[part])
-                u = torch.where(torch.isfinite(u), u, held)
-                if number == 0:
-                    held, right = self._towards(value, first, u, held, right)
+            u = self._closed_form(slope, part, held)
+            held, right = self._towards(value, first, torch.where(torch.isfinite(u), u, held), held, right)
+            for start in neighbours:
+                far = self._push(part, start[part] - control[part]) > DIFFERENT * grid.spacing
+                if not far.any():
                     continue
-                reached = self._judged(value, part, u)[0]
-                better = reached < right
-                held = torch.where(better.unsqueeze(-1), u, held)
-                right = torch.where(better, reached, right)
+                local = far.nonzero().squeeze(1)
+                u = self._closed_form(slope, local + first, start[local + first])
+                u = torch.where(torch.isfinite(u), u, held[local])
+                reached = self._judged(value, local + first, u)[0]
+                better = reached < right[local]
+                held[local[better]], right[local[better]] = u[better], reached[better]
             controls.append(held)
             rights.append(right)
         return torch.cat(controls), torch.cat(rights)
+
+    def _push(self, part: slice, change: Tensor) -> Tensor:
+        """How far a ``change`` of control moves the end of the path, ``(N,)``."""
+        return self.step * torch.einsum("ndm,nm->nd", self.B[part], change).abs().amax(dim=-1)
 
     def _towards(self, value: Tensor, first: int, u: Tensor, held: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
         """``u`` where it is better than ``held``, and elsewhere the first better one halfway, a quarter of the way, ...
@@ -163,8 +171,8 @@ class SemiLagrangian:
         Without it a control far too large for the step would be refused, and the one held taken for optimal.
         """
         held, right = held.clone(), right.clone()
-        push = torch.einsum("ndm,nm->nd", self.B[first : first + PIECE], u - held).abs().amax(dim=-1)
-        left = (self.step * push > NEGLIGIBLE * self.grid.spacing).nonzero().squeeze(1)
+        push = self._push(slice(first, first + PIECE), u - held)
+        left = (push > NEGLIGIBLE * self.grid.spacing).nonzero().squeeze(1)
         share = 1.0
         for _ in range(HALVINGS):
             if len(left) == 0:
