@@ -16,6 +16,7 @@ from ocp_torch.reference.grid import Grid
 from ocp_torch.reference.richardson import extrapolate
 from ocp_torch.reference.semi_lagrangian import SemiLagrangian, discounted_weights
 from ocp_torch.reference.session import prepare
+from test_controller import controllers
 
 TURN = 2.0 * math.pi
 
@@ -36,7 +37,7 @@ wave = lambda x: 1.0 + (TURN * x[:, 0]).cos()
 KINKED = {
     **{f"circle rho={rho:g}": (partial(Circle, discount=rho), 128) for rho in (0.1, 0.8, 2.0, 4.0)},
     "torus chain": (Torus, 48),
-    "torus random rho=0.8": (partial(Torus, shear="random", discount=0.8, seed=3), 48),
+    "torus random rho=0.8": (partial(Torus, shear="random", discount=0.8, seed=3), 64),
 }
 SMOOTH = {
     **{
@@ -48,9 +49,9 @@ SMOOTH = {
     "2-d": (Manufactured, 48),
     "2-d q=1.5 B(x)": (partial(Manufactured, exponent=1.5, state_dependent_control=True, seed=3), 48),
     "2-d m=1": (partial(Manufactured, control_dim=1, seed=2), 48),
-    "2-d slow discount": (partial(Manufactured, discount=0.3, seed=4), 64),
 }
 SLOW = {
+    "2-d slow discount": (partial(Manufactured, discount=0.3, seed=4), 64),
     "3-d": (partial(Manufactured, dim=3), 27),
     "3-d m=2": (partial(Manufactured, dim=3, control_dim=2, seed=2), 27),
     "torus 3-d chain": (partial(Torus, dim=3), 27),
@@ -71,7 +72,7 @@ def assert_true_within_its_error(make, side, close):
 @pytest.mark.parametrize("name", KINKED)
 def test_kinked_problems_are_solved_within_the_stated_error(name):
     reference = assert_true_within_its_error(*KINKED[name], close=5e-3)
-    assert 1.6 <= reference.order <= 2.4
+    assert 1.6 <= reference.order <= 2.5
 
 
 @pytest.mark.parametrize("name", SMOOTH)
@@ -81,7 +82,7 @@ def test_smooth_problems_are_solved_within_the_stated_error(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SLOW)
-def test_three_dimensions_are_solved_within_the_stated_error(name):
+def test_costly_problems_are_solved_within_the_stated_error(name):
     assert_true_within_its_error(*SLOW[name], close=0.1)
 
 
@@ -283,3 +284,13 @@ def test_a_saved_reference_loads_without_pickle(tmp_path):
 def test_a_wrong_field_is_refused_before_anything_is_solved(change, words):
     with pytest.raises(InputError, match=words):
         prepare(CONFIG | change)
+
+
+@pytest.mark.parametrize("method", ["dual", "primal network"])
+def test_a_run_is_drawn_beside_the_grid_in_its_own_folder(method, tmp_path):
+    """With a `V` network and without one."""
+    controllers(method)[0].save(tmp_path / "controller.safetensors")
+    prepare(CONFIG | {"run": str(tmp_path), "side": 32}).run()
+    drawn = tmp_path / "figures" / "reference.png"
+    assert drawn.read_bytes().startswith(b"\x89PNG")
+    assert {p.name for p in tmp_path.iterdir()} == {"controller.safetensors", "figures"}
