@@ -112,7 +112,7 @@ def test_the_error_has_the_order_of_the_theory_at_every_node(rise, order):
 
 @pytest.mark.parametrize("make", [Circle, partial(Manufactured, dim=1, exponent=1.5, seed=2)])
 def test_no_control_at_all_is_better_than_the_candidates(make):
-    """Brute force over a fine set of controls, four cells away from the circle's kink: on it cubic interpolation undershoots."""
+    """Brute force over a fine set of controls, but for four cells at the kink, where cubic interpolation undershoots."""
     scheme, solution = solved(make(), 128)
     everything = slice(0, solution.grid.count)
     best = solution.value.clone()
