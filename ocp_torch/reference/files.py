@@ -1,0 +1,41 @@
+"""A reference as one NPZ file, which loads without pickle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ocp_torch.errors import InputError
+from ocp_torch.reference.reference import Reference
+from ocp_torch.storage import write_atomically
+
+
+def require_npz(name: str, value: object) -> Path:
+    """``value`` as the path of an NPZ file that can be written; raise `InputError` otherwise."""
+    path = Path(str(value))
+    if path.suffix != ".npz" or path.is_dir():
+        raise InputError(f"{name} is {str(value)!r}, but must be a file whose name ends in .npz.")
+    if path.parent.exists() and not path.parent.is_dir():
+        raise InputError(f"{name} is {str(value)!r}, but {path.parent} is not a folder.")
+    return path
+
+
+def save_reference(path: Path, reference: Reference) -> None:
+    """Write ``optimum``, ``error``, ``order``, ``sides``, ``estimates``, and of the finest grid ``value`` ``(side,) * d`` and
+    ``control`` ``(side,) * d + (m,)``, at the nodes `k / side`."""
+    arrays = {
+        "optimum": np.float64(reference.optimum),
+        "error": np.float64(reference.error),
+        "order": np.float64(reference.order),
+        "sides": np.array(reference.sides),
+        "estimates": np.array(reference.estimates),
+        "value": reference.value.numpy(),
+        "control": reference.control.numpy(),
+    }
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+
+    write_atomically(path, write)

@@ -1,0 +1,54 @@
+"""From the numbers of three grids: the extrapolated one, the order they show, and the error that is stated."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+# Order of the scheme where V is smooth, by which the leading error is removed.
+ORDER = 2.0
+# Factor on the change of the extrapolated number from one pair of grids to the next: covers every order from 1 on.
+SAFETY = 3.0
+# What is removed by extrapolation counts as uncertain by this share at least, times SAFETY.
+DOUBT = 0.1
+STEEPEST = 12.0
+
+
+@dataclass(frozen=True)
+class Extrapolation:
+    """``optimum`` with its stated ``error``, and the ``order`` the three grids show (NaN where they show none)."""
+
+    optimum: float
+    error: float
+    order: float
+
+
+def extrapolate(spacings: tuple[float, float, float], numbers: tuple[float, float, float]) -> Extrapolation:
+    r"""Richardson's extrapolation of ``numbers`` on grids of ``spacings`` `h_1 > h_2 > h_3`, taken as `Q + C h^2`.
+
+    With `X_12`, `X_23` from the two pairs of grids and `Q_3` the finest number the stated error is
+    `SAFETY max(|X_23 - X_12|, DOUBT |X_23 - Q_3|)`. If the error is `C h^p` instead, that of `X_23` is below it for every
+    `p` in [1, 2) and ratio of spacings from 4/3 on, and also for `p > 2`.
+    """
+    (h1, h2, h3), (Q1, Q2, Q3) = spacings, numbers
+    pair = lambda coarse, fine, h, k: fine + (fine - coarse) / ((h / k) ** ORDER - 1.0)
+    earlier, optimum = pair(Q1, Q2, h1, h2), pair(Q2, Q3, h2, h3)
+    error = SAFETY * max(abs(optimum - earlier), DOUBT * abs(optimum - Q3))
+    return Extrapolation(optimum, error, observed_order(spacings, numbers))
+
+
+def observed_order(spacings: tuple[float, float, float], numbers: tuple[float, float, float]) -> float:
+    """`p` with `(Q_1 - Q_2) / (Q_2 - Q_3) = (h_1^p - h_2^p) / (h_2^p - h_3^p)`; NaN if the changes have opposite signs."""
+    (h1, h2, h3), (Q1, Q2, Q3) = spacings, numbers
+    if Q2 == Q3 or not (Q1 - Q2) / (Q2 - Q3) > 0.0:
+        return math.nan
+    ratio = (Q1 - Q2) / (Q2 - Q3)
+    # Increasing in p: bisection between orders no scheme has.
+    change = lambda p: (h1**p - h2**p) / (h2**p - h3**p)
+    low, high = 1e-3, STEEPEST
+    if not change(low) < ratio < change(high):
+        return math.nan
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if change(middle) < ratio else (low, middle)
+    return middle

@@ -1,0 +1,22 @@
+"""`OPT` from grids, in one to three dimensions: python scripts/reference.py problem=torus (--help for all fields)."""
+
+from __future__ import annotations
+
+import hydra
+from omegaconf import DictConfig
+
+from ocp_torch.launch import job, launch
+from ocp_torch.reference.session import prepare
+
+
+def refer(config: dict, folder) -> None:
+    prepare(config).run()
+
+
+@hydra.main(version_base="1.3", config_path="../configs", config_name="reference")
+def main(config: DictConfig) -> None:
+    job(refer, config)
+
+
+if __name__ == "__main__":
+    launch(main, "reference", prepare)
