@@ -127,6 +127,11 @@ class TaylorModel:
         radius = self.radius * (its_size + other.radius) + size * other.radius + cut
         return self._with(product, radius, size * its_size)
 
+    def reshape(self, *shape: int) -> TaylorModel:
+        """The axes after the cells in another shape."""
+        K, N = self.coefficients.shape[:2]
+        return TaylorModel(self.coefficients.reshape(K, N, *shape), self.radius.reshape(N, *shape), self.basis)
+
     def sum(self, dim: int = -1) -> TaylorModel:
         """Sum over an axis counted from the end."""
         total = self.coefficients.sum(dim=dim)

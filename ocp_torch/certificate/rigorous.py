@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from ocp_torch.certificate.activations import SERIES
 from ocp_torch.certificate.network_model import network_model
-from ocp_torch.certificate.sides import slack_function
+from ocp_torch.certificate.shifted import slack_function
 from ocp_torch.enclosure import contradiction
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.extremum import supremum
@@ -73,7 +73,7 @@ def obstacle(problem: Problem, value: nn.Module) -> str | None:
     box = _cells(problem.dim, 16, DEGREE[problem.dim])
     enclosure = problem.enclosure(box)
     if enclosure is None:
-        return "the problem neither encloses its data over cells (enclosure) nor declares their Lipschitz constants (lipschitz)"
+        return "the problem gives neither an enclosure of its data nor their Lipschitz constants (lipschitz)"
     for half in (1.0, 2.0**-8):
         small = Box(box.centre, half * box.half, box.degree)
         t = 2.0 * torch.rand(box.centre.shape, generator=generator, dtype=torch.float64) - 1.0
