@@ -10,11 +10,13 @@ from torch import Tensor
 from ocp_torch import calculus, formulas
 from ocp_torch.calculus import Field
 from ocp_torch.certificate.estimate import Estimate, integral
-from ocp_torch.certificate.shifted import SlackParts, best_shift
+from ocp_torch.certificate.shifted import SlackParts, best_shift, slack_function
 from ocp_torch.control_laws import Density
 from ocp_torch.extremum import Extremum
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
+
+__all__ = ["CHUNK", "LowerSide", "chunked_gradient", "lower_side", "slack_function", "upper_side"]
 
 # States evaluated at once, so that memory stays bounded.
 CHUNK = 8192
@@ -22,7 +24,7 @@ CHUNK = 8192
 
 @dataclass(frozen=True)
 class LowerSide:
-    """`F_M` rests on `M`, `shifted` on the supremum of the slack of `theta V`; per point set, `E[V mu0]` and `E[max(Q, 0)]`."""
+    """`F_M` rests on `M`, `shifted` on the supremum of the slack of `theta V`; both on per-set `E[V mu0]`, `E[max(Q, 0)]`."""
 
     M: float
     initial: list[float]
