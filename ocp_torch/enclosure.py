@@ -36,9 +36,11 @@ class Lipschitz:
     initial_density: float | None = None
 
 
-def lipschitz_enclosure(problem, box: Box) -> Enclosure | None:
-    """The data at the centre of each cell up to the constant times the cell's half-diagonal; `None` if one is unknown."""
-    base = next(c for c in type(problem).__mro__ if c.__module__ == "ocp_torch.problems.problem")
+def lipschitz_enclosure(problem, base: type, box: Box) -> Enclosure | None:
+    """The data at the centre of each cell up to the constant times the cell's half-diagonal; `None` if one is unknown.
+
+    What ``problem`` takes over from ``base`` is constant.
+    """
     declared = problem.lipschitz if problem.lipschitz is not None else Lipschitz()
     diagonal = box.half.norm(dim=-1)
     models = {}

@@ -65,11 +65,10 @@ def embed(box: Box, modes: int) -> SmoothModel:
     phases = torch.zeros(d * modes, dtype=k.dtype)
     # sin = cos of a quarter turn less; the rounding of the phase is below that of the angle, counted twice over.
     both = box.cosine(torch.cat([waves, waves]), torch.cat([phases, phases - 0.5 * math.pi]))
-    reach = (2.0 * math.pi * box.half.unsqueeze(1) * waves.abs()).unsqueeze(0)  # (1, N, J, d)
-    total = reach.sum(dim=-1)
-    slope = reach.squeeze(0) * (total.squeeze(0) ** m / math.factorial(m)).unsqueeze(-1)
-    rounding = m * ROUNDING * 16.0 * total.squeeze(0).unsqueeze(-1) * total.squeeze(0).exp().unsqueeze(-1)
-    slope = upward(slope + rounding * (reach.squeeze(0) > 0)).permute(2, 0, 1).repeat(1, 1, 2)
+    reach = 2.0 * math.pi * box.half.unsqueeze(1) * waves  # (N, J, d)
+    total = reach.sum(dim=-1, keepdim=True)
+    left_out = total**m / math.factorial(m) + 16.0 * m * ROUNDING * total.exp()
+    slope = upward(reach * left_out).permute(2, 0, 1).repeat(1, 1, 2)
     return SmoothModel(both.coefficients, torch.cat([both.radius.unsqueeze(0), slope]), box.basis)
 
 

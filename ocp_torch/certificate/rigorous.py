@@ -1,6 +1,7 @@
 r"""A lower bound on `OPT` proved for the network as it stands, in one and two dimensions.
 
-For any smooth `W`, `W - sup_x Q_W(x)` is a subsolution of the HJB equation, so `E[W mu0] - sup_x Q_W(x) <= OPT`. Here
+For any smooth `W`, `W - sup_x Q_W(x)` is a subsolution of the HJB equation, so `E[W mu0] - sup_x Q_W(x) <= OPT` for a
+density `mu0` (mean 1). Here
 `W = theta V`, and both the supremum and the integral are enclosed over cells that cover the torus, bisected until the
 bound is tight: nothing is sampled, no `M` is used.
 
@@ -20,8 +21,9 @@ import torch
 from torch import Tensor, nn
 
 from ocp_torch.certificate.activations import SERIES
+from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.network_model import network_model
-from ocp_torch.certificate.shifted import slack_function
+from ocp_torch.certificate.sides import LowerSide, slack_function
 from ocp_torch.enclosure import contradiction
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.extremum import supremum
@@ -32,6 +34,10 @@ from ocp_torch.taylor import ROUNDING, Box, TaylorModel, upward
 
 MOST_DIMENSIONS = 2
 DEGREE = {1: 4, 2: 4}
+# How close to the sampled supremum, relative to the bound, by dimension.
+TOLERANCE = {1: 1e-5, 2: 2e-3}
+# Cells are not bisected below this half-width: all centres, and their multiples by wave numbers, are then exact.
+SMALLEST_HALF = 2.0**-32
 # Cells a side to start with, and cells evaluated at once.
 FIRST_CELLS = {1: 64, 2: 32}
 CHUNK = 256
@@ -53,17 +59,32 @@ class RigorousBound:
     seconds: float
     complete: bool
 
+    @property
+    def estimate(self) -> Estimate:
+        """The bound as an entry of the certificate; there is nothing random in it."""
+        return Estimate(self.value, 0.0)
+
+    @property
+    def sentence(self) -> str:
+        """What was proved, for the terminal."""
+        low, high = self.integral
+        return (
+            f"proved: sup Q of {self.theta:.4g} V <= {self.slack:.3e}, E[{self.theta:.4g} V mu0] in [{low:.8f}, {high:.8f}],"
+            f" over {self.cells:,} cells"
+        )
+
 
 def obstacle(problem: Problem, value: nn.Module) -> str | None:
     """Why there can be no rigorous bound for ``value`` on ``problem``; `None` where there can."""
     if problem.dim > MOST_DIMENSIONS:
         return f"cells cover the torus in at most {MOST_DIMENSIONS} dimensions, and this problem has {problem.dim}"
-    layers = list(value.body.modules()) if isinstance(value, PeriodicMLP) else []
-    known = (nn.Sequential, nn.Linear, Gated, *SERIES)
-    if type(value) is not PeriodicMLP or not value.scalar or not all(type(layer) in known for layer in layers):
+    if type(value) is not PeriodicMLP or not value.scalar or not all(map(_known, value.body.modules())):
         return "V is not one of the package's own scalar networks"
-    if not all(bool(torch.isfinite(p).all()) for p in (*value.parameters(), *value.buffers())):
+    weights = [*value.parameters(), *value.buffers()]
+    if not all(bool(torch.isfinite(w).all()) for w in weights):
         return "V has weights that are not finite"
+    if not all(w.dtype == torch.float64 and w.device.type == "cpu" for w in weights):
+        return "V is not in float64 on the CPU"
     data = ("state_cost", "drift", "control_matrix", "initial_density")
     if not _speaks_for(problem, "enclosure", data) or not _speaks_for(
         problem.control_cost, "conjugate_model", ("conjugate",)
@@ -81,6 +102,12 @@ def obstacle(problem: Problem, value: nn.Module) -> str | None:
         if wrong is not None:
             return f"the problem's enclosure does not hold its own {wrong}"
     return None
+
+
+def _known(layer: nn.Module) -> bool:
+    """Whether this is a layer that `network_model` encloses, the activations in their plain form."""
+    plain = getattr(layer, "approximate", "none") == "none" and getattr(layer, "beta", 1.0) == 1.0
+    return plain and type(layer) in (nn.Sequential, nn.Linear, Gated, *SERIES)
 
 
 def _speaks_for(owner: object, claim: str, methods: tuple[str, ...]) -> bool:
@@ -112,11 +139,13 @@ def cell_models(problem: Problem, value: PeriodicMLP, theta: float, box: Box) ->
 
 @dataclass
 class _Cover:
-    """Cells with what is proved on each: ``upper`` of `Q`, and ``mean`` and ``radius`` of `W mu0` times its volume."""
+    """Cells with what is proved on each: ``upper`` of `sup Q`, ``reached`` from below, and ``mean`` and ``radius`` of
+    `W mu0` times its volume; ``axis`` is where to bisect it."""
 
     centre: Tensor
     half: Tensor
     upper: Tensor
+    reached: Tensor
     mean: Tensor
     radius: Tensor
     axis: Tensor
@@ -149,7 +178,8 @@ def _evaluate(problem: Problem, value: PeriodicMLP, theta: float, centre: Tensor
     loose = bent + Q.radius.unsqueeze(-1) * half / half.sum(dim=-1, keepdim=True)
     axis = loose.nan_to_num(nan=math.inf, posinf=math.inf).argmax(dim=-1)
     axis = torch.where(half.amax(dim=-1) > 4.5 * half.amin(dim=-1), half.argmax(dim=-1), axis)
-    return _Cover(centre, half, upper.nan_to_num(nan=math.inf), mean * volume, radius * volume, axis)
+    reached = (Q.coefficients[0] - Q.radius).nan_to_num(nan=-math.inf)
+    return _Cover(centre, half, upper.nan_to_num(nan=math.inf), reached, mean * volume, radius * volume, axis)
 
 
 def rigorous_lower_bound(
@@ -158,36 +188,39 @@ def rigorous_lower_bound(
     *,
     theta: float = 1.0,
     sampled_slack: float | None = None,
-    tolerance: float = 2e-3,
-    cells: int = 2**20,
+    tolerance: float | None = None,
+    cells: int = 2**18,
     seconds: float | None = None,
 ) -> RigorousBound | None:
     r"""`E[theta V mu0] - sup Q <= OPT`, proved; `None` where `obstacle` says why there is none, or nothing finite was found.
 
-    Cells are bisected, worst first, until `sup Q` is known within ``tolerance``, relative to `E[theta V mu0]`, of
+    Cells are bisected, worst first, until `sup Q` is known within ``tolerance``, relative to `E|theta V mu0|`, of
     ``sampled_slack`` (searched for when not given), or until ``cells`` have been evaluated or ``seconds`` have passed:
     the bound stands then as well, only less tight. ``value`` must be in float64 on the CPU.
     """
     require_integer("certificate.rigorous cells", cells, 1)
-    tolerance = require_number("certificate.rigorous tolerance", tolerance, above=0.0)
     if obstacle(problem, value) is not None:
         return None
+    tolerance = TOLERANCE[problem.dim] if tolerance is None else tolerance
+    require_number("certificate.rigorous tolerance", tolerance, above=0.0)
     started = time.monotonic()
+    points = scrambled_sobol(2**14, problem.dim, 0, torch.float64)
+    size = _scale(problem, value, theta, points)
     if sampled_slack is None:
-        points = scrambled_sobol(2**14, problem.dim, 0, torch.float64)
         sampled_slack = supremum(slack_function(problem, lambda x: theta * value(x)), points).value
     first = _cells(problem.dim, FIRST_CELLS[problem.dim], DEGREE[problem.dim])
     evaluate = lambda centre, half: _evaluate(problem, value, theta, centre, half)
     parts = [evaluate(c, h) for c, h in zip(first.centre.split(CHUNK), first.half.split(CHUNK), strict=True)]
     pending, count = _Cover.join(parts), len(first)
     slack, means, radii = -math.inf, [], []
-    size = max(abs(float(pending.mean.sum())), 1e-300)
-    goal, each = sampled_slack + tolerance * size, 0.1 * tolerance * size
-    complete = False
+    goal, complete = sampled_slack + tolerance * size, False
     while True:
+        # Where Q is larger than was met by sampling, more cannot be proved.
+        goal = max(goal, float(pending.reached.max()) + tolerance * size)
         # The radius of W mu0 is held per volume, so that all cells together keep theirs.
         volume = (2.0 * pending.half).prod(dim=-1)
-        done = (pending.upper <= goal) & (pending.radius <= each * volume)
+        done = (pending.upper <= goal) & (pending.radius <= 0.1 * tolerance * size * volume)
+        done |= pending.half.amax(dim=-1) <= SMALLEST_HALF
         if bool(done.any()):
             finished = pending.take(done)
             slack = max(slack, float(finished.upper.max()))
@@ -214,10 +247,26 @@ def rigorous_lower_bound(
     return _conclude(slack, sampled_slack, means, radii, count, theta, time.monotonic() - started, complete)
 
 
+@torch.no_grad()
+def _scale(problem: Problem, value: PeriodicMLP, theta: float, x: Tensor) -> float:
+    """The size of `theta V mu0`, which tolerances are relative to; not much below that of the costs."""
+    initial, cost = theta * value(x) * problem.initial_density(x), problem.state_cost(x)
+    return max(float(initial.abs().mean()), 1e-3 * float(cost.abs().mean()), 1e-300)
+
+
 def _conclude(slack, sampled_slack, means, radii, count, theta, seconds, complete) -> RigorousBound:
-    # fsum adds without error; the products with the volumes did round.
+    # fsum rounds once.
     middle = math.fsum(means)
     radius = float(upward(torch.tensor(math.fsum(radii) + ROUNDING * math.fsum(map(abs, means)), dtype=torch.float64)))
     low, high = math.nextafter(middle - radius, -math.inf), math.nextafter(middle + radius, math.inf)
     bound = math.nextafter(low - slack, -math.inf)
     return RigorousBound(bound, slack, sampled_slack, (low, high), count, theta, seconds, complete)
+
+
+def proved_lower(problem: Problem, value: nn.Module, lower: LowerSide) -> tuple[RigorousBound | None, list[str]]:
+    """The proved counterpart of ``lower.shifted``, or a warning that says why there is none."""
+    why = obstacle(problem, value)
+    if why is not None:
+        return None, [f"no rigorous lower bound: {why}."]
+    bound = rigorous_lower_bound(problem, value, theta=lower.theta, sampled_slack=lower.largest_slack.value)
+    return bound, [] if bound else ["no rigorous lower bound: nothing finite was proved within the budget of cells."]

@@ -99,7 +99,7 @@ class Problem:
         Here from ``lipschitz`` constants alone. Taylor models, as in `Torus`, converge faster; a class that overrides the
         data must override this too.
         """
-        return lipschitz_enclosure(self, box)
+        return lipschitz_enclosure(self, Problem, box)
 
     # Exact truth, where known: `None` otherwise.
     def exact_value(self, x: Tensor) -> Tensor | None:
