@@ -33,9 +33,9 @@ from ocp_torch.samplers import scrambled_sobol
 from ocp_torch.taylor import ROUNDING, Box, TaylorModel, upward
 
 MOST_DIMENSIONS = 2
-DEGREE = {1: 4, 2: 4}
+DEGREE = {1: 4, 2: 5}
 # How close to the sampled supremum, relative to the bound, by dimension.
-TOLERANCE = {1: 1e-5, 2: 2e-3}
+TOLERANCE = {1: 1e-5, 2: 1e-3}
 # Cells are not bisected below this half-width: all centres, and their multiples by wave numbers, are then exact.
 SMALLEST_HALF = 2.0**-32
 # Cells a side to start with, and cells evaluated at once.
