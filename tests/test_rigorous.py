@@ -15,7 +15,7 @@ from ocp_torch import calculus
 from ocp_torch.bounds import resolve_bounds
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields, table
 from ocp_torch.certificate.activations import SERIES
-from ocp_torch.certificate.network_model import network_model
+from ocp_torch.certificate.network_model import SmoothModel, activate, embed, network_model, product
 from ocp_torch.certificate.rigorous import cell_models, obstacle, rigorous_lower_bound
 from ocp_torch.certificate.shifted import slack_function
 from ocp_torch.enclosure import Lipschitz, contradiction
@@ -122,6 +122,55 @@ def test_a_network_and_its_gradient_lie_in_their_models(dim, degree, level, acti
     value, gradient = network_model(V, box)
     assert holds(value, flat(V, box, t), t)
     assert holds(gradient, flat(lambda x: calculus.value_and_gradient(V, x)[1], box, t), t)
+
+
+def perturbed_models(degree: int, size: float, offset: float, slope: float, seed: int):
+    """A `SmoothModel` in two variables, and at places ``t`` a function it holds, with its slopes: `P + offset + slope . t`."""
+    box = random_box(2, 3, degree, seed)
+    basis, generator = box.basis, torch.Generator().manual_seed(seed)
+    P = size * torch.randn(basis.count, len(box), 3, generator=generator).double()
+    P[0] = torch.randn(len(box), 3, generator=generator).double()
+    own = torch.full((len(box), 3), abs(slope)).double()
+    model = SmoothModel(P, torch.stack([abs(offset) + 2.0 * own, own, own]), basis)
+    t = corners_and_inside(box)
+    polynomial, slopes = model.models(torch.ones_like(box.half))
+    truth = at(polynomial, t) + offset + slope * t.sum(dim=-1, keepdim=True)
+    return model, t, truth, at(slopes, t) + slope
+
+
+REGIMES = [(0.3, 0.0, 0.0), (0.02, 0.0, 0.0), (1e-4, 0.1, 0.0), (0.1, 1e-2, 0.0), (1e-6, 0.0, 0.05), (0.1, -0.05, 0.05)]
+
+
+def layer_holds(found: SmoothModel, value, slopes, t) -> bool:
+    polynomial, derivative = found.models(torch.ones_like(t[0]))
+    inside = (at(polynomial, t) - value).abs() <= polynomial.radius + 1e-13
+    return bool(inside.all() and ((at(derivative, t) - slopes).abs() <= derivative.radius + 1e-13).all())
+
+
+@pytest.mark.parametrize("regime", REGIMES, ids=str)
+@pytest.mark.parametrize("degree", [1, 2, 4])
+def test_each_layer_alone_holds_what_its_radii_allow(regime, degree):
+    """Where one term of the radius is nearly all of it, so that none can be forgotten."""
+    for seed in range(3):
+        model, t, h, dh = perturbed_models(degree, *regime, seed)
+        for name, make in ACTIVATIONS.items():
+            slope = torch.func.vmap(torch.func.grad(make()))(h.flatten()).reshape(h.shape)
+            assert layer_holds(activate(model, make()), make()(h), slope.unsqueeze(-1) * dh, t), name
+        other, _, k, dk = perturbed_models(degree, *regime, seed + 100)
+        slopes = dh * k.unsqueeze(-1) + h.unsqueeze(-1) * dk
+        assert layer_holds(product(model, other), h * k, slopes, t)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 4])
+def test_the_embedding_alone_holds(degree):
+    embedding = network(2, 0, modes=3).embedding
+    for level in (1, 3, 6):
+        box = random_box(2, level, degree, 0)
+        t = corners_and_inside(box)
+        value, slopes = embed(box, 3).models(box.half)
+        gradient = torch.func.vmap(torch.func.jacrev(embedding))
+        assert holds(value, flat(embedding, box, t), t)
+        assert holds(slopes, flat(gradient, box, t), t)
 
 
 @pytest.mark.parametrize("degree", [2, 3, 4])
