@@ -125,7 +125,7 @@ def test_a_network_and_its_gradient_lie_in_their_models(dim, degree, level, acti
 
 
 def perturbed_models(degree: int, size: float, offset: float, slope: float, seed: int):
-    """A `SmoothModel` in two variables, and at places ``t`` a function it holds, with its slopes: `P + offset + slope . t`."""
+    """A model in two variables, and at places ``t`` a function it holds, with its slopes: `P + offset + slope . t`."""
     box = random_box(2, 3, degree, seed)
     basis, generator = box.basis, torch.Generator().manual_seed(seed)
     P = size * torch.randn(basis.count, len(box), 3, generator=generator).double()
