@@ -195,11 +195,13 @@ def test_the_shifted_bound_undoes_a_constant_that_violates_the_constraint(proble
     samples = Samples.of(problem, zoo.states(problem, 256))
     network = random_fields(problem, seed=1).value
     above = 1.0 - float(slack_function(problem, network)(samples.x).max())
-    shifted = [
-        lower_side(problem, lambda x, c=c: network(x) + c, [samples] * 2, 1.0, ascents=1).shifted.value
-        for c in (above, above + 3.0)
+    found = [
+        lower_side(problem, lambda x, c=c: network(x) + c, [samples] * 2, 1.0, ascents=1) for c in (above, above + 3.0)
     ]
-    assert shifted[1] - shifted[0] == pytest.approx(3.0 * (float(samples.mu0.mean()) - 1.0), abs=1e-6)
+    change = found[1].shifted.value - found[0].shifted.value
+    # Sampled, the mean of mu0 is not quite 1; what is left of that enters with the multiple of V that is shifted.
+    low, high = sorted(3.0 * (float(samples.mu0.mean()) - 1.0) * side.theta for side in found)
+    assert low - 1e-6 <= change <= high + 1e-6
 
 
 @zoo.on(zoo.FEW)

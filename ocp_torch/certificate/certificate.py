@@ -47,7 +47,7 @@ class Certificate:
     @property
     def best_lower(self) -> tuple[str, float] | None:
         """Name and value of the largest lower bound whose assumptions hold."""
-        usable = {"F_M": self.assumptions.occupation_holds, "shifted": True}
+        usable = {"F_M": self.assumptions.occupation_holds, "shifted": True, "rigorous": True}
         return _best(max, self.lower, usable)
 
     @property
@@ -145,6 +145,7 @@ def table(certificate: dict, searches: list[str] = ()) -> str:
 
     row("lower: F_M", certificate["lower"]["F_M"])
     row("lower: shifted", certificate["lower"]["shifted"])
+    row("lower: rigorous", certificate["lower"].get("rigorous"))
     if exact is not None:
         lines.append(f"{'OPT (exact)':26}{exact:14.8f}")
     row("Perf: controller from V", certificate["perf"]["value"])

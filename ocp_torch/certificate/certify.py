@@ -16,10 +16,11 @@ from ocp_torch.certificate.certificate import Certificate, Run
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.performance import Simulated, simulate_performance
+from ocp_torch.certificate.rigorous import RigorousBound, proved_lower
 from ocp_torch.certificate.sides import CHUNK, LowerSide, lower_side, upper_side
 from ocp_torch.certificate.stage import StageSettings, fit_closed_loop
 from ocp_torch.control_laws import CLOSED, control_laws, occupation_density, zero_law
-from ocp_torch.errors import require_integer
+from ocp_torch.errors import require_flag, require_integer
 from ocp_torch.fields.fields import Fields
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.problem import Problem
@@ -43,6 +44,7 @@ class CertificateSettings:
     trajectories: int = 256  # simulated starts per replicate; 0 skips every simulation
     ascents: int = 32  # local ascents from the worst sampled states
     occupation_states: int = 144  # where the supremum of the occupation density is looked for; 0 skips it
+    rigorous: bool = False  # a lower bound proved over cells, in one and two dimensions: a second, or up to two minutes
     stage: StageSettings = field(default_factory=StageSettings)  # the fit to the closed loop
 
     def __post_init__(self) -> None:
@@ -51,6 +53,7 @@ class CertificateSettings:
         require_integer("certificate.trajectories", self.trajectories, 0)
         require_integer("certificate.ascents", self.ascents, 1)
         require_integer("certificate.occupation_states", self.occupation_states, 0)
+        require_flag("certificate.rigorous", self.rigorous)
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,7 @@ def certify_fields(
         lower = lower_side(problem, fields.value, sets, bounds.M, settings.ascents)
     part = max(TANGENT_PART, problem.dim // 2)
     few = replicated_samples(problem, max(1, settings.points // part), count, seed, divergences=True)
+    proved, proof_notes = proved_lower(problem, fields.value, lower) if settings.rigorous and lower else (None, [])
     laws = control_laws(occupation, problem, fields, bounds)
     simulated: dict[str, Simulated] = {}
     zero = sup_control = sup_occupation = stage = None
@@ -124,7 +128,7 @@ def certify_fields(
     assumptions, notes = check_assumptions(
         problem, bounds, sup_occupation, sup_control, largest_value, uses=(has_value, J is not None)
     )
-    warnings = list(bounds.warnings) + notes + warnings
+    warnings = list(bounds.warnings) + notes + warnings + proof_notes
     # J bounds the performance of w / mu and G that of w over the mu of Lemma 2: of nothing else.
     speaks = {"J": best == "density", "G": best == "density" and occupation == CLOSED and assumptions.value_holds}
     if stage is not None and not (speaks["J"] and assumptions.value_holds and J.value <= stage.J.value):
@@ -136,13 +140,17 @@ def certify_fields(
     return Certificate(
         run=run,
         exact=problem.exact_optimum,
-        lower={"F_M": lower.F_M if lower else None, "shifted": lower.shifted if lower else None},
+        lower={
+            "F_M": lower.F_M if lower else None,
+            "shifted": lower.shifted if lower else None,
+            **({"rigorous": proved.estimate if proved else None} if settings.rigorous else {}),
+        },
         upper={"J": J, "G": G, "lagrangian": stage.lagrangian if stage else None},
         perf=perf,
         baseline={"zero": zero},
         assumptions=assumptions,
         warnings=warnings,
-        searches=_searches(lower, stage),
+        searches=_searches(lower, stage, proved),
         speaks=speaks,
     )
 
@@ -185,13 +193,13 @@ def certification_stage(
     return closed_loop_bounds(loop, value, fitted.log_occupation, loop_sets, settings.ascents, kind, initial), []
 
 
-def _searches(lower: LowerSide | None, stage: ClosedLoopBounds | None) -> list[str]:
-    """How each sampled supremum was found."""
-    found = {"sup max(Q, 0)": lower.largest_slack} if lower else {}
+def _searches(lower: LowerSide | None, stage: ClosedLoopBounds | None, proved: RigorousBound | None) -> list[str]:
+    """How each supremum was found."""
+    found = {f"sup Q of {lower.theta:.4g} V": lower.largest_slack} if lower else {}
     if stage is not None:
         found |= {"eps_hi": stage.eps_hi, "eps_lo": stage.eps_lo}
-    return [
-        f"{name} = {max(e.value, 0.0):.3e}, the largest of {e.points:,} sampled states and {e.ascents} ascents"
+    return ([proved.sentence] if proved else []) + [
+        f"{name} = {e.value:.3e}, the largest of {e.points:,} sampled states and {e.ascents} ascents"
         for name, e in found.items()
     ]
 

@@ -10,10 +10,13 @@ from torch import Tensor
 from ocp_torch import calculus, formulas
 from ocp_torch.calculus import Field
 from ocp_torch.certificate.estimate import Estimate, integral
+from ocp_torch.certificate.shifted import SlackParts, best_shift, slack_function
 from ocp_torch.control_laws import Density
-from ocp_torch.extremum import Extremum, supremum
+from ocp_torch.extremum import Extremum
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
+
+__all__ = ["CHUNK", "LowerSide", "chunked_gradient", "lower_side", "slack_function", "upper_side"]
 
 # States evaluated at once: what fits the cache is fastest.
 CHUNK = 1024
@@ -21,11 +24,12 @@ CHUNK = 1024
 
 @dataclass(frozen=True)
 class LowerSide:
-    """`F_M` rests on `M`, `shifted` on the supremum of the slack; per point set, `E[V mu0]` and `E[max(Q, 0)]`."""
+    """`F_M` rests on `M`, `shifted` on the supremum of the slack of `theta V`; both on per-set `E[V mu0]`, `E[max(Q, 0)]`."""
 
     M: float
     initial: list[float]
     violation: list[float]
+    theta: float
     largest_slack: Extremum
 
     @property
@@ -34,45 +38,21 @@ class LowerSide:
 
     @property
     def shifted(self) -> Estimate:
-        return Estimate.of([e - max(self.largest_slack.value, 0.0) for e in self.initial])
-
-
-def slack_function(problem: Problem, value: Field):
-    """`x -> Q(x)` for the whole torus, differentiable in `x` where the problem is."""
-
-    def slack(x: Tensor) -> Tensor:
-        samples = Samples.of(problem, x, divergences=False) if not x.requires_grad else _live(problem, x)
-        v, gradient = calculus.value_and_gradient(value, x)
-        return formulas.hjb_slack(samples, v, gradient, problem.control_cost, problem.discount)
-
-    return slack
-
-
-def _live(problem: Problem, x: Tensor) -> Samples:
-    """Samples whose data carry derivatives in `x`; only suprema over `x` want that."""
-    one = torch.ones_like(x[:, 0])
-    return Samples(x, problem.state_cost(x), problem.drift(x), problem.control_matrix(x), one, one)
+        """`E[theta V mu0] - sup Q_{theta V}`; a negative supremum shifts `V` up."""
+        return Estimate.of([self.theta * e - self.largest_slack.value for e in self.initial])
 
 
 def lower_side(problem: Problem, value: Field, sets: list[Samples], M: float, ascents: int = 32) -> LowerSide:
-    r"""`F_M(V) = E[V mu0 - M max(Q, 0)]` (section 4.1) and `E[V mu0] - max_x max(Q, 0)`.
-
-    The second needs no `M`: `V` minus its largest positive slack is a subsolution, because a constant shifts `Q` by
-    itself. Its supremum is sampled on all of ``sets`` and climbed, hence an estimate.
-    """
-    violation, initial, worst = [], [], None
+    r"""`F_M(V) = E[V mu0 - M max(Q, 0)]` (section 4.1) and the shifted bound (`ocp_torch.certificate.shifted`)."""
+    violation, initial, pieces = [], [], []
     for samples in sets:
         v, gradient = chunked_gradient(value, samples.x)
-        slack = formulas.hjb_slack(samples, v, gradient, problem.control_cost, problem.discount)
+        parts = SlackParts.of(samples, v, gradient, problem.control_cost, problem.discount)
         initial.append(integral(samples, v * samples.mu0))
-        violation.append(integral(samples, slack.clamp_min(0.0)))
-        top = slack.topk(min(ascents, len(slack)))
-        found = torch.cat([top.values.unsqueeze(-1), samples.x[top.indices]], dim=-1)
-        worst = found if worst is None else torch.cat([worst, found])
-    start = worst[worst[:, 0].topk(min(ascents, len(worst))).indices, 1:]
-    largest = supremum(slack_function(problem, value), start, ascents=ascents)
-    largest = Extremum(largest.value, largest.x, sum(len(s) for s in sets), largest.ascents)
-    return LowerSide(M, initial, violation, largest)
+        violation.append(integral(samples, parts.slack(1.0).clamp_min(0.0)))
+        pieces.append(parts)
+    theta, largest = best_shift(problem, value, SlackParts.join(pieces), sum(initial) / len(initial), ascents)
+    return LowerSide(M, initial, violation, theta, largest)
 
 
 def upper_side(

@@ -12,11 +12,13 @@ import torch
 from torch import Tensor
 
 from ocp_torch.control_cost import norm_power
+from ocp_torch.enclosure import Enclosure
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
 from ocp_torch.extremum import supremum
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.trigonometric import TrigonometricPolynomial, random_polynomial
 from ocp_torch.samplers import scrambled_sobol
+from ocp_torch.taylor import Box, TaylorModel
 
 # States searched for the extrema of u* and f, before local ascent.
 SEARCH_POINTS = 2**14
@@ -175,6 +177,29 @@ class Manufactured(Problem):
 
     def initial_density(self, x: Tensor) -> Tensor:
         return self._mu0(x)
+
+    def enclosure(self, box: Box) -> Enclosure:
+        """The formulas of `state_cost` and `drift` in Taylor models; the optimal control near its zeros by its size alone."""
+        rho, q, conjugate = self.discount, self.exponent, self.control_cost.conjugate_exponent
+        V0, slope = self._V0.model(box), self._V0.gradient_model(box)
+        mu, mu0 = self._mu.model(box), self._mu0.model(box)
+        stream = TaylorModel.stack([h.model(box) for h in self._stream])
+        closed_loop = (self._phi.gradient_model(box) * rho + stream) * mu.reciprocal()[..., None]
+        B = self._control_matrix_model(box)
+        pull = (B * slope[..., None]).sum(dim=-2) * (-1.0 / rho)
+        squares = (pull * pull).sum()
+        u = pull if q == 2.0 else pull * squares.power(0.5 * conjugate - 1.0)[..., None]
+        cost = squares.power(0.5 * conjugate) * (1.0 / q)
+        f = V0 - (slope * closed_loop).sum() * (1.0 / rho) - cost + self._c
+        return Enclosure(f, closed_loop - (B * u[None]).sum(), B, mu0)
+
+    def _control_matrix_model(self, box: Box) -> TaylorModel:
+        B0 = self._B0.to(box.centre).expand(len(box), -1, -1)
+        if not self.state_dependent_control:
+            return box.constant(B0)
+        waves = torch.nn.functional.one_hot(self._B_coordinate, self.dim).to(box.centre).flatten(0, 1)
+        waved = box.cosine(waves, 2.0 * torch.pi * self._B_phase.to(box.centre).flatten())
+        return (waved * 0.3 + 1.0).reshape(*self._B0.shape) * B0
 
     def exact_value(self, x: Tensor) -> Tensor:
         return self._V0(x) + self._c

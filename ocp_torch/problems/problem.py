@@ -12,7 +12,9 @@ from torch import Tensor
 
 from ocp_torch import calculus
 from ocp_torch.control_cost import PowerCost
+from ocp_torch.enclosure import Enclosure, Lipschitz, lipschitz_enclosure
 from ocp_torch.errors import InputError, require_integer, require_number
+from ocp_torch.taylor import Box
 
 # Beyond this, B alone would fill the memory.
 MOST_COORDINATES = 1024
@@ -27,7 +29,7 @@ class Problem:
 
     Attributes a subclass may set, each `None` where unknown: ``state_cost_bound >= sup f``; ``occupation_bound >= sup
     mu*`` (`math.inf` when known to be unbounded); ``control_bound >= sup |u*|``; ``value_bound >= sup V*``;
-    ``exact_optimum``, the number `OPT`.
+    ``exact_optimum``, the number `OPT`; ``lipschitz``, constants of the data (`Lipschitz`).
     """
 
     def __init__(self, dim: int, control_dim: int | None = None, discount: float = 2.0, exponent: float = 2.0) -> None:
@@ -45,6 +47,7 @@ class Problem:
         self.control_bound: float | None = None
         self.value_bound: float | None = None
         self.exact_optimum: float | None = None
+        self.lipschitz: Lipschitz | None = None
         self._placed: dict = {}
 
     def state_cost(self, x: Tensor) -> Tensor:
@@ -89,6 +92,14 @@ class Problem:
         """Whether `div a` and `div B` are to be had."""
         x = torch.full((1, self.dim), 0.5, dtype=torch.float64)
         return self.drift_divergence(x) is not None and self.control_divergence(x) is not None
+
+    def enclosure(self, box: Box) -> Enclosure | None:
+        """What `f`, `a`, `B` and `mu0` can be over a batch of cells, for rigorous bounds; `None` where nobody knows.
+
+        Here from ``lipschitz`` constants alone. Taylor models, as in `Torus`, converge faster; a class that overrides the
+        data must override this too.
+        """
+        return lipschitz_enclosure(self, Problem, box)
 
     # Exact truth, where known: `None` otherwise.
     def exact_value(self, x: Tensor) -> Tensor | None:

@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from ocp_torch.taylor import Box, TaylorModel
+
 
 class TrigonometricPolynomial:
     """`p(x) = c + sum_j b_j cos(2 pi k_j . x + theta_j)` with integer wave vectors `k_j != 0`.
@@ -46,6 +48,19 @@ class TrigonometricPolynomial:
         """`grad p(x)`, ``(N, d)``."""
         slopes = -2.0 * math.pi * self.amplitudes.to(x) * self._angle(x).sin()
         return slopes @ self.waves.to(x)
+
+    def model(self, box: Box) -> TaylorModel:
+        """`p` over a batch of cells, ``(N,)``."""
+        if len(self.waves) == 0:
+            return box.constant(self.constant)
+        waved = box.cosine(self.waves.to(box.centre), self.phases.to(box.centre))
+        return (waved * self.amplitudes.to(box.centre)).sum() + self.constant
+
+    def gradient_model(self, box: Box) -> TaylorModel:
+        """`grad p` over a batch of cells, ``(N, d)``; a cosine a quarter turn on is the derivative of a cosine."""
+        turned = box.cosine(self.waves.to(box.centre), self.phases.to(box.centre) + 0.5 * math.pi)
+        slopes = 2.0 * math.pi * self.amplitudes.unsqueeze(-1) * self.waves
+        return (turned[..., None] * slopes.to(box.centre)).sum(dim=-2)
 
     def hessian(self, x: Tensor) -> Tensor:
         """Second derivatives of `p`, ``(N, d, d)``."""

@@ -1,0 +1,105 @@
+r"""A lower bound that needs no `M`: `E[W mu0] - sup Q_W <= OPT` for any smooth `W`, here for `W = theta V`.
+
+A constant `c` added to `W` adds `c` to its slack, so `W - sup Q_W` is a subsolution of the HJB equation. For `V` scaled by
+`theta` the slack `Q_{theta V} = theta (V - grad V . a / rho) - f + R*(-theta B^T grad V / rho)` is convex in `theta` at
+every state, so the bound is concave in `theta`: its maximum is found by a search on a line. (Scaling `V - c` instead of `V`
+changes nothing.) Where `V` has large slack, at kinks for instance, a `theta` below 1 trades a little of `E[V mu0]` for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ocp_torch import calculus, formulas
+from ocp_torch.calculus import Field
+from ocp_torch.control_cost import PowerCost
+from ocp_torch.extremum import Extremum, supremum
+from ocp_torch.problems.problem import Problem
+from ocp_torch.samples import Samples
+
+# The search: theta in [0, TOP], narrowed by thirds.
+TOP, NARROWINGS = 1.5, 40
+
+
+@dataclass(frozen=True)
+class SlackParts:
+    """What the slack of every `theta V` at sampled states is made of."""
+
+    x: Tensor  # (N, d)
+    value: Tensor  # (N,) V - grad V . a / rho
+    f: Tensor  # (N,)
+    push: Tensor  # (N, m) -B^T grad V / rho
+    cost: PowerCost
+
+    @classmethod
+    def of(cls, samples: Samples, value: Tensor, gradient: Tensor, cost: PowerCost, rho: float) -> SlackParts:
+        transported = value - formulas.along(samples, gradient) / rho
+        return cls(samples.x, transported, samples.f, -formulas.pull_back(samples, gradient) / rho, cost)
+
+    @staticmethod
+    def join(parts: list[SlackParts]) -> SlackParts:
+        names = ("x", "value", "f", "push")
+        return SlackParts(*(torch.cat([getattr(p, n) for p in parts]) for n in names), parts[0].cost)
+
+    def take(self, index: Tensor) -> SlackParts:
+        return SlackParts(self.x[index], self.value[index], self.f[index], self.push[index], self.cost)
+
+    def slack(self, theta: float) -> Tensor:
+        """`Q_{theta V}`, ``(N,)``."""
+        return theta * self.value - self.f + self.cost.conjugate(theta * self.push)
+
+
+def slack_function(problem: Problem, value: Field):
+    """`x -> Q(x)` for the whole torus, differentiable in `x` where the problem is."""
+
+    def slack(x: Tensor) -> Tensor:
+        samples = Samples.of(problem, x, divergences=False) if not x.requires_grad else _live(problem, x)
+        v, gradient = calculus.value_and_gradient(value, x)
+        return formulas.hjb_slack(samples, v, gradient, problem.control_cost, problem.discount)
+
+    return slack
+
+
+def _live(problem: Problem, x: Tensor) -> Samples:
+    """Samples whose data carry derivatives in `x`; only suprema over `x` want that."""
+    one = torch.ones_like(x[:, 0])
+    return Samples(x, problem.state_cost(x), problem.drift(x), problem.control_matrix(x), one, one)
+
+
+def climbed(problem: Problem, value: Field, parts: SlackParts, theta: float, ascents: int) -> Extremum:
+    """`sup Q_{theta V}`: the largest of all sampled states, then local ascents from the worst; an estimate from below."""
+    start = parts.x[parts.slack(theta).topk(min(ascents, len(parts.x))).indices]
+    scaled = value if theta == 1.0 else lambda x: theta * value(x)
+    found = supremum(slack_function(problem, scaled), start, ascents=ascents)
+    return Extremum(found.value, found.x, len(parts.x), found.ascents)
+
+
+def best_shift(
+    problem: Problem, value: Field, parts: SlackParts, initial: float, ascents: int
+) -> tuple[float, Extremum]:
+    r"""`theta` and `sup Q_{theta V}`: 1, or the maximiser of `theta initial - max Q_{theta V}` over the sampled states.
+
+    The supremum at the chosen `theta` is searched for anew, and 1 stays where that shows no gain. Where `f < 0` is met
+    the problem breaks its promise, `0` is no subsolution to scale towards, and `theta` is 1.
+    """
+    plain = climbed(problem, value, parts, 1.0, ascents)
+    if bool((parts.f < 0.0).any()):
+        return 1.0, plain
+    theta = scaled_by(parts, initial)
+    scaled = climbed(problem, value, parts, theta, ascents)
+    gains = theta * initial - scaled.value > initial - plain.value
+    return (theta, scaled) if gains else (1.0, plain)
+
+
+def scaled_by(parts: SlackParts, initial: float) -> float:
+    """The `theta` in `[0, TOP]` that maximises the sampled bound, concave in `theta`."""
+    bound = lambda theta: theta * initial - float(parts.slack(theta).max())
+    low, high = 0.0, TOP
+    for _ in range(NARROWINGS):
+        third = (high - low) / 3.0
+        left, right = low + third, high - third
+        low, high = (left, high) if bound(left) < bound(right) else (low, right)
+    return 0.5 * (low + high)

@@ -1,0 +1,95 @@
+"""The lower bound that needs no `M`: the best multiple of `V`, shifted by the supremum of its slack."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import zoo
+from ocp_torch.calculus import value_and_gradient
+from ocp_torch.certificate.estimate import replicated_samples
+from ocp_torch.certificate.shifted import TOP, SlackParts, climbed, scaled_by, slack_function
+from ocp_torch.certificate.sides import lower_side
+from ocp_torch.problems import Circle
+from ocp_torch.samples import Samples
+
+
+def parts_of(problem, value, count: int = 400) -> SlackParts:
+    samples = Samples.of(problem, zoo.states(problem, count))
+    return SlackParts.of(samples, *value_and_gradient(value, samples.x), problem.control_cost, problem.discount)
+
+
+def near(problem, seed: int, size: float):
+    network = zoo.rough_network(problem.dim, seed, size=size)
+    return lambda x: problem.exact_value(x) + network(x)
+
+
+@zoo.on(zoo.FEW)
+def test_the_slack_of_a_multiple_is_that_of_the_scaled_network(problem):
+    V = near(problem, 2, 0.5)
+    parts = parts_of(problem, V)
+    for theta in (0.0, 0.3, 1.0, 1.4):
+        torch.testing.assert_close(parts.slack(theta), slack_function(problem, lambda x, s=theta: s * V(x))(parts.x))
+
+
+@zoo.on(zoo.FEW)
+def test_the_multiple_is_the_best_on_a_line_of_multiples(problem):
+    parts, initial = parts_of(problem, near(problem, 4, 0.2)), problem.exact_optimum
+    bound = lambda theta: theta * initial - float(parts.slack(theta).max())
+    best = max(bound(theta) for theta in torch.linspace(0.0, TOP, 1501).tolist())
+    assert bound(scaled_by(parts, initial)) >= best - 1e-9
+
+
+case = dict(name=st.sampled_from(zoo.FEW), seed=st.integers(0, 10**6), size=st.sampled_from([1e-2, 0.1, 1.0]))
+
+
+@settings(max_examples=6)
+@given(**case)
+def test_scaling_never_loses_and_never_passes_the_optimum(name, seed, size):
+    problem = zoo.build(name)
+    V = near(problem, seed, size)
+    sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
+    found = lower_side(problem, V, sets, 1.0, ascents=8)
+    pieces = [
+        SlackParts.of(s, *value_and_gradient(V, s.x), problem.control_cost, problem.discount) for s in sets
+    ]  # the multiple 1, as it was before there was a choice
+    plain = climbed(problem, V, SlackParts.join(pieces), 1.0, 8)
+    initial = sum(found.initial) / len(found.initial)
+    assert found.shifted.value >= initial - max(plain.value, 0.0) - 1e-12
+    assert found.shifted.value <= problem.exact_optimum + 6.0 * found.shifted.se + 1e-9
+
+
+@zoo.on(zoo.FEW)
+def test_a_value_function_of_the_wrong_size_is_put_right(problem):
+    sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
+    found = lower_side(problem, lambda x: 0.8 * problem.exact_value(x), sets, 1.0)
+    assert found.theta == pytest.approx(1.25, abs=0.02)
+    assert found.shifted.value == pytest.approx(problem.exact_optimum, rel=5e-3, abs=6.0 * found.shifted.se)
+
+
+@zoo.on(zoo.FEW)
+def test_a_subsolution_with_room_is_shifted_up(problem):
+    sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
+    found = lower_side(problem, lambda x: problem.exact_value(x) - 5.0, sets, 1.0)
+    assert found.shifted.value == pytest.approx(problem.exact_optimum, rel=5e-3, abs=6.0 * found.shifted.se)
+
+
+def test_a_useless_value_function_still_gives_about_the_smallest_cost():
+    problem = Circle()
+    sets = replicated_samples(problem, 512, 2, seed=0, divergences=False)
+    rough = lower_side(problem, zoo.rough_network(1, 0, size=50.0), sets, 1.0)
+    assert -1e-3 < rough.shifted.value < problem.exact_optimum
+    assert rough.theta < 0.1
+
+
+class Negative(Circle):
+    def state_cost(self, x):
+        return super().state_cost(x) - 0.1
+
+
+def test_where_the_cost_is_negative_nothing_is_scaled():
+    problem = Negative()
+    sets = replicated_samples(problem, 512, 2, seed=0, divergences=False)
+    found = lower_side(problem, zoo.rough_network(1, 0), sets, 1.0)
+    assert found.theta == 1.0
+    assert found.shifted.value <= problem.exact_optimum - 0.1
