@@ -41,7 +41,7 @@ def certify_saved(controller: Controller, settings: CertificateSettings, seed: i
     """Print and return the certificate of ``controller``; with its own ``seed`` the numbers are those of its run."""
     torch.set_num_threads(int(controller.config.get("trainer", {}).get("threads", 1)))
     before = controller.certificate
-    run = Run(**{name: before[name] for name in Run.__dataclass_fields__})
+    run = Run(**{name: before[name] for name in Run.__dataclass_fields__ if name in before})
     if seed is not None:
         run = Run(**{**vars(run), "seed": require_integer("seed", seed, 0)})
     trained = Trained(controller.fields, controller.occupation, build_network(controller.model))

@@ -28,17 +28,24 @@ class Silent:
     def extended(self, trainer) -> None:
         """Another round begins."""
 
+    def noticed(self, sentence: str) -> None:
+        """Something is wrong with the run's health."""
+
 
 class Monitor(Silent):
     """Progress bar (terminals only), log lines, and TensorBoard scalars in the groups bounds, performance, loss, lr,
     gradient_norm, violation and throughput."""
 
-    def __init__(self, folder: Path, steps: int, progress: bool = True) -> None:
-        self.writer = SummaryWriter(str(folder))
+    def __init__(self, folder: Path, trainer) -> None:
+        done = trainer.step
+        # What a killed start still wrote beyond its last checkpoint is not shown twice.
+        self.writer = SummaryWriter(str(folder), purge_step=done + 1 if done else None)
         # disable=None: no bar where the output is not a terminal.
-        self.bar = tqdm(total=steps, unit="step", dynamic_ncols=True, disable=None if progress else True)
+        hidden = None if trainer.settings.progress else True
+        options = dict(unit="step", dynamic_ncols=True, disable=hidden)
+        self.bar = tqdm(total=max(trainer.end, done), initial=done, **options)
         self._shown: dict[str, str] = {}
-        self._mark = (time.perf_counter(), 0)
+        self._mark = (time.perf_counter(), trainer.samples)
 
     def __enter__(self) -> Monitor:
         return self
@@ -73,7 +80,11 @@ class Monitor(Silent):
         if gaps:
             values["gap"] = f"{100 * min(gaps):.2f}%"
         self._show(**values)
+        # To train.log, not to the terminal.
         log.debug("step %d: %s", trainer.step, ", ".join(f"{k} {v}" for k, v in values.items()))
+
+    def noticed(self, sentence: str) -> None:
+        log.warning("warning: %s", sentence)
 
     def extended(self, trainer) -> None:
         self.bar.total = trainer.end
