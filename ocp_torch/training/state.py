@@ -31,6 +31,7 @@ def gather(trainer: Trainer) -> dict:
         "samples": trainer.samples,
         "seconds": trainer.seconds,
         "elapsed": trainer.elapsed,
+        "ended": trainer.ended,
         "pending": trainer.pending,
         "retry": trainer.retry,
         "fields": trainer.fields.state_dict(),

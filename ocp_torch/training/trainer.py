@@ -102,6 +102,7 @@ class Trainer:
         raises `Preempted` after the step in hand, with the state saved. Raises `NonFiniteError` before an update that is
         not finite.
         """
+        self.ended = False
         while self._reason() is None:
             if self.step < self.end:
                 self._advance(monitor, checkpoint)
@@ -113,7 +114,7 @@ class Trainer:
             if signals is not None and signals.received is not None:
                 self.save(checkpoint)
                 signals.take()
-        self.stopped = self._reason() or STEPS
+        self.stopped, self.ended = self._reason() or STEPS, True
         self.save(checkpoint)
         return self.stopped
 
