@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from functools import cache
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
@@ -143,6 +144,7 @@ def explain(error: Exception, config_name: str) -> str:
     return " ".join(text.split()).rstrip(".") + "."
 
 
+@cache
 def known_fields(config_name: str) -> list[str]:
     """Dotted names of all fields and groups of the default configuration."""
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):

@@ -63,7 +63,7 @@ class Trainer:
         self.step, self.round, self.samples = 0, 0, 0
         self.seconds, self.elapsed = 0.0, 0.0  # in steps alone; with looks and checkpoints
         self.pending, self.retry = False, 0  # a certificate may have reached the target gap; not tried before this step
-        self.stopped = STEPS
+        self.stopped, self.ended = STEPS, False
         (mean, spread), _ = typical_sizes(problem)
         self.watch = Watch(unit=abs(mean) + spread)
 
