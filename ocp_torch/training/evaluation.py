@@ -11,6 +11,7 @@ from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained
 from ocp_torch.config import build_certificate_settings, build_network, build_problem
 from ocp_torch.controller import Controller, load_controller
 from ocp_torch.errors import InputError, require_integer
+from ocp_torch.training.settings import MOST_THREADS
 
 log = logging.getLogger(__name__)
 
@@ -39,9 +40,14 @@ def settings_for(controller: Controller, config: dict) -> CertificateSettings:
 
 def certify_saved(controller: Controller, settings: CertificateSettings, seed: int | None = None) -> Certificate:
     """Print and return the certificate of ``controller``; with its own ``seed`` the numbers are those of its run."""
-    torch.set_num_threads(int(controller.config.get("trainer", {}).get("threads", 1)))
+    threads = controller.config.get("trainer", {}).get("threads", 1)
+    torch.set_num_threads(require_integer("trainer.threads", threads, 1, maximum=MOST_THREADS))
     before = controller.certificate
-    run = Run(**{name: before[name] for name in Run.__dataclass_fields__ if name in before})
+    try:
+        run = Run(**{name: before[name] for name in Run.__dataclass_fields__ if name in before})
+    except TypeError:
+        raise InputError("the controller's certificate does not say which problem and method it is of.") from None
+    require_integer("seed", run.seed, 0)
     if seed is not None:
         run = Run(**{**vars(run), "seed": require_integer("seed", seed, 0)})
     trained = Trained(controller.fields, controller.occupation, build_network(controller.model))
