@@ -7,13 +7,35 @@ import time
 from pathlib import Path
 
 import torch
+from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from ocp_torch import calculus, formulas
 from ocp_torch.certificate import Certificate
+from ocp_torch.control_laws import occupation_density
+from ocp_torch.samples import Samples
 from ocp_torch.steppers import StepReport
 
 log = logging.getLogger(__name__)
+
+
+@torch.no_grad()
+def liouville_residual(trainer, batch: Samples) -> dict[str, Tensor]:
+    """`mean |mu0 - mu - div(a mu + B w) / rho|` on ``batch``, whatever gives `mu`: also where the loss needs no divergences
+    (a player that rests, the plain saddle) or `mu` is in closed form. Nothing where the problem gives no divergences."""
+    problem, fields, rho = trainer.problem, trainer.fields, trainer.problem.discount
+    samples = Samples.of(problem, batch.x)
+    if samples.div_a is None or samples.div_B is None:
+        return {}
+    _, inflow = formulas.controlled_inflow(samples, fields.control_density, rho)
+    density = occupation_density(trainer.objective.occupation, problem, fields, trainer.bounds)
+    if problem.driftless:
+        loss = density(samples.x)
+    else:
+        mu, derivative = calculus.directional_derivative(density, samples.x, samples.a)
+        loss = mu + (mu * samples.div_a + derivative) / rho
+    return {"residual_mean_absolute": samples.mean((inflow - loss).abs())}
 
 
 class Silent:
@@ -62,7 +84,10 @@ class Monitor(Silent):
         for player in report.losses:
             self.writer.add_scalar(f"loss/{player}", float(report.losses[player]), step)
             self.writer.add_scalar(f"gradient_norm/{player}", float(report.gradient_norms[player]), step)
-        for name, value in trainer.objective.diagnostics(trainer.fields, report.batch).items():
+        shown = trainer.objective.diagnostics(trainer.fields, report.batch)
+        if "residual_mean_absolute" not in shown and trainer.fields.control_density is not None:
+            shown |= liouville_residual(trainer, report.batch)
+        for name, value in shown.items():
             self.writer.add_scalar(f"violation/{name}", float(value), step)
         for player, rate in trainer.stepper.learning_rates().items():
             self.writer.add_scalar(f"lr/{player}", rate, step)
