@@ -23,10 +23,10 @@ from test_config import configured
 from test_training import METHODS, SMALL, differences, small, state_of
 
 STEPPERS, SAMPLERS, OPTIMIZERS = ("simultaneous", "extragradient"), ("uniform", "sobol"), ("soap", "adam", "sgd")
-# Every method with every stepper and sampler; the optimisers go round.
+# Every method with every stepper; samplers and optimisers go round. (More combinations, once interrupted: test_training.)
 WAYS = [
-    (*METHODS[method], f"stepper={stepper}", f"sampler={sampler}", f"optimizer={OPTIMIZERS[k % 3]}")
-    for k, (method, stepper, sampler) in enumerate(itertools.product(METHODS, STEPPERS, SAMPLERS))
+    (*METHODS[method], f"stepper={stepper}", f"sampler={SAMPLERS[k % 2]}", f"optimizer={OPTIMIZERS[k % 3]}")
+    for k, (stepper, method) in enumerate(itertools.product(STEPPERS, METHODS))
 ]
 
 
@@ -49,7 +49,7 @@ class Recorder(Silent):
 
 @pytest.mark.parametrize("way", WAYS, ids=" ".join)
 def test_from_any_step_a_resumed_run_reaches_the_same_bits(way, tmp_path):
-    steps, made = (1, 7, 13, 20), maker(*way)
+    steps, made = (1, 7, 13), maker(*way)
     whole = made()
     whole.fit(Recorder(tmp_path, *steps))
     for step in steps:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
@@ -56,6 +57,7 @@ class Stepper(ABC):
         resting = objective.resting
         self.schedules = {p: schedule(optimizer, resting.get(p, 0.0)) for p, optimizer in self.optimizers.items()}
         self._configured = {p: _hyper_parameters(optimizer) for p, optimizer in self.optimizers.items()}
+        self._unmoved = {p: copy.deepcopy(s.state_dict()) for p, s in self.schedules.items()}
 
     @abstractmethod
     def step(self, draw: Draw, visit: Visit) -> StepReport:
@@ -79,6 +81,7 @@ class Stepper(ABC):
             if moves is None:
                 self.schedules[player].load_state_dict(state["schedules"][player])
                 continue
+            self.schedules[player].load_state_dict(copy.deepcopy(self._unmoved[player]))
             for group, configured in zip(optimizer.param_groups, self._configured[player], strict=True):
                 group.update(configured)
             with warnings.catch_warnings():
