@@ -195,6 +195,9 @@ def failures():
 def failed(hydra: DictConfig, reason: str) -> None:
     """Say that a job of a sweep failed, and have it named at the end."""
     name = hydra.job.override_dirname
-    log.error("error: job %s (%s): %s", hydra.job.num, name, reason)
-    with open(os.environ[FAILURES], "a") as file:
-        file.write(f"{hydra.job.num} ({name})\n")
+    sentence = f"error: job {hydra.job.num} ({name}): {reason}"
+    print(sentence, file=sys.stderr)
+    log.debug("%s", sentence)  # to its own train.log as well
+    if FAILURES in os.environ:
+        with open(os.environ[FAILURES], "a") as file:
+            file.write(f"{hydra.job.num} ({name})\n")
