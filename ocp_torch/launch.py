@@ -127,6 +127,8 @@ def job(task: Callable[[dict, Path], object], config: DictConfig) -> None:
             raise
         failed(hydra, f"stopped by {stop}")
     except Exception as error:
+        if not sweeping and isinstance(error, InputError):
+            fail(str(error))
         if not sweeping:
             raise
         if not isinstance(error, InputError):

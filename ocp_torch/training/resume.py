@@ -22,7 +22,7 @@ from ocp_torch.problems import PROBLEMS
 from ocp_torch.storage import write_atomically
 from ocp_torch.training.checkpoint import LAST, load_checkpoint, newest
 
-CONFIG, LARGEST_CONFIG = "config.yaml", 2**20
+CONFIG, LARGEST_CONFIG, DEEPEST = "config.yaml", 2**20, 32
 OWN_TARGETS = {f"ocp_torch.problems.{c.__name__}" for c in PROBLEMS.values()}
 OWN_TARGETS |= {f"{c.__module__}.{c.__name__}" for c in PROBLEMS.values()}
 # What a checkpoint's tensors belong to; everything else may be set anew at a resume.
@@ -89,8 +89,7 @@ def read_configuration(file: Path) -> dict:
         if file.stat().st_size > LARGEST_CONFIG:
             raise InputError(f"{file} is too large to be a run's configuration.")
         text = file.read_text()
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
-            raise InputError(f"{file} holds references, which no run's configuration does.")
+        _require_shallow(file, text)
         data = yaml.safe_load(text)
         if not isinstance(data, dict):
             raise InputError(f"{file} is not a run's configuration.")
@@ -105,6 +104,15 @@ def read_configuration(file: Path) -> dict:
             raise
         reason = " ".join(str(error).split())[:200].rstrip(".")
         raise InputError(f"{file} is damaged or not a run's configuration ({reason}).") from None
+
+
+def _require_shallow(file: Path, text: str) -> None:
+    """References that unfold to any size, and nesting that takes forever to read, are in no run's configuration."""
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if isinstance(event, yaml.AliasEvent) or depth > DEEPEST:
+            raise InputError(f"{file} holds references or nests too deep, which no run's configuration does.")
 
 
 def resumed_configuration(composed: dict, named: Iterable[str]) -> dict:
