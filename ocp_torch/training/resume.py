@@ -195,7 +195,7 @@ def require_same_run(config: dict, made: dict) -> None:
         for name, (own, other) in _differences(_at(config, field), _at(made, field), field):
             if not name.endswith("._target_"):
                 raise InputError(
-                    f"{name} is {own!r}, but the run has {str(other)[:80]!r}, and it cannot change at a resume; "
+                    f"{name} is {own!r}, but the run has {repr(other)[:80]}, and it cannot change at a resume; "
                     "fields of trainer, certificate, optimizer, schedule and stepper can."
                 )
 
