@@ -7,6 +7,8 @@ import logging
 import multiprocessing
 import os
 import random
+import re
+import shlex
 import sys
 import tempfile
 import traceback
@@ -159,7 +161,8 @@ def again(hydra: DictConfig, folder: Path, sweeping: bool) -> str:
     """The command that goes on with what was stopped."""
     own = [o for o in hydra.overrides.task if o.lstrip("+").startswith("problem._target_=")]
     if not sweeping:
-        return " ".join(["python", sys.argv[0], f"resume={folder}", *own])
+        path = str(folder) if re.fullmatch(r"[\w./+-]+", str(folder)) else quoted(folder)
+        return shlex.join(["python", sys.argv[0], f"resume={path}", *own])
     return f"the sweep's own command with hydra.sweep.dir={hydra.sweep.dir} resume=auto"
 
 

@@ -70,7 +70,7 @@ class Command:
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.process, number)
 
-    def wait(self, seconds: float = 300.0) -> Ended:
+    def wait(self, seconds: float = 900.0) -> Ended:
         deadline = time.monotonic() + seconds
         while True:
             done, code = os.waitpid(self.process, os.WNOHANG)
