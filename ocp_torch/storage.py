@@ -23,10 +23,11 @@ METADATA_KEY, DIGEST_KEY = "ocp_torch", "sha256"
 LARGEST_FILE = 2**33
 
 
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+def write_atomically(path: Path, write: Callable[[Path], None], make_room: Callable[[], None] | None = None) -> None:
     """Let ``write`` fill a temporary file beside ``path``, then put it in place in one step: old or new, never half.
 
-    File and folder are on the disk when it returns. Raises `StorageError` when there is no room or no permission.
+    ``make_room`` is called in between, once the new file is whole and on the disk. File and folder are on the disk when it
+    returns. Raises `StorageError` when there is no room or no permission.
     """
     temporary: Path | None = None
     try:
@@ -37,6 +38,8 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
         write(temporary)
         sync(temporary)
         temporary.chmod(0o644)
+        if make_room is not None:
+            make_room()
         os.replace(temporary, path)
         sync(path.parent)
     except (OSError, SafetensorError) as error:

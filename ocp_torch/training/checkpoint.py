@@ -33,12 +33,8 @@ def save_checkpoint(path: Path, state: dict, keep: int = 1) -> None:
     content = buffer.getvalue()
     header = f"{MAGIC} {SCHEMA} {hashlib.sha256(content).hexdigest()}\n".encode()
 
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(header + content)
-        # Only once the new file is whole: a full disk must not cost an old one.
-        _make_room(path, keep)
-
-    write_atomically(path, write)
+    # Older files move only once the new one is safe: a full disk must not cost one of them.
+    write_atomically(path, lambda temporary: temporary.write_bytes(header + content), lambda: _make_room(path, keep))
 
 
 def older(path: Path, age: int) -> Path:
