@@ -83,7 +83,7 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
     data = composed(config_name, overrides, roots=(own,) if own else ())
     check(data)
     if data.get("resume") is None:
-        if own is not None:
+        if own is not None and "resume" in data:
             require_fresh(own)
         return arguments
     folder = locate(Path(data["resume"]))[0]
@@ -192,7 +192,8 @@ def failures():
         file = Path(folder) / "failed"
         os.environ[FAILURES] = str(file)
         try:
-            yield lambda: file.read_text().splitlines() if file.exists() else []
+            number = lambda line: int(line.split(" ")[0])
+            yield lambda: sorted(file.read_text().splitlines(), key=number) if file.exists() else []
         finally:
             os.environ.pop(FAILURES, None)
 

@@ -17,6 +17,7 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from ocp_torch.certificate import table
 from ocp_torch.errors import InputError
 from ocp_torch.problems import PROBLEMS
 from ocp_torch.storage import write_atomically
@@ -213,13 +214,14 @@ def _differences(one: object, other: object, name: str) -> list[tuple[str, tuple
     return [] if one == other else [(name, (one, other))]
 
 
-def is_finished(folder: Path, state: dict, config: dict) -> bool:
-    """Whether the run in ``folder`` has nothing left to do under ``config``."""
+def result_of(folder: Path, state: dict, config: dict) -> str | None:
+    """The table of a run that has nothing left to do under ``config``, or `None`."""
     try:
         certificate = json.loads((folder / "certificate.json").read_text())
-    except (OSError, ValueError, RecursionError):
-        return False
-    return bool(state.get("ended")) and state.get("config") == config and certificate.get("step") == state["step"]
+        done = state.get("ended") and state.get("config") == config and certificate["step"] == state["step"]
+        return table(certificate) if done else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None  # what cannot be read is made again
 
 
 def keep_configuration(folder: Path, config: dict) -> None:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from dataclasses import dataclass
 from pathlib import Path
 
-from ocp_torch.certificate import CertificateSettings, table
+from ocp_torch.certificate import CertificateSettings
 from ocp_torch.config import build_certificate_settings, build_trainer
 from ocp_torch.errors import InputError
 from ocp_torch.training.resume import (
     filled_from,
-    is_finished,
     keep_configuration,
     load_state,
     require_same_run,
+    result_of,
 )
 from ocp_torch.training.session import run_session
 from ocp_torch.training.trainer import Trainer
@@ -59,9 +58,9 @@ def train(config: dict, folder: Path) -> None:
     for note in run.notes:
         log.warning("warning: %s", note)
     if run.state is not None:
-        if is_finished(folder, run.state, run.trainer.config):
-            certificate = json.loads((folder / "certificate.json").read_text())
-            log.info("\n%s\n%s is finished; a larger trainer.steps would go on.", table(certificate), folder)
+        result = result_of(folder, run.state, run.trainer.config)
+        if result is not None:
+            log.info("\n%s\n%s is finished; a larger trainer.steps would go on.", result, folder)
             return
         keep_configuration(folder, config)
     run_session(run.trainer, run.certificate_settings, folder)
