@@ -39,7 +39,7 @@ def run(trainer, folder, monkeypatch, gap, certified=lambda trainer: None, **res
 def test_a_target_gap_stops_the_run_once_a_certificate_has_it(tmp_path, monkeypatch):
     """Good looks begin at step 4, good certificates at step 9: those in between are tried and training goes on."""
     trainer = small(*WAY, "trainer.target_gap=0.02", "trainer.steps=40")
-    tried, made = run(trainer, tmp_path, monkeypatch, lambda t: 0.01, lambda t: 0.02 if t.step >= 9 else 0.1)
+    tried, made = run(trainer, tmp_path, monkeypatch, lambda t: 0.01, lambda t: 0.015 if t.step >= 9 else 0.1)
     assert [step for step, _ in tried] == [4, 8, 12]
     assert (trainer.step, made.run.stopped) == (12, "target_gap")
     assert json.loads((tmp_path / "certificate.json").read_text())["stopped"] == "target_gap"
@@ -125,7 +125,7 @@ def test_fields_that_became_worse_are_not_handed_out(tmp_path, monkeypatch):
     assert all(torch.equal(fields[n], saved[8][n]) for n in fields)
     (sentence,) = [w for w in made.warnings if "handed out" in w]
     assert "step 8" in sentence
-    assert "22 % against 10 %" in sentence
+    assert "(a gap of 22 % against a gap of 10 %)" in sentence
     controller = load_controller(tmp_path / "controller.safetensors")
     assert all(torch.equal(t, saved[8][n]) for n, t in controller.fields.state_dict().items())
     assert sentence in controller.certificate["warnings"]
@@ -162,10 +162,10 @@ def test_a_hopeless_run_is_told_plainly(tmp_path, monkeypatch, caplog):
 
 def test_the_best_constant_is_the_best_of_all_constants():
     problem, bounds = Circle(), small("method=dual").bounds
-    x = torch.rand(2**16, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    x = (torch.arange(2**15, dtype=torch.float64).unsqueeze(-1) + 0.5) / 2**15
     f = problem.state_cost(x)
     values = [float(c - bounds.M * (c - f).clamp_min(0.0).mean()) for c in torch.linspace(0.0, 0.3, 600)]
-    assert best_constant(problem, bounds, 0) == pytest.approx(max(values), rel=5e-3)
+    assert best_constant(problem, bounds, 0) == pytest.approx(max(values), rel=2e-4)
 
 
 def test_norms_that_grow_without_end_are_told_once_with_what_would_help():
@@ -228,8 +228,8 @@ class Steep(Objective):
 
     def losses(self, fields, samples: Samples):
         value = fields.value(samples.x)
-        root = (value - value.detach()).clamp_min(0.0).sqrt()
-        return {"value": samples.mean(torch.where(samples.x[:, 0] > 0.9, root, value))}
+        far = samples.x[:, 0] > 0.9
+        return {"value": value[~far].sum() + (value - value.detach())[far].sqrt().sum()}
 
 
 def test_a_gradient_that_is_not_finite_is_named_with_its_field_and_state():
