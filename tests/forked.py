@@ -11,6 +11,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import ocp_torch.training.start  # noqa: F401 (so that no child has to import it)
 from ocp_torch.launch import CHECKOUT
 
 # A run of well under a second whose steps, looks, checkpoints and certificate all take a while to be killed in.
@@ -65,6 +66,10 @@ class Command:
                 status = _run(name, list(arguments), cwd, self.out, self.err, before)
             finally:
                 os._exit(status)
+
+    @property
+    def running(self) -> bool:
+        return os.waitid(os.P_PID, self.process, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
 
     def send(self, number: int) -> None:
         with contextlib.suppress(ProcessLookupError):
