@@ -22,7 +22,7 @@ from ocp_torch.errors import (
     require_number,
     require_section,
 )
-from ocp_torch.fields import MODELS, Fields
+from ocp_torch.fields import MODELS, VALUE, Fields
 from ocp_torch.objectives import METHODS, Objective
 from ocp_torch.problems import Problem
 from ocp_torch.process import prepare
@@ -69,6 +69,11 @@ def build_trainer(config: dict) -> Trainer:
     name = require_choice("method.name", method.pop("name", None), METHODS)
     bounds = resolve_bounds(problem, **{field: method.pop(field, None) for field in BOUND_FIELDS})
     objective = call(METHODS[name], "method", method, problem=problem, bounds=bounds)
+    if settings.target_gap is not None and VALUE not in objective.fields:
+        raise InputError(
+            f"trainer.target_gap is {settings.target_gap:g}, but {name} gives no lower bound to measure a gap by; "
+            "use dual or pd."
+        )
     network = build_network(config["model"])
     fields = Fields.build(problem, objective.fields, network, derive_seed(seed, WEIGHTS_STREAM))
     fields = fields.to(dtype=settings.torch_dtype, device=settings.torch_device)

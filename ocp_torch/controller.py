@@ -103,6 +103,7 @@ def load_controller(path: str | Path, problem: Problem | None = None, device: st
 def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None, device: str) -> Controller:
     if metadata["occupation"] not in (None, CLOSED, SADDLE, NETWORK):
         raise InputError(f"{path} names the unknown occupation {metadata['occupation']!r}.")
+    _require_plain_run(path, metadata["certificate"], metadata["config"])
     saved = metadata["problem"]
     if problem is None:
         if saved["name"] not in PROBLEMS:
@@ -155,6 +156,16 @@ def _sketch(problem: Problem, names: list[str], model: dict, options: dict) -> d
     network = MODELS[model["name"]]
     outputs = {"value": None, "control_density": problem.control_dim, "log_occupation": None}
     return Fields({n: network(dim=problem.dim, outputs=outputs[n], **options) for n in names}).state_dict()
+
+
+def _require_plain_run(path: Path, certificate: object, config: object) -> None:
+    """What `evaluate` reads of the run: groups of fields, and no count that would take all memory."""
+    effort = config.get("certificate", {}) if isinstance(config, dict) else None
+    settings = config.get("trainer", {}) if isinstance(config, dict) else None
+    if not all(isinstance(part, dict) for part in (certificate, effort, settings)):
+        raise InputError(f"{path} does not describe the run it came from.")
+    for group in (effort, effort.get("stage") or {}, {"threads": settings.get("threads", 1)}):
+        _require_reasonable(path, group)
 
 
 def _require_reasonable(path: Path, numbers: dict) -> None:

@@ -12,6 +12,10 @@ class InputError(ValueError):
     """A mistake in what the user asked for; its message is one sentence, fit to be printed without a traceback."""
 
 
+class StorageError(InputError):
+    """A file that could not be written: no space, no permission. What was there before is untouched."""
+
+
 def require_integer(name: str, value: object, minimum: int, maximum: int = 2**31 - 1) -> int:
     """Return ``value`` if it is a whole number from ``minimum`` to ``maximum``; raise `InputError` otherwise."""
     if isinstance(value, bool) or not isinstance(value, int):

@@ -1,100 +1,110 @@
-"""The glue between Hydra and the package: folders, friendly errors, and checks before anything is written."""
+"""The glue between Hydra and the package: checks before anything is written, friendly errors, sweeps that go on."""
 
 from __future__ import annotations
 
-import inspect
+import contextlib
+import logging
+import multiprocessing
 import os
+import random
 import re
+import shlex
 import sys
+import tempfile
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from hydra import compose, initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
+import numpy as np
+import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import (
-    ConfigCompositionException,
-    HydraException,
-    MissingConfigException,
-    OverrideParseException,
-)
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf import DictConfig
 
-from ocp_torch.config import problem_class
-from ocp_torch.errors import InputError, nearest
+from ocp_torch.composition import (
+    CHECKOUT,
+    CONFIGS,
+    check_sweep,
+    composed,
+    known_fields,
+    parsed,
+    plain,
+    prepared,
+    register_resolvers,
+)
+from ocp_torch.errors import InputError
+from ocp_torch.training.checkpoint import LAST
+from ocp_torch.training.resume import adopt, locate
+from ocp_torch.training.signals import Preempted
 
-CHECKOUT = Path(__file__).resolve().parent.parent
-CONFIGS = CHECKOUT / "configs"
-FAILED_INPUT = 2
+__all__ = ["CHECKOUT", "CONFIGS", "composed", "job", "known_fields", "launch", "register_resolvers"]
 
-
-def register_resolvers() -> None:
-    """`${checkout:outputs}`: a folder of the checkout wherever a run starts; `${problem_name:a.b.Circle}`: circle."""
-    OmegaConf.register_new_resolver("checkout", lambda part: str(CHECKOUT / part), replace=True)
-    OmegaConf.register_new_resolver("problem_name", lambda target: str(target).rpartition(".")[2].lower(), replace=True)
-
-
-def plain(config: DictConfig) -> dict:
-    """The configuration as nested plain data, interpolations resolved."""
-    data = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    data.pop("hydra", None)
-    return data
-
-
-def drop_unclaimed(problem: dict, overrides: list[str]) -> dict:
-    """Without the group's own fields that a user's class does not take; those the user set himself stay, to be refused."""
-    target = str(problem.get("_target_"))
-    if target.startswith("ocp_torch."):
-        return problem
-    own = [o.lstrip("+") for o in overrides if o.lstrip("+").startswith("problem.")]
-    named = {o.split("=")[0].removeprefix("problem.") for o in own}
-    taken = inspect.signature(problem_class(problem.get("_target_"))).parameters
-    return {k: v for k, v in problem.items() if k == "_target_" or k in taken or k in named}
+log = logging.getLogger(__name__)
+FAILED_INPUT, INTERRUPTED = 2, 130
+ASKS = ("--help", "-h", "--info", "-i", "--cfg", "-c", "--hydra-help", "--version", "--shell-completion", "-sc")
+# Jobs of a sweep may run in processes of their own; this file, named in the environment, collects which failed.
+FAILURES = "OCP_TORCH_FAILURES"
 
 
 def launch(entry: Callable, config_name: str, check: Callable[[dict], object]) -> None:
     """Run the Hydra ``entry``; a single run is composed and handed to ``check`` first, before any folder is made.
 
-    A user's mistake ends in one sentence on stderr and exit status 2.
+    A user's mistake ends in one sentence on stderr and exit status 2, a signal in 143 or 130, failed jobs of a sweep in
+    their names and status 2.
     """
     register_resolvers()
+    logging.raiseExceptions = False  # a full disk is told once, not at every line of a log
     # A user's module is found where the command was given, as `python -m` would find it.
     sys.path.insert(0, os.getcwd())
-    arguments = sys.argv[1:]
-    if not any(
-        a in ("-m", "--multirun", "--help", "-h", "--info", "-i", "--cfg", "-c", "--hydra-help") for a in arguments
-    ):
-        overrides = [a for a in arguments if not a.startswith("-")]
-        try:
-            check(composed(config_name, overrides))
-        except InputError as error:
-            fail(str(error))
-    entry()
-
-
-def composed(config_name: str, overrides: list[str]) -> dict:
-    """What the job will be given; whatever Hydra or OmegaConf has against it becomes an `InputError` of one sentence."""
     try:
-        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            return prepared(plain(compose(config_name, overrides)), overrides)
-    except (HydraException, OmegaConfBaseException, ValueError, TypeError) as error:
-        if isinstance(error, InputError):
-            raise
-        known = isinstance(error, HydraException | OmegaConfBaseException)
-        # Hydra has no exception of its own for some slips, and does not say where they are.
-        sentence = explain(error, config_name) if known else f"{' '.join(overrides)} cannot be composed: {error}."
-        raise InputError(sentence) from None
-    finally:
-        GlobalHydra.instance().clear()
+        if not any(a.split("=")[0] in ASKS for a in sys.argv[1:]):
+            sys.argv[1:] = checked(sys.argv[1:], config_name, check)
+        with failures() as failed:
+            entry()
+            names = failed()
+        if names:
+            raise InputError(f"{len(names)} job(s) of the sweep failed: {'; '.join(names)}.")
+    except InputError as error:
+        fail(str(error))
+    except Preempted as stop:
+        sys.exit(stop.status)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
 
 
-def prepared(data: dict, overrides: list[str]) -> dict:
-    """``data`` with the problem's fields reduced to those its class takes."""
-    if isinstance(data.get("problem"), dict) and "_target_" in data["problem"]:
-        data["problem"] = drop_unclaimed(data["problem"], overrides)
-    return data
+def checked(arguments: list[str], config_name: str, check: Callable[[dict], object]) -> list[str]:
+    """The arguments to hand to Hydra: as they are, but for a resume, which goes on in the folder of its run."""
+    overrides = [a for a in arguments if not a.startswith("-")]
+    if any(a in ("-m", "--multirun") for a in arguments):
+        check_sweep(config_name, overrides)
+        return arguments
+    given = {o.key_or_group: o.value() for o in parsed(overrides) if not o.is_sweep_override() and not o.is_delete()}
+    own = Path(str(given["hydra.run.dir"])) if "hydra.run.dir" in given else None
+    data = composed(config_name, overrides, roots=(own,) if own else ())
+    check(data)
+    if data.get("resume") is None:
+        if own is not None and "resume" in data:
+            require_fresh(own)
+        return arguments
+    folder = locate(Path(data["resume"]))[0]
+    if folder is None:
+        return arguments
+    kept = [a for a in arguments if not a.lstrip("+").startswith(("resume=", "hydra.run.dir="))]
+    return [*kept, f"resume={quoted(data['resume'])}", f"hydra.run.dir={quoted(folder)}"]
+
+
+def quoted(value: object) -> str:
+    """A value as Hydra reads it back, whatever signs it holds."""
+    text = str(value).replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{text}'"
+
+
+def require_fresh(folder: Path) -> None:
+    """Raise `InputError` when ``folder`` holds a run that a new one would overwrite."""
+    if (folder / "checkpoints" / LAST).exists():
+        raise InputError(
+            f"{folder} holds a run already; go on with it by resume={folder}, or give another hydra.run.dir."
+        )
 
 
 def fail(sentence: str) -> None:
@@ -104,57 +114,96 @@ def fail(sentence: str) -> None:
 
 
 def job(task: Callable[[dict, Path], object], config: DictConfig) -> None:
-    """Run ``task(config, folder)`` as a Hydra job. In a sweep a wrong input ends its own job only."""
+    """Run ``task(config, folder)`` as a Hydra job. In a sweep whatever goes wrong ends its own job only."""
     hydra = HydraConfig.get()
+    sweeping = hydra.mode == RunMode.MULTIRUN
+    folder = Path(hydra.runtime.output_dir)
     try:
-        task(prepared(plain(config), list(hydra.overrides.task)), Path(hydra.runtime.output_dir))
-    except InputError as error:
-        if hydra.mode == RunMode.MULTIRUN:
-            print(f"error: job {hydra.job.num} ({hydra.job.override_dirname}): {error}", file=sys.stderr)
-            failed_jobs.append(hydra.job.override_dirname)
-            return
-        fail(str(error))
+        with isolated():
+            data = prepared(plain(config), list(hydra.overrides.task), roots=(folder,))
+            folder = settled(folder, data, make=hydra.output_subdir is not None)
+            task(data, folder)
+    except Preempted as stop:
+        log.info("stopped by %s, saved; go on with: %s", stop, again(hydra, folder, sweeping))
+        if not sweeping or multiprocessing.parent_process() is None:
+            raise
+        failed(hydra, f"stopped by {stop}")
+    except Exception as error:
+        if not sweeping and isinstance(error, InputError):
+            fail(str(error))
+        if not sweeping:
+            raise
+        if not isinstance(error, InputError):
+            log.debug("%s", traceback.format_exc())
+        reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+        failed(hydra, " ".join(reason.split()))
 
 
-failed_jobs: list[str] = []
+def settled(folder: Path, data: dict, make: bool) -> Path:
+    """The folder the job works in: Hydra's fresh ``folder``, or that of the run it goes on with."""
+    if not make:
+        return folder
+    if data.get("resume") is None:
+        require_fresh(folder)
+        return folder
+    own = locate(Path(data["resume"]))[0]
+    if own is None or own.resolve() == folder.resolve():
+        return folder
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, logging.FileHandler):
+            handler.close()  # it opens its file again at the next line
+            handler.baseFilename = str((own / Path(handler.baseFilename).name).absolute())
+    adopt(folder, own)
+    return own
 
 
-def finish() -> None:
-    """After a sweep: name the jobs that failed and leave with their status."""
-    if failed_jobs:
-        fail(f"{len(failed_jobs)} job(s) of the sweep failed: {'; '.join(failed_jobs)}.")
+def again(hydra: DictConfig, folder: Path, sweeping: bool) -> str:
+    """The command that goes on with what was stopped."""
+    own = [o for o in hydra.overrides.task if o.lstrip("+").startswith("problem._target_=")]
+    if not sweeping:
+        path = str(folder) if re.fullmatch(r"[\w./+-]+", str(folder)) else quoted(folder)
+        return shlex.join(["python", sys.argv[0], f"resume={path}", *own])
+    return f"the sweep's own command with hydra.sweep.dir={hydra.sweep.dir} resume=auto"
 
 
-def explain(error: Exception, config_name: str) -> str:
-    """Hydra's and OmegaConf's own words as one sentence."""
-    text = str(error)
-    unknown = re.search(r"Could not find '([\w./-]+)/([^'/]*)'", text)
-    if isinstance(error, MissingConfigException) and unknown:
-        group, choice = unknown.groups()
-        known = sorted(p.stem for p in (CONFIGS / group).glob("*.yaml"))
-        return f"{group} is {choice!r}, but must be one of {', '.join(known)}{nearest(choice, known)}."
-    override = re.search(r"Could not override '([\w.]+)'", text)
-    if isinstance(error, ConfigCompositionException) and override:
-        field = override.group(1)
-        known = known_fields(config_name)
-        hint = nearest(field, known)
-        return f"{field} is not a field of the configuration{hint}; write +{field}=... to add an argument of your own."
-    missing = re.search(r"Missing mandatory value: ([\w.]+)", text)
-    if missing:
-        field = getattr(error, "full_key", None) or missing.group(1)
-        return f"{field} is missing; give {field}=... on the command line."
-    if isinstance(error, OverrideParseException):
-        return f"{error.override!r} cannot be read; write field=value, and quote a value that holds signs of its own."
-    return " ".join(text.split()).rstrip(".") + "."
+@contextlib.contextmanager
+def isolated():
+    """Leave the process as it was: no job of a sweep finds another one's threads, precision or random numbers."""
+    dtype, threads, deterministic = torch.get_default_dtype(), torch.get_num_threads(), torch.is_grad_enabled()
+    states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
+    path, folder = list(sys.path), os.getcwd()
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(dtype)
+        torch.set_num_threads(threads)
+        torch.set_grad_enabled(deterministic)
+        torch.set_rng_state(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        random.setstate(states[2])
+        sys.path[:] = path
+        os.chdir(folder)
 
 
-def known_fields(config_name: str) -> list[str]:
-    """Dotted names of all fields and groups of the default configuration."""
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        config = OmegaConf.to_container(compose(config_name), resolve=False)
+@contextlib.contextmanager
+def failures():
+    """Collect the failed jobs of all processes; yields a function that names them."""
+    with tempfile.TemporaryDirectory(prefix="ocp_torch_") as folder:
+        file = Path(folder) / "failed"
+        os.environ[FAILURES] = str(file)
+        try:
+            number = lambda line: int(line.split(" ")[0])
+            yield lambda: sorted(file.read_text().splitlines(), key=number) if file.exists() else []
+        finally:
+            os.environ.pop(FAILURES, None)
 
-    def names(node: dict, prefix: str = "") -> list[str]:
-        own = [f"{prefix}{k}" for k in node]
-        return own + [n for k, v in node.items() if isinstance(v, dict) for n in names(v, f"{prefix}{k}.")]
 
-    return names(config)
+def failed(hydra: DictConfig, reason: str) -> None:
+    """Say that a job of a sweep failed, and have it named at the end."""
+    name = hydra.job.override_dirname
+    sentence = f"error: job {hydra.job.num} ({name}): {reason}"
+    print(sentence, file=sys.stderr)
+    log.debug("%s", sentence)  # to its own train.log as well
+    if FAILURES in os.environ:
+        with open(os.environ[FAILURES], "a") as file:
+            file.write(f"{hydra.job.num} ({name})\n")

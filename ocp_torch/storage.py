@@ -16,26 +16,55 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, StorageError
 
 METADATA_KEY, DIGEST_KEY = "ocp_torch", "sha256"
+# No run writes more; a larger file is not read into memory.
+LARGEST_FILE = 2**33
 
 
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
-    """Let ``write`` fill a temporary file beside ``path``, then put it in place in one step: old or new, never half."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(handle)
-    temporary = Path(name)
+def write_atomically(path: Path, write: Callable[[Path], None], make_room: Callable[[], None] | None = None) -> None:
+    """Let ``write`` fill a temporary file beside ``path``, then put it in place in one step: old or new, never half.
+
+    ``make_room`` is called in between, once the new file is whole and on the disk. File and folder are on the disk when it
+    returns. Raises `StorageError` when there is no room or no permission.
+    """
+    temporary: Path | None = None
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        os.close(handle)
+        temporary = Path(name)
         write(temporary)
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
+        sync(temporary)
         temporary.chmod(0o644)
+        if make_room is not None:
+            make_room()
         os.replace(temporary, path)
+        sync(path.parent)
+    except (OSError, SafetensorError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise StorageError(f"{path} cannot be written: {reason}; what was saved before is untouched.") from None
     finally:
-        with contextlib.suppress(FileNotFoundError):
-            temporary.unlink()
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+
+
+def sync(path: Path) -> None:
+    """Make the contents of a file, or the names in a folder, survive a loss of power."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def sweep_temporaries(folder: Path) -> None:
+    """Remove what a killed process left half-written in ``folder``."""
+    for leftover in folder.glob(".*.pt.*"):
+        with contextlib.suppress(OSError):
+            leftover.unlink()
 
 
 def finite(data):
@@ -65,6 +94,13 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict) -> None
     write_atomically(path, lambda temporary: save_file(tensors, str(temporary), metadata=header))
 
 
+def require_readable_size(path: Path) -> None:
+    """Raise `InputError` for a file too large to be one of ours."""
+    size = path.stat().st_size
+    if size > LARGEST_FILE:
+        raise InputError(f"{path} has {size:,} bytes, but no file of a run has more than {LARGEST_FILE:,}.")
+
+
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict]:
     """Read what `save_tensors` wrote; runs no code from the file.
 
@@ -72,6 +108,7 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict]:
     """
     if not path.is_file():
         raise InputError(f"{path} does not exist; give the path of a controller.safetensors file.")
+    require_readable_size(path)
     try:
         with safe_open(str(path), framework="pt", device="cpu") as file:
             header = file.metadata() or {}

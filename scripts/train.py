@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import hydra
-from omegaconf import DictConfig
+import signal
 
-from ocp_torch.config import build_certificate_settings, build_trainer
-from ocp_torch.launch import finish, job, launch
-from ocp_torch.training.session import run_session
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during the slow imports ends quietly
 
+import hydra  # noqa: E402
+from omegaconf import DictConfig  # noqa: E402
 
-def build(config: dict):
-    trainer = build_trainer(config)
-    return trainer, build_certificate_settings(trainer.config)
-
-
-def train(config: dict, folder) -> None:
-    trainer, certificate_settings = build(config)
-    run_session(trainer, certificate_settings, folder)
+from ocp_torch.launch import job, launch  # noqa: E402
+from ocp_torch.training.start import prepare, train  # noqa: E402
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="train")
@@ -26,5 +19,5 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    launch(main, "train", build)
-    finish()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    launch(main, "train", prepare)

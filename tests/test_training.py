@@ -50,8 +50,8 @@ def session(trainer, folder):
 
 
 def state_of(trainer) -> dict:
-    """All of its state that must repeat: everything but the clock."""
-    return {k: v for k, v in trainer.state_dict().items() if k != "seconds"}
+    """All of its state that must repeat: everything but the clock, and how often it is looked at."""
+    return {k: v for k, v in trainer.state_dict().items() if k not in ("seconds", "elapsed", "config")}
 
 
 def differences(one, other, where: str = "") -> list[str]:
@@ -140,7 +140,8 @@ def test_looking_at_the_bounds_on_the_way_changes_nothing():
     once, often = small(), small("trainer.evaluate_every=10")
     for trainer in (once, often):
         trainer.fit(Silent())
-    assert differences(state_of(once), state_of(often)) == []
+    changed = differences(state_of(once), state_of(often))
+    assert all(name.startswith("/watch/") for name in changed), changed
 
 
 RUNS = {
@@ -178,7 +179,8 @@ def test_a_run_leaves_exactly_the_documented_files(run):
     figures = {name for name in files if name.startswith("figures/") and name.endswith(".png")}
     assert events
     assert figures
-    assert files - events - figures == {"checkpoints/last.pt", "certificate.json", "controller.safetensors"}
+    looks = {"checkpoints/best.pt"} if config["trainer"]["evaluate_every"] else set()
+    assert files - events - figures == {"checkpoints/last.pt", "certificate.json", "controller.safetensors"} | looks
     for name in figures:
         assert imread(folder / name).std() > 0, f"{name} is blank"
     assert load_checkpoint(folder / "checkpoints" / "last.pt")["step"] == 20
@@ -205,7 +207,8 @@ def test_certificate_json_has_the_documented_schema_with_numbers_or_null(run):
     folder, config = run
     certificate = json.loads((folder / "certificate.json").read_text())
     groups = {"lower", "upper", "perf", "baseline", "gap", "share", "assumptions"}
-    assert certificate.keys() == NUMBERS["top"] | groups | {"problem", "method", "exact", "warnings"}
+    assert certificate.keys() == NUMBERS["top"] | groups | {"problem", "method", "exact", "warnings", "stopped"}
+    assert certificate["stopped"] == "steps"
     assert all(is_number(certificate[name]) for name in NUMBERS["top"])
     assert (certificate["schema"], certificate["seed"], certificate["step"]) == (1, 5, 20)
     assert certificate["samples"] == 20 * 16

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -15,13 +17,10 @@ from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
 from ocp_torch.objectives.objective import Objective
 from ocp_torch.samples import Samples
+from ocp_torch.steppers.culprit import NonFiniteError, culprit
 
 Draw = Callable[[], Samples]
 Visit = Callable[[], None]
-
-
-class NonFiniteError(ArithmeticError):
-    """A loss or gradient is not finite; raised before any parameter was touched."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +56,8 @@ class Stepper(ABC):
         self.optimizers = {player: optimizers[player](self.parameters[player]) for player in objective.players}
         resting = objective.resting
         self.schedules = {p: schedule(optimizer, resting.get(p, 0.0)) for p, optimizer in self.optimizers.items()}
+        self._configured = {p: _hyper_parameters(optimizer) for p, optimizer in self.optimizers.items()}
+        self._unmoved = {p: copy.deepcopy(s.state_dict()) for p, s in self.schedules.items()}
 
     @abstractmethod
     def step(self, draw: Draw, visit: Visit) -> StepReport:
@@ -72,10 +73,21 @@ class Stepper(ABC):
             "schedules": {player: s.state_dict() for player, s in self.schedules.items()},
         }
 
-    def load_state_dict(self, state: dict) -> None:
+    def load_state_dict(self, state: dict, moves: dict[str, int] | None = None) -> None:
+        """Go on from ``state`` exactly; or, with ``moves``, with its moments but with this stepper's own hyper-parameters and
+        schedules, those after so many moves of each player."""
         for player, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][player])
-            self.schedules[player].load_state_dict(state["schedules"][player])
+            if moves is None:
+                self.schedules[player].load_state_dict(state["schedules"][player])
+                continue
+            self.schedules[player].load_state_dict(copy.deepcopy(self._unmoved[player]))
+            for group, configured in zip(optimizer.param_groups, self._configured[player], strict=True):
+                group.update(configured)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that the optimiser did not step in between
+                for _ in range(moves[player]):
+                    self.schedules[player].step()
 
     def _differentiate(self, samples: Samples) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Set each parameter's gradient to that of its own player's loss; losses and gradient norms per player."""
@@ -91,19 +103,17 @@ class Stepper(ABC):
                 # A bias that only shifts V gets no gradient where only grad V matters.
                 parameter.grad = torch.zeros_like(parameter) if gradient is None else gradient
             norms[player] = torch.nn.utils.get_total_norm([p.grad for p in parameters])
-        self._guard(losses, norms)
+        self._guard(losses, norms, samples)
         if self.clip is not None:
             for player, parameters in moving.items():
                 torch.nn.utils.clip_grads_with_norm_(parameters, self.clip, norms[player])
         return {player: loss.detach() for player, loss in losses.items()}, norms
 
-    def _guard(self, losses: dict[str, Tensor], norms: dict[str, Tensor]) -> None:
+    def _guard(self, losses: dict[str, Tensor], norms: dict[str, Tensor], samples: Samples) -> None:
         checks = torch.stack([*losses.values(), *norms.values()])
-        if torch.isfinite(checks).all():
-            return
-        bad_loss = [player for player, loss in losses.items() if not torch.isfinite(loss)]
-        what = f"the loss of player {bad_loss[0]!r}" if bad_loss else "a gradient"
-        raise NonFiniteError(f"{what} is not finite; try a smaller optimizer.lr, or stepper.clip.")
+        if not torch.isfinite(checks).all():
+            what = culprit(self.objective, self.fields, samples)
+            raise NonFiniteError(f"{what}; try a smaller optimizer.lr, or stepper.clip.")
 
     def _update(self, players: Iterable[str]) -> None:
         """One update of ``players`` with the gradients in place, then the projection."""
@@ -116,6 +126,10 @@ class Stepper(ABC):
         """A player's schedule counts its own moves."""
         for player in players:
             self.schedules[player].step()
+
+
+def _hyper_parameters(optimizer: Optimizer) -> list[dict]:
+    return [{k: v for k, v in group.items() if k != "params"} for group in optimizer.param_groups]
 
 
 @torch.no_grad()

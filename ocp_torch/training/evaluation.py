@@ -10,6 +10,7 @@ from ocp_torch.config import build_certificate_settings, build_network, build_pr
 from ocp_torch.controller import Controller, load_controller
 from ocp_torch.errors import InputError, require_integer
 from ocp_torch.process import prepare
+from ocp_torch.training.settings import MOST_THREADS
 
 log = logging.getLogger(__name__)
 
@@ -38,9 +39,14 @@ def settings_for(controller: Controller, config: dict) -> CertificateSettings:
 
 def certify_saved(controller: Controller, settings: CertificateSettings, seed: int | None = None) -> Certificate:
     """Print and return the certificate of ``controller``; with its own ``seed`` the numbers are those of its run."""
-    prepare(int(controller.config.get("trainer", {}).get("threads", 1)))
+    threads = controller.config.get("trainer", {}).get("threads", 1)
+    prepare(require_integer("trainer.threads", threads, 1, maximum=MOST_THREADS))
     before = controller.certificate
-    run = Run(**{name: before[name] for name in Run.__dataclass_fields__})
+    try:
+        run = Run(**{name: before[name] for name in Run.__dataclass_fields__ if name in before})
+    except TypeError:
+        raise InputError("the controller's certificate does not say which problem and method it is of.") from None
+    require_integer("seed", run.seed, 0)
     if seed is not None:
         run = Run(**{**vars(run), "seed": require_integer("seed", seed, 0)})
     trained = Trained(controller.fields, controller.occupation, build_network(controller.model))

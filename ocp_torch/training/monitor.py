@@ -7,13 +7,35 @@ import time
 from pathlib import Path
 
 import torch
+from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
+from ocp_torch import calculus, formulas
 from ocp_torch.certificate import Certificate
+from ocp_torch.control_laws import occupation_density
+from ocp_torch.samples import Samples
 from ocp_torch.steppers import StepReport
 
 log = logging.getLogger(__name__)
+
+
+@torch.no_grad()
+def liouville_residual(trainer, batch: Samples) -> dict[str, Tensor]:
+    """`mean |mu0 - mu - div(a mu + B w) / rho|` on ``batch``, whatever gives `mu`: also where the loss needs no divergences
+    (a player that rests, the plain saddle) or `mu` is in closed form. Nothing where the problem gives no divergences."""
+    problem, fields, rho = trainer.problem, trainer.fields, trainer.problem.discount
+    samples = Samples.of(problem, batch.x)
+    if samples.div_a is None or samples.div_B is None:
+        return {}
+    _, inflow = formulas.controlled_inflow(samples, fields.control_density, rho)
+    density = occupation_density(trainer.objective.occupation, problem, fields, trainer.bounds)
+    if problem.driftless:
+        loss = density(samples.x)
+    else:
+        mu, derivative = calculus.directional_derivative(density, samples.x, samples.a)
+        loss = mu + (mu * samples.div_a + derivative) / rho
+    return {"residual_mean_absolute": samples.mean((inflow - loss).abs())}
 
 
 class Silent:
@@ -28,17 +50,24 @@ class Silent:
     def extended(self, trainer) -> None:
         """Another round begins."""
 
+    def noticed(self, sentence: str) -> None:
+        """Something is wrong with the run's health."""
+
 
 class Monitor(Silent):
     """Progress bar (terminals only), log lines, and TensorBoard scalars in the groups bounds, performance, loss, lr,
     gradient_norm, violation and throughput."""
 
-    def __init__(self, folder: Path, steps: int, progress: bool = True) -> None:
-        self.writer = SummaryWriter(str(folder))
+    def __init__(self, folder: Path, trainer) -> None:
+        done = trainer.step
+        # What a killed start still wrote beyond its last checkpoint is not shown twice.
+        self.writer = SummaryWriter(str(folder), purge_step=done + 1 if done else None)
         # disable=None: no bar where the output is not a terminal.
-        self.bar = tqdm(total=steps, unit="step", dynamic_ncols=True, disable=None if progress else True)
+        hidden = None if trainer.settings.progress else True
+        options = dict(unit="step", dynamic_ncols=True, disable=hidden)
+        self.bar = tqdm(total=max(trainer.end, done), initial=done, **options)
         self._shown: dict[str, str] = {}
-        self._mark = (time.perf_counter(), 0)
+        self._mark = (time.perf_counter(), trainer.samples)
 
     def __enter__(self) -> Monitor:
         return self
@@ -55,7 +84,10 @@ class Monitor(Silent):
         for player in report.losses:
             self.writer.add_scalar(f"loss/{player}", float(report.losses[player]), step)
             self.writer.add_scalar(f"gradient_norm/{player}", float(report.gradient_norms[player]), step)
-        for name, value in trainer.objective.diagnostics(trainer.fields, report.batch).items():
+        shown = trainer.objective.diagnostics(trainer.fields, report.batch)
+        if "residual_mean_absolute" not in shown and trainer.fields.control_density is not None:
+            shown |= liouville_residual(trainer, report.batch)
+        for name, value in shown.items():
             self.writer.add_scalar(f"violation/{name}", float(value), step)
         for player, rate in trainer.stepper.learning_rates().items():
             self.writer.add_scalar(f"lr/{player}", rate, step)
@@ -73,7 +105,11 @@ class Monitor(Silent):
         if gaps:
             values["gap"] = f"{100 * min(gaps):.2f}%"
         self._show(**values)
+        # To train.log, not to the terminal.
         log.debug("step %d: %s", trainer.step, ", ".join(f"{k} {v}" for k, v in values.items()))
+
+    def noticed(self, sentence: str) -> None:
+        log.warning("warning: %s", sentence)
 
     def extended(self, trainer) -> None:
         self.bar.total = trainer.end

@@ -6,55 +6,115 @@ import json
 import logging
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings, table
 from ocp_torch.controller import Controller
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, StorageError
+from ocp_torch.fields import Fields
 from ocp_torch.steppers import NonFiniteError
+from ocp_torch.storage import sweep_temporaries, write_atomically
 from ocp_torch.training import figures
+from ocp_torch.training.checkpoint import LAST
+from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.monitor import Monitor
-from ocp_torch.training.trainer import Trainer
+from ocp_torch.training.signals import Signals
+from ocp_torch.training.trainer import NOT_FINITE, TARGET_GAP, Trainer
+from ocp_torch.training.watch import hopeless
 
 log = logging.getLogger(__name__)
 
 
 def run_session(trainer: Trainer, certificate_settings: CertificateSettings, folder: Path) -> Certificate:
-    """Fill ``folder`` with a run: events, `checkpoints/last.pt`, `certificate.json`, `controller.safetensors`, figures.
+    """Fill ``folder`` with a run: events, `checkpoints/`, `certificate.json`, `controller.safetensors`, figures.
 
-    Raises `InputError` when a loss stops being finite.
+    A trainer that was resumed goes on where it is. SIGTERM and Ctrl-C raise `Preempted` once the state is saved. Raises
+    `InputError` when a loss stops being finite (what the best look so far gives is handed out first), and `StorageError`
+    when a file cannot be written.
     """
     started = time.perf_counter()
-    settings = trainer.settings
+    last = folder / "checkpoints" / LAST
+    sweep_temporaries(last.parent)
+    if trainer.step == 0:
+        seed_generators(trainer.seed)
     log.info(summary(trainer))
-    with Monitor(folder, settings.steps, settings.progress) as monitor:
-        try:
-            trainer.fit(monitor, folder / "checkpoints" / "last.pt")
-        except NonFiniteError as error:
-            raise InputError(f"Training stopped at step {trainer.step}, before the update: {error}") from None
-        certificate = trainer.certify(certificate_settings)
-        monitor.record(certificate, trainer.step)
-        monitor.hyper_parameters(flatten(trainer.config), certificate)
-        certificate.save(folder / "certificate.json")
-        if certificate.best_perf is not None:
-            kind = certificate.best_perf[0]
-        else:
-            kind = "value" if trainer.averaged_fields.value is not None else "density"
-        controller_of(trainer, certificate, kind).save(folder / "controller.safetensors")
-        if settings.figures:
-            drawn = figures.draw(trainer.problem, trainer.averaged_fields, trainer.bounds, trainer.objective.occupation)
-            figures.save(drawn, folder / "figures")
-            monitor.figures(drawn, trainer.step)
+    try:
+        with Signals() as signals, Monitor(folder, trainer) as monitor:
+            failure = None
+            try:
+                certificate, fields = _train(trainer, certificate_settings, monitor, last, signals)
+            except NonFiniteError as error:
+                failure = f"Training stopped at step {trainer.step}, before the update: {error}"
+                certificate, fields = _salvage(trainer, certificate_settings, failure)
+            kind = _hand_out(trainer, certificate, fields, folder)
+            if trainer.settings.figures:
+                drawn = figures.draw(trainer.problem, fields, trainer.bounds, trainer.objective.occupation)
+                figures.save(drawn, folder / "figures")
+                monitor.figures(drawn, trainer.step)
+            # Last, so that a start that was killed before this point leaves no points to be doubled.
+            monitor.record(certificate, trainer.step)
+            monitor.hyper_parameters(flatten(trainer.config), certificate)
+    except OSError as error:
+        raise StorageError(f"{folder} cannot be written to: {error.strerror or error}.") from None
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
     log.info("controller from %s, %.0f s in all, in %s", kind, time.perf_counter() - started, folder)
+    if failure is not None:
+        raise InputError(f"{failure.rstrip('.')}; the controller in {folder} is that of the best look before.")
     return certificate
 
 
-def controller_of(trainer: Trainer, certificate: Certificate, kind: str) -> Controller:
-    """The controller of law ``kind`` that ``trainer`` hands out, from its averaged fields."""
+def _train(
+    trainer: Trainer, settings: CertificateSettings, monitor: Monitor, last: Path, signals: Signals
+) -> tuple[Certificate, Fields]:
+    """Train to the end; the certificate, and the fields it is of. A target gap is reached when the certificate says so."""
+    target = trainer.settings.target_gap
+    while True:
+        signals.saved = False
+        reason = trainer.fit(monitor, last, signals)
+        signals.saved = True  # from here on a signal need not wait
+        signals.take()
+        fields, note = trainer.choose()
+        certificate = trainer.certify(settings, fields)
+        gap = certificate.gap["certified"]
+        if reason != TARGET_GAP or (gap is not None and gap <= target):
+            return with_warnings(trainer, certificate, [note] if note else []), fields
+        log.info("step %d: the certified gap is not %g yet; training goes on.", trainer.step, target)
+        trainer.go_on()
+
+
+def _salvage(trainer: Trainer, settings: CertificateSettings, failure: str) -> tuple[Certificate, Fields]:
+    """What a run that cannot go on still gives; `InputError` when nothing."""
+    if trainer.watch.best is None:
+        raise InputError(failure)
+    trainer.stopped, fields = NOT_FINITE, trainer.best_fields()
+    note = f"handed out are the averaged fields of step {trainer.watch.best.step}. {failure}"
+    return with_warnings(trainer, trainer.certify(settings, fields), [note]), fields
+
+
+def with_warnings(trainer: Trainer, certificate: Certificate, notes: list[str]) -> Certificate:
+    """``certificate`` with what else a user should know of the run."""
+    found = hopeless(trainer.problem, trainer.bounds, certificate, trainer.seed)
+    fresh = [note for note in (*notes, *trainer.watch.notes, *found) if note not in certificate.warnings]
+    return replace(certificate, warnings=[*certificate.warnings, *fresh])
+
+
+def _hand_out(trainer: Trainer, certificate: Certificate, fields: Fields, folder: Path) -> str:
+    """Write `controller.safetensors` and `certificate.json`; the law that the controller follows."""
+    if certificate.best_perf is not None:
+        kind = certificate.best_perf[0]
+    else:
+        kind = "value" if fields.value is not None else "density"
+    controller_of(trainer, certificate, kind, fields).save(folder / "controller.safetensors")
+    write_atomically(folder / "certificate.json", certificate.save)
+    return kind
+
+
+def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields: Fields) -> Controller:
+    """The controller of law ``kind`` that ``trainer`` hands out, from its averaged ``fields``."""
     return Controller(
         problem=trainer.problem,
-        fields=trainer.averaged_fields,
+        fields=fields,
         bounds=trainer.bounds,
         occupation=trainer.objective.occupation,
         kind=kind,
@@ -74,6 +134,7 @@ def summary(trainer: Trainer) -> str:
         f"{name}: d = {problem.dim}, m = {problem.control_dim}, rho = {problem.discount:g}, q = {problem.exponent:g}",
         f"{method}: {', '.join(trainer.objective.fields)}, {weights:,} weights, {settings.dtype} on {settings.torch_device}",
         f"{settings.steps:,} steps of {settings.batch} states, seed {trainer.seed}",
+        *([f"going on from step {trainer.step:,}"] if trainer.step else []),
         f"bounds: {used}",
         *(f"warning: {warning}" for warning in (*bounds.warnings, *trainer.objective.notes)),
     ]

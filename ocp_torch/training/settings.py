@@ -26,6 +26,9 @@ class TrainerSettings:
     log_every: int  # steps between scalars
     evaluate_every: int  # steps between quick bounds; 0 for none
     checkpoint_every: int  # steps between checkpoints; 0 for one at the end
+    keep: int  # checkpoints kept: last.pt, last-1.pt, ...
+    target_gap: float | None  # stop once this certified gap is reached; null for never
+    max_seconds: float | None  # stop training after so many seconds, those before a resume included; null for never
     figures: bool  # draw figures at the end and in TensorBoard
     progress: bool  # a progress bar, where the output is a terminal
 
@@ -39,6 +42,14 @@ class TrainerSettings:
             require_flag(f"trainer.{name}", getattr(self, name))
         for name in ("evaluate_every", "checkpoint_every"):
             require_integer(f"trainer.{name}", getattr(self, name), 0)
+        require_integer("trainer.keep", self.keep, 1, maximum=1000)
+        for name in ("target_gap", "max_seconds"):
+            if getattr(self, name) is not None:
+                require_number(f"trainer.{name}", getattr(self, name), above=0.0)
+        if self.target_gap is not None and not self.evaluate_every:
+            raise InputError(
+                "trainer.evaluate_every is 0, but trainer.target_gap needs looks at the bounds on the way."
+            )
         require_choice("trainer.dtype", self.dtype, ("float32", "float64"))
         require_choice("trainer.device", self.device, ("auto", "cpu", "cuda"))
         if self.device == "cuda" and not torch.cuda.is_available():

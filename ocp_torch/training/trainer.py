@@ -1,28 +1,41 @@
-"""The loop: draw samples, step, average; evaluate, log and save on the way. It does not know which method it runs."""
+"""The loop: draw samples, step, average; look at the bounds, log and save on the way. It does not know its method."""
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import torch
 from torch import nn
 
 from ocp_torch.bounds import Bounds
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, StageSettings, Trained, certify_fields, raised
+from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
+from ocp_torch.fields.fields import typical_sizes
 from ocp_torch.objectives import Objective
 from ocp_torch.problems import Problem
+from ocp_torch.samplers import derive_seed
 from ocp_torch.samples import Samples
-from ocp_torch.steppers import Stepper
-from ocp_torch.training.checkpoint import load_checkpoint, save_checkpoint
+from ocp_torch.steppers import NonFiniteError, Stepper
+from ocp_torch.training.checkpoint import BEST, load_checkpoint, save_checkpoint
 from ocp_torch.training.settings import TrainerSettings
+from ocp_torch.training.signals import Signals
+from ocp_torch.training.state import gather, restore
+from ocp_torch.training.watch import Look, Watch, hopeless
 
 # What a look at the bounds during training costs: enough for a curve, not for a claim.
 QUICK = CertificateSettings(
     points=2048, replicates=2, trajectories=32, ascents=8, occupation_states=0, stage=StageSettings(steps=0)
 )
+# Looks choose between fields; on a branch of states of their own they cannot flatter the certificate of their choice.
+LOOK_STREAM = 5
+STEPS, TARGET_GAP, MAX_SECONDS, NOT_FINITE = "steps", "target_gap", "max_seconds", "not_finite"
+# After a certificate that did not reach the target gap, the next is tried this much further on.
+RETRY = 1.25
 
 
 class Trainer:
@@ -47,7 +60,12 @@ class Trainer:
         self.problem, self.fields, self.objective, self.bounds = problem, fields, objective, bounds
         self.stepper, self.average, self.sampler, self.settings = stepper, average, sampler, settings
         self.network, self.seed, self.names, self.config = network, seed, names, config
-        self.step, self.round, self.samples, self.seconds = 0, 0, 0, 0.0
+        self.step, self.round, self.samples = 0, 0, 0
+        self.seconds, self.elapsed = 0.0, 0.0  # in steps alone; with looks and checkpoints
+        self.pending, self.retry = False, 0  # a certificate may have reached the target gap; not tried before this step
+        self.stopped, self.ended = STEPS, False
+        (mean, spread), _ = typical_sizes(problem)
+        self.watch = Watch(unit=abs(mean) + spread)
 
     @property
     def averaged_fields(self) -> Fields:
@@ -58,7 +76,7 @@ class Trainer:
     def run(self) -> Run:
         """Who and where this run is, for its certificate."""
         problem, method = self.names
-        return Run(problem, method, self.seed, self.step, self.samples, self.seconds)
+        return Run(problem, method, self.seed, self.step, self.samples, self.seconds, self.stopped)
 
     def draw(self) -> Samples:
         """The next batch of training samples, on the run's device."""
@@ -76,17 +94,39 @@ class Trainer:
         length = self.settings.steps * 2**self.round
         return 1.0 - (self.end - self.step) / length
 
-    def fit(self, monitor, checkpoint: Path | None = None) -> None:
-        """Train for the first round, and for further ones as `settings` allow; save to ``checkpoint`` on the way."""
-        while True:
-            while self.step < self.end:
+    def fit(self, monitor, checkpoint: Path | None = None, signals: Signals | None = None) -> str:
+        """Train until there is a reason to stop, and return it; save to ``checkpoint`` on the way and at the end.
+
+        The reasons: `steps` (all rounds that `settings` allow), `max_seconds`, and `target_gap`, when a look is good enough
+        that a certificate should decide: where it decides against, `go_on` and call again. A signal that ``signals`` caught
+        raises `Preempted` after the step in hand, with the state saved. Raises `NonFiniteError` before an update that is
+        not finite.
+        """
+        self.ended = False
+        while self._reason() is None:
+            if self.step < self.end:
                 self._advance(monitor, checkpoint)
-            if not self._wants_another_round():
+            elif self._wants_another_round():
+                self.round += 1
+                monitor.extended(self)
+            else:
                 break
-            self.round += 1
-            monitor.extended(self)
-        if checkpoint is not None:
-            save_checkpoint(checkpoint, self.state_dict())
+            if signals is not None and signals.received is not None:
+                self.save(checkpoint)
+                signals.take()
+        self.stopped, self.ended = self._reason() or STEPS, True
+        self.save(checkpoint)
+        return self.stopped
+
+    def go_on(self) -> None:
+        """The certificate did not reach the target gap: train on, and try again later."""
+        self.pending, self.retry = False, round(RETRY * self.step)
+
+    def _reason(self) -> str | None:
+        limit = self.settings.max_seconds
+        if self.pending:
+            return TARGET_GAP
+        return MAX_SECONDS if limit is not None and self.elapsed >= limit else None
 
     def _advance(self, monitor, checkpoint: Path | None) -> None:
         """One step, and what is due after it."""
@@ -96,13 +136,47 @@ class Trainer:
         report = self.stepper.step(self.draw, lambda: self.average.update_parameters(self.fields))
         self.step += 1
         self.samples += report.samples
-        self.seconds += time.perf_counter() - started
+        stepped = time.perf_counter()
+        self.seconds += stepped - started
+        due = lambda every: every > 0 and self.step % every == 0
         last = self.step == self.end
-        monitor.stepped(self, report, log=self.step % settings.log_every == 0 or last)
-        if settings.evaluate_every and self.step % settings.evaluate_every == 0 and not last:
-            monitor.evaluated(self, self.certify(QUICK))
-        if checkpoint is not None and settings.checkpoint_every and self.step % settings.checkpoint_every == 0:
-            save_checkpoint(checkpoint, self.state_dict())
+        if due(settings.log_every) or last:
+            for sentence in self.watch.stepped(self.step, report.losses, self.stepper.parameters):
+                monitor.noticed(sentence)
+        monitor.stepped(self, report, log=due(settings.log_every) or last)
+        if due(settings.evaluate_every) and not last:
+            self._look(monitor, checkpoint)
+        self.elapsed += time.perf_counter() - started
+        if due(settings.checkpoint_every) or self.pending:
+            self.save(checkpoint)
+
+    def _look(self, monitor, checkpoint: Path | None) -> None:
+        """Look at the bounds; keep the state if they are the best so far, and see whether they are good enough."""
+        self._require_finite()
+        certificate = self.look()
+        monitor.evaluated(self, certificate)
+        best = self.watch.looked(Look.at(self.step, certificate), self.averaged_fields)
+        if 2 * self.step >= self.settings.steps and not self.watch.warned:
+            for sentence in hopeless(self.problem, self.bounds, certificate, self.seed):
+                self.watch.warned = True
+                monitor.noticed(f"step {self.step}: {sentence}")
+        target, gap = self.settings.target_gap, certificate.gap["simulated"]
+        self.pending = target is not None and gap is not None and gap <= target and self.step >= self.retry
+        if best and checkpoint is not None:
+            save_checkpoint(checkpoint.with_name(BEST), self.state_dict())
+
+    def save(self, checkpoint: Path | None) -> None:
+        """Write the state to ``checkpoint``, never one that is not finite. Raises `NonFiniteError`, `StorageError`."""
+        self._require_finite()
+        if checkpoint is not None:
+            save_checkpoint(checkpoint, self.state_dict(), self.settings.keep)
+
+    def _require_finite(self) -> None:
+        for name, parameter in self.fields.named_parameters():
+            if not torch.isfinite(parameter).all():
+                raise NonFiniteError(
+                    f"the weights of {name} are not finite; try a smaller optimizer.lr, or stepper.clip."
+                )
 
     def _wants_another_round(self) -> bool:
         """Whether rounds are left and the gap is not good yet; never without a lower bound to measure it by.
@@ -111,45 +185,82 @@ class Trainer:
         """
         if self.round + 1 >= self.settings.rounds or self.fields.value is None:
             return False
-        certificate = self.certify(replace(QUICK, occupation_states=CertificateSettings.occupation_states))
+        certificate = self.look(occupation_states=CertificateSettings.occupation_states)
         better = raised(self.bounds, certificate.assumptions.estimated_sup_occupation)
         if better.M > self.bounds.M:
-            self._use(better)
+            self.use(better)
             return True
         gap = certificate.gap["simulated"]
         return gap is None or gap > self.settings.good_gap
 
-    def _use(self, bounds: Bounds) -> None:
+    def use(self, bounds: Bounds) -> None:
+        """Train and certify with ``bounds`` from now on."""
         self.bounds = self.objective.bounds = bounds
 
-    def certify(self, settings: CertificateSettings) -> Certificate:
-        """The certificate of the averaged fields as they stand."""
-        trained = Trained(self.averaged_fields, self.objective.occupation, self.network)
-        return certify_fields(self.problem, trained, self.bounds, settings, self.run)
+    def look(self, **settings) -> Certificate:
+        """A quick certificate of the averaged fields, on states that neither training nor `certify` uses."""
+        run = replace(self.run, seed=derive_seed(self.seed, LOOK_STREAM))
+        return self.certify(replace(QUICK, **settings), run=run)
+
+    def certify(
+        self, settings: CertificateSettings, fields: Fields | None = None, run: Run | None = None
+    ) -> Certificate:
+        """The certificate of ``fields``, or of the averaged ones as they stand."""
+        trained = Trained(fields or self.averaged_fields, self.objective.occupation, self.network)
+        return certify_fields(self.problem, trained, self.bounds, settings, run or self.run)
+
+    def choose(self) -> tuple[Fields, str | None]:
+        """The fields to hand out: the averaged ones, or those of the best look where they are clearly worse than that; and
+        a sentence that says so."""
+        best = self.watch.best
+        if best is None or best.step == self.step:
+            return self.averaged_fields, None
+        final = Look.at(self.step, self.look())
+        if not best.better_than(final, sure=True):
+            return self.averaged_fields, None
+        return self.best_fields(), (
+            f"handed out are the averaged fields of step {best.step}: those of step {self.step} are worse "
+            f"({_words(final)} against {_words(best)})."
+        )
+
+    def best_fields(self) -> Fields:
+        """The averaged fields of the best look."""
+        fields = copy.deepcopy(self.averaged_fields)
+        fields.load_state_dict(self.watch.fields)
+        return fields
 
     def state_dict(self) -> dict:
         """Everything needed to go on exactly."""
-        return {
-            "step": self.step,
-            "round": self.round,
-            "M": self.bounds.M,
-            "samples": self.samples,
-            "seconds": self.seconds,
-            "fields": self.fields.state_dict(),
-            "average": self.average.state_dict(),
-            "stepper": self.stepper.state_dict(),
-            "sampler": self.sampler.state_dict(),
-        }
+        return gather(self)
 
     def load_state_dict(self, state: dict) -> None:
-        self.step, self.round = state["step"], state["round"]
-        self.samples, self.seconds = state["samples"], state["seconds"]
-        self._use(replace(self.bounds, M=state["M"]))
-        self.fields.load_state_dict(state["fields"])
-        self.average.load_state_dict(state["average"])
-        self.stepper.load_state_dict(state["stepper"])
-        self.sampler.load_state_dict(state["sampler"])
+        """The way back from `state_dict`; see `restore` for what other `trainer.steps` mean."""
+        restore(self, state)
 
     def resume(self, checkpoint: Path) -> None:
-        """Go on from ``checkpoint`` exactly where it was saved."""
-        self.load_state_dict(load_checkpoint(checkpoint))
+        """Go on from ``checkpoint`` exactly where it was saved. Raises `InputError` when it is damaged or does not fit."""
+        try:
+            self.load_state_dict(load_checkpoint(checkpoint))
+            self._rehearse()
+            self.load_state_dict(load_checkpoint(checkpoint))
+        except Exception as error:  # a crafted state raises whatever its odd part leads to
+            if isinstance(error, InputError):
+                raise
+            reason = next(iter(str(error).splitlines()), "empty").rstrip(".")
+            raise InputError(f"{checkpoint} does not fit this run ({type(error).__name__}: {reason}).") from None
+
+    def _rehearse(self) -> None:
+        """One step for nothing: shows whether an optimiser can work with the state it was given."""
+        self.objective.progress = 1.0
+        try:
+            self.stepper.step(self.draw, lambda: self.average.update_parameters(self.fields))
+        except NonFiniteError:
+            pass  # the run itself will say so
+
+
+def _words(look: Look) -> str:
+    return (
+        f"a gap of {100 * look.gap:.3g} %"
+        if look.gap is not None
+        else f"a performance of {look.perf or float('nan'):.6g}"
+    )

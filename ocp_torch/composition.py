@@ -1,0 +1,157 @@
+"""From a command line to plain data, with Hydra; whatever Hydra has against it becomes one sentence."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from functools import cache
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import (
+    ConfigCompositionException,
+    HydraException,
+    MissingConfigException,
+    OverrideParseException,
+)
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from ocp_torch.config import problem_class
+from ocp_torch.errors import InputError, nearest
+from ocp_torch.training.resume import find_run, next_subfolder, resumed_configuration
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+CONFIGS = CHECKOUT / "configs"
+OUTPUTS = CHECKOUT / "outputs"
+EXTRAS = {"hydra/launcher": "parallel"}  # Hydra's plugin groups -> the extra that installs them
+
+
+def register_resolvers() -> None:
+    """`${checkout:outputs}`: a folder of the checkout wherever a run starts; `${problem_name:a.b.Circle}`: circle;
+    `${start_folder:dir}`: where in a run's folder this start's configuration goes."""
+    resolvers = {
+        "checkout": lambda part: str(CHECKOUT / part),
+        "problem_name": lambda target: str(target).rpartition(".")[2].lower(),
+        "start_folder": lambda folder: next_subfolder(Path(folder)),
+    }
+    for name, resolver in resolvers.items():
+        OmegaConf.register_new_resolver(name, resolver, replace=True)
+
+
+def plain(config: DictConfig) -> dict:
+    """The configuration as nested plain data, interpolations resolved."""
+    data = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    data.pop("hydra", None)
+    return data
+
+
+def parsed(overrides: list[str]) -> list[Override]:
+    """The overrides as Hydra reads them; `InputError` where it cannot."""
+    try:
+        return OverridesParser.create().parse_overrides(overrides)
+    except HydraException as error:
+        raise InputError(explain(error, "train")) from None
+
+
+def prepared(data: dict, overrides: list[str], roots: tuple[Path, ...] = ()) -> dict:
+    """``data`` as a run is built from it: that of the run to go on with, where ``resume`` names one (`auto`: the last of
+    this configuration below ``roots``); and with the problem's fields reduced to those its class takes."""
+    named = [o.key_or_group for o in parsed(overrides) if not o.key_or_group.startswith("hydra")]
+    if data.get("resume") == "auto":
+        run = find_run(data, (*roots, OUTPUTS))
+        data = {**data, "resume": str(run) if run else None}
+    if data.get("resume") is not None:
+        data = resumed_configuration(data, named)
+    if isinstance(data.get("problem"), dict) and "_target_" in data["problem"]:
+        data["problem"] = drop_unclaimed(data["problem"], overrides)
+    return data
+
+
+def drop_unclaimed(problem: dict, overrides: list[str]) -> dict:
+    """Without the group's own fields that a user's class does not take; those the user set himself stay, to be refused."""
+    target = str(problem.get("_target_"))
+    if target.startswith("ocp_torch."):
+        return problem
+    own = [o.lstrip("+") for o in overrides if o.lstrip("+").startswith("problem.")]
+    named = {o.split("=")[0].removeprefix("problem.") for o in own}
+    taken = inspect.signature(problem_class(problem.get("_target_"))).parameters
+    return {k: v for k, v in problem.items() if k == "_target_" or k in taken or k in named}
+
+
+def composed(config_name: str, overrides: list[str], roots: tuple[Path, ...] = ()) -> dict:
+    """What the job will be given; whatever Hydra or OmegaConf has against it becomes an `InputError` of one sentence."""
+    return prepared(_composed(config_name, overrides), overrides, roots)
+
+
+def _composed(config_name: str, overrides: list[str]) -> dict:
+    try:
+        with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+            return plain(compose(config_name, overrides))
+    except (HydraException, OmegaConfBaseException, ValueError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
+        known = isinstance(error, HydraException | OmegaConfBaseException)
+        # Hydra has no exception of its own for some slips, and does not say where they are.
+        reason = " ".join(str(error).split()).rstrip(".")
+        sentence = explain(error, config_name) if known else f"{' '.join(overrides)} cannot be composed: {reason}."
+        raise InputError(sentence) from None
+    finally:
+        GlobalHydra.instance().clear()
+
+
+def check_sweep(config_name: str, overrides: list[str]) -> None:
+    """Raise `InputError` where a job of the sweep would not even compose: every value of every field, one at a time."""
+    try:
+        options = BasicSweeper.split_arguments(parsed(overrides), None)[0]
+    except HydraException as error:
+        raise InputError(explain(error, config_name)) from None
+    for one in dict.fromkeys(o for job in options for o in job):
+        first = next(job for job in options if one in job)
+        _composed(config_name, [o for o in first if not o.startswith(("hydra.", "hydra/"))])
+    # Hydra's own settings are the same for every job.
+    _composed(config_name, [o for o in options[0] if o.startswith(("hydra.", "hydra/"))])
+
+
+def explain(error: Exception, config_name: str) -> str:
+    """Hydra's and OmegaConf's own words as one sentence."""
+    text = str(error)
+    unknown = re.search(r"Could not find '([\w./-]+)/([^'/]*)'", text)
+    if isinstance(error, MissingConfigException) and unknown:
+        group, choice = unknown.groups()
+        if group in EXTRAS:
+            return (
+                f"{group} is {choice!r}, which is not installed; pip install -e '.[{EXTRAS[group]}]' brings joblib's."
+            )
+        known = sorted(p.stem for p in (CONFIGS / group).glob("*.yaml"))
+        return f"{group} is {choice!r}, but must be one of {', '.join(known)}{nearest(choice, known)}."
+    override = re.search(r"Could not override '([\w.@/-]+)'", text)
+    if isinstance(error, ConfigCompositionException) and override:
+        field = override.group(1)
+        known = known_fields(config_name)
+        hint = nearest(field, known)
+        return f"{field} is not a field of the configuration{hint}; write +{field}=... to add an argument of your own."
+    missing = re.search(r"Missing mandatory value: ([\w.]+)", text)
+    if missing:
+        field = getattr(error, "full_key", None) or missing.group(1)
+        return f"{field} is missing; give {field}=... on the command line."
+    if isinstance(error, OverrideParseException):
+        return f"{error.override!r} cannot be read; write field=value, and quote a value that holds signs of its own."
+    return " ".join(text.split()).rstrip(".") + "."
+
+
+@cache
+def known_fields(config_name: str) -> list[str]:
+    """Dotted names of all fields and groups of the default configuration."""
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        config = OmegaConf.to_container(compose(config_name), resolve=False)
+
+    def names(node: dict, prefix: str = "") -> list[str]:
+        own = [f"{prefix}{k}" for k in node]
+        return own + [n for k, v in node.items() if isinstance(v, dict) for n in names(v, f"{prefix}{k}.")]
+
+    return names(config)

@@ -1,0 +1,198 @@
+"""Runs side by side: their certificates as rows, the smallest gap first; and what is broken or not finished."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ocp_torch.errors import InputError
+from ocp_torch.storage import write_atomically
+from ocp_torch.training.checkpoint import newest
+
+LARGEST_CERTIFICATE = 2**24
+# Column -> how a number in it is shown.
+COLUMNS = {
+    "run": "",
+    "problem": "",
+    "method": "",
+    "seed": "d",
+    "step": ",d",
+    "train_seconds": ".0f",
+    "lower": ".6f",
+    "perf": ".6f",
+    "upper": ".6f",
+    "exact": ".6f",
+    "gap_certified": ".3%",
+    "gap_simulated": ".3%",
+    "share": ".1%",
+    "stopped": "",
+    "warnings": "d",
+}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """``rows`` have the columns `COLUMNS`, `None` where a number does not apply; ``unfinished`` says, per run, why it has
+    none."""
+
+    rows: list[dict]
+    unfinished: dict[str, str]
+
+    def table(self) -> str:
+        """For the terminal."""
+        cells = [list(COLUMNS), *([shown(row[c], form) for c, form in COLUMNS.items()] for row in self.rows)]
+        widths = [max(len(line[k]) for line in cells) for k in range(len(COLUMNS))]
+        lines = ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in cells]
+        lines.insert(1, "-" * max(map(len, lines)))
+        lines += [f"not in the table: {run}: {why}" for run, why in self.unfinished.items()]
+        return "\n".join(lines)
+
+    def save_csv(self, file: Path) -> None:
+        """Numbers in full precision, empty where they do not apply."""
+
+        def write(temporary: Path) -> None:
+            with temporary.open("w", newline="") as stream:
+                writer = csv.DictWriter(stream, COLUMNS)
+                writer.writeheader()
+                writer.writerows(self.rows)
+
+        write_atomically(file, write)
+
+    def save_plot(self, file: Path) -> None:
+        """What lies between the lower bound and each upper side of every run, as a picture."""
+        if file.suffix.lower() not in (".png", ".pdf", ".svg"):
+            raise InputError(f"plot is {str(file)!r}, but must end in .png, .pdf or .svg.")
+        figure = Figure(figsize=(7.0, 1.2 + 0.4 * max(1, len(self.rows))), layout="constrained")
+        FigureCanvasAgg(figure)
+        axis = figure.subplots()
+        for k, row in enumerate(self.rows):
+            for column, mark in (("lower", "|"), ("perf", "o"), ("upper", "|")):
+                if row[column] is not None:
+                    axis.plot(row[column], k, mark, color="C0", markersize=10 if mark == "|" else 5)
+            known = [row[c] for c in ("lower", "perf", "upper") if row[c] is not None]
+            axis.plot([min(known, default=0.0), max(known, default=0.0)], [k, k], color="C0", linewidth=1)
+            if row["exact"] is not None:
+                axis.plot(row["exact"], k, "kx", markersize=6)
+        axis.set_yticks(range(len(self.rows)), [row["run"] for row in self.rows])
+        axis.invert_yaxis()
+        axis.set(xlabel="lower bound | simulated performance o upper bound | (x: OPT)")
+        kind = file.suffix.lower()[1:]
+        write_atomically(file, lambda temporary: figure.savefig(temporary, format=kind, dpi=120))
+
+
+def shown(value, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def compare(paths: Iterable[Path]) -> Comparison:
+    """All runs in ``paths`` (run folders, or folders of them), sorted by the certified gap, then by the simulated one."""
+    folders: list[Path] = []
+    for path in paths:
+        if not path.is_dir():
+            raise InputError(f"{path} is not a folder; give runs' folders, or folders that hold some.")
+        folders += run_folders(path)
+    rows, unfinished = [], {}
+    names = named(list(dict.fromkeys(folders)))
+    for folder, name in names.items():
+        try:
+            rows.append(row_of(folder, name))
+        except InputError as error:
+            unfinished[name] = str(error)
+    rows.sort(key=lambda row: [math.inf if row[c] is None else row[c] for c in ("gap_certified", "gap_simulated")])
+    return Comparison(rows, unfinished)
+
+
+def run_folders(path: Path) -> list[Path]:
+    """``path`` if it is a run's folder, else every run's folder below it."""
+    marks = (".hydra", "checkpoints", "certificate.json")
+    if any((path / mark).exists() for mark in marks):
+        return [path]
+    return sorted({p.parent for mark in marks for p in path.rglob(mark) if "checkpoints" not in p.parent.parts[-1:]})
+
+
+def named(folders: list[Path]) -> dict[Path, str]:
+    """Each folder by the part of its path that it does not share with all the others, printable."""
+    parents = [list(folder.absolute().parts) for folder in folders]
+    shared = 0
+    while len(parents) > 1 and all(len(p) > shared + 1 for p in parents) and len({p[shared] for p in parents}) == 1:
+        shared += 1
+    keep = slice(shared, None) if len(parents) > 1 else slice(-1, None)
+    return {f: printable("/".join(p[keep])) for f, p in zip(folders, parents, strict=True)}
+
+
+def printable(text: object) -> str:
+    """Names come from files of strangers: nothing in them may steer a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in str(text))[:120]
+
+
+def row_of(folder: Path, name: str) -> dict:
+    """The row of one run. Raises `InputError`, saying why, when it has no certificate that can be read."""
+    file = folder / "certificate.json"
+    if not file.exists():
+        raise InputError(progress_of(folder))
+    try:
+        if file.stat().st_size > LARGEST_CERTIFICATE:
+            raise ValueError("it is too large")
+        certificate = json.loads(file.read_text())
+        lower, perf, upper = (best(certificate, *side) for side in SIDES)
+        return {
+            "run": name,
+            **{k: printable(certificate[k]) for k in ("problem", "method")},
+            **{k: int(number(certificate[k])) for k in ("seed", "step")},
+            "train_seconds": number(certificate["train_seconds"]),
+            "lower": lower,
+            "perf": perf,
+            "upper": upper,
+            "exact": number(certificate["exact"]),
+            "gap_certified": number(certificate["gap"]["certified"]),
+            "gap_simulated": number(certificate["gap"]["simulated"]),
+            "share": number(certificate["share"]["certified"]),
+            "stopped": printable(certificate.get("stopped", "steps")),
+            "warnings": len(list(certificate["warnings"])),
+        }
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        reason = printable(f"{type(error).__name__}: {error}")
+        raise InputError(f"its certificate.json is damaged ({reason}).") from None
+
+
+# Each side of a certificate: its group, the key of `gap` that names the bound in use, and which end is the best.
+SIDES = (("lower", "lower_from", max), ("perf", None, min), ("upper", "upper_from", min))
+
+
+def best(certificate: dict, group: str, chosen: str | None, choose) -> float | None:
+    """The bound the gap was taken from, or the best value there is."""
+    name = certificate["gap"][chosen] if chosen else None
+    if name is not None:
+        return number(certificate[group][name]["value"])
+    if chosen is not None:
+        return None
+    values = [number(e["value"]) for e in certificate[group].values() if e is not None]
+    return choose(values, default=None)
+
+
+def number(value) -> float | None:
+    """A finite number, or `None`; `ValueError` for anything else."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{value!r} is not a number")
+    return value
+
+
+def progress_of(folder: Path) -> str:
+    """How far a run without a certificate came."""
+    try:
+        state = newest(folder / "checkpoints")[0]
+        total = state["config"]["trainer"]["steps"]
+        return f"not finished: saved at step {int(state['step'])} of {int(total)}; resume={printable(folder)} goes on."
+    except InputError as error:
+        return f"not finished: {printable(error)}"
+    except (KeyError, TypeError, ValueError):
+        return "its checkpoint is not the state of a run."

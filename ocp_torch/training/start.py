@@ -1,0 +1,66 @@
+"""From a configuration to a run under way: a fresh one, or one that goes on."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+from ocp_torch.certificate import CertificateSettings
+from ocp_torch.config import build_certificate_settings, build_trainer
+from ocp_torch.errors import InputError
+from ocp_torch.training.resume import (
+    filled_from,
+    keep_configuration,
+    load_state,
+    require_same_run,
+    result_of,
+)
+from ocp_torch.training.session import run_session
+from ocp_torch.training.trainer import Trainer
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A trainer ready to run; for one that was resumed also the state it was given and what was said of damaged files."""
+
+    trainer: Trainer
+    certificate_settings: CertificateSettings
+    state: dict | None = None
+    notes: tuple[str, ...] = ()
+
+
+def prepare(config: dict) -> Prepared:
+    """Build what ``config`` describes, and put it where the checkpoint is that its ``resume`` names.
+
+    Raises `InputError` for any wrong field, damaged file, or change that a resume cannot make.
+    """
+    config = dict(config)
+    path = config.pop("resume", None)
+    if path is None:
+        trainer = build_trainer(config)
+        return Prepared(trainer, build_certificate_settings(trainer.config))
+    state, checkpoint, notes = load_state(Path(path))
+    made = state.get("config") if isinstance(state, dict) else None
+    if not isinstance(made, dict):
+        raise InputError(f"{checkpoint} is not the state of a run.")
+    trainer = build_trainer(filled_from(config, made))
+    require_same_run(trainer.config, made)
+    trainer.resume(checkpoint)
+    return Prepared(trainer, build_certificate_settings(trainer.config), state, tuple(notes))
+
+
+def train(config: dict, folder: Path) -> None:
+    """One run in ``folder``, from wherever it is to its end."""
+    run = prepare(config)
+    for note in run.notes:
+        log.warning("warning: %s", note)
+    if run.state is not None:
+        result = result_of(folder, run.state, run.trainer.config)
+        if result is not None:
+            log.info("\n%s\n%s is finished; a larger trainer.steps would go on.", result, folder)
+            return
+        keep_configuration(folder, config)
+    run_session(run.trainer, run.certificate_settings, folder)
