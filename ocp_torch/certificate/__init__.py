@@ -1,7 +1,8 @@
 """Bounds, performances and what they assume; needs no trainer."""
 
 from ocp_torch.certificate.certificate import Certificate, Run, table
-from ocp_torch.certificate.certify import CertificateSettings, Trained, certify_fields, raised
+from ocp_torch.certificate.certify import Trained, certify_fields, raised
+from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.stage import StageSettings
 
 __all__ = ["Certificate", "CertificateSettings", "Run", "StageSettings", "Trained", "certify_fields", "raised", "table"]

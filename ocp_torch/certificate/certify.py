@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import nn
@@ -16,10 +16,10 @@ from ocp_torch.certificate.certificate import Certificate, Run
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.performance import Simulated, simulate_performance
+from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.sides import LowerSide, lower_side, upper_side
-from ocp_torch.certificate.stage import StageSettings, fit_closed_loop
+from ocp_torch.certificate.stage import fit_closed_loop
 from ocp_torch.control_laws import CLOSED, control_laws, occupation_density, zero_law
-from ocp_torch.errors import require_integer
 from ocp_torch.fields.fields import Fields
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.problem import Problem
@@ -32,25 +32,6 @@ BASELINE_FACTOR = 2
 TANGENT_PART = 4
 # Head-room of an M that is estimated from the learned controller's occupation density.
 OCCUPATION_ROOM = 1.25
-
-
-@dataclass(frozen=True)
-class CertificateSettings:
-    """How much is spent on a certificate. Raises `InputError` on counts that cannot give a standard error."""
-
-    points: int = 32768  # states per replicate for the integrals and sampled suprema
-    replicates: int = 8  # independent randomised point sets behind each standard error
-    trajectories: int = 256  # simulated starts per replicate; 0 skips every simulation
-    ascents: int = 32  # local ascents from the worst sampled states
-    occupation_states: int = 144  # where the supremum of the occupation density is looked for; 0 skips it
-    stage: StageSettings = field(default_factory=StageSettings)  # the fit to the closed loop
-
-    def __post_init__(self) -> None:
-        require_integer("certificate.points", self.points, 1)
-        require_integer("certificate.replicates", self.replicates, 2)
-        require_integer("certificate.trajectories", self.trajectories, 0)
-        require_integer("certificate.ascents", self.ascents, 1)
-        require_integer("certificate.occupation_states", self.occupation_states, 0)
 
 
 @dataclass(frozen=True)
