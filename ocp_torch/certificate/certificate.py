@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ocp_torch.certificate.assumptions import Assumptions
@@ -43,25 +43,28 @@ class Certificate:
     warnings: list[str] = field(default_factory=list)
     searches: list[str] = field(default_factory=list)
     speaks: dict[str, bool] = field(default_factory=dict)
+    confidence: float = 0.95
 
     @property
     def best_lower(self) -> tuple[str, float] | None:
         """Name and value of the largest lower bound whose assumptions hold."""
-        usable = {"F_M": self.assumptions.occupation_holds, "shifted": True}
-        return _best(max, self.lower, usable)
+        sound = self.assumptions.problem_holds
+        return _best(max, self.lower, {"F_M": sound and self.assumptions.occupation_holds, "shifted": sound})
 
     @property
     def best_upper(self) -> tuple[str, float] | None:
         """The smallest upper bound of the controller handed out whose assumptions hold; no simulation in it."""
-        holds = self.assumptions.value_holds
+        known = self.assumptions
+        holds = known.problem_holds and known.value_holds and known.cost_holds
         usable = {name: holds and self.speaks.get(name, True) for name in ("J", "G")}
-        return _best(min, self.upper, {**usable, "lagrangian": True})
+        usable["J"] = usable["J"] and known.regular_holds
+        return _best(min, self.upper, {**usable, "lagrangian": known.problem_holds and known.regular_holds})
 
     @property
     def best_perf(self) -> tuple[str, float] | None:
         """The controller with the smallest simulated performance, and that with its bias and two standard errors."""
         known = {name: e for name, e in self.perf.items() if e is not None and e.finite}
-        if not known:
+        if not known or not self.assumptions.problem_holds:
             return None
         name = min(known, key=lambda n: known[n].above)
         return name, known[name].above
@@ -77,6 +80,22 @@ class Certificate:
             "upper_from": upper[0] if upper else None,
         }
 
+    def without_contradictions(self) -> Certificate:
+        """Itself, or, where `F_M` is above an upper bound on `OPT` by more than chance allows, with `F_M` taken out."""
+        low, sure = self.lower.get("F_M"), 1.0 - (1.0 - self.confidence) / 10.0
+        if low is None or not low.finite or not self.assumptions.occupation_holds:
+            return self
+        above = {name: e.interval(sure)[1] for name, e in self.perf.items() if e is not None and e.finite}
+        best = self.best_upper
+        if best is not None:
+            above[best[0]] = self.upper[best[0]].interval(sure)[1]
+        name = min(above, key=above.get, default=None)
+        if name is None or low.interval(sure)[0] <= above[name]:
+            return self
+        warning = f"F_M is not used: it is above the upper bound {above[name]:.6g} ({name}), so M is too small."
+        assumptions = replace(self.assumptions, occupation_holds=False)
+        return replace(self, assumptions=assumptions, warnings=[*self.warnings, warning])
+
     @property
     def share(self) -> dict:
         """The part of what control can gain over doing nothing that is certainly achieved, by both upper sides."""
@@ -88,14 +107,15 @@ class Certificate:
 
     def to_dict(self) -> dict:
         """The stable schema of `certificate.json`; what does not apply is null."""
-        groups = {name: getattr(self, name) for name in ("lower", "upper", "perf", "baseline")}
-        as_json = {
-            k: {n: e.to_dict() if e is not None and e.finite else None for n, e in g.items()} for k, g in groups.items()
-        }
+        level = self.confidence
+        one = lambda e: e.to_dict(level) if e is not None and e.finite else None
+        groups = ("lower", "upper", "perf", "baseline")
+        as_json = {group: {name: one(e) for name, e in getattr(self, group).items()} for group in groups}
         return {
             "schema": SCHEMA,
             **vars(self.run),
             "exact": self.exact,
+            "confidence": self.confidence,
             **as_json,
             "gap": self.gap,
             "share": self.share,
@@ -133,7 +153,8 @@ def table(certificate: dict, searches: list[str] = ()) -> str:
     """The certificate (as a dict of its schema) as a table for the terminal, and how its suprema were found."""
     exact = certificate["exact"]
     lines = [f"{certificate['problem']} / {certificate['method']}, seed {certificate['seed']}", ""]
-    header = f"{'':26}{'value':>14}{'± se':>11}{'± bias':>11}" + (f"{'vs OPT':>12}" if exact else "")
+    covered = f"± {100.0 * certificate['confidence']:.6g} %" if "confidence" in certificate else "± se"
+    header = f"{'':26}{'value':>14}{covered:>11}{'of it bias':>11}" + (f"{'vs OPT':>12}" if exact else "")
     lines += [header, "-" * len(header)]
 
     def row(label: str, estimate: dict | None) -> None:
@@ -141,7 +162,8 @@ def table(certificate: dict, searches: list[str] = ()) -> str:
             return
         bias = f"{estimate['bias']:11.1e}" if "bias" in estimate else " " * 11
         against = f"{100.0 * (estimate['value'] / exact - 1.0):+11.4f}%" if exact else ""
-        lines.append(f"{label:26}{estimate['value']:14.8f}{estimate['se']:11.1e}{bias}{against}")
+        half = estimate["interval"][1] - estimate["value"] if "interval" in estimate else estimate["se"]
+        lines.append(f"{label:26}{estimate['value']:14.8f}{half:11.1e}{bias}{against}")
 
     row("lower: F_M", certificate["lower"]["F_M"])
     row("lower: shifted", certificate["lower"]["shifted"])

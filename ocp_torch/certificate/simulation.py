@@ -26,11 +26,13 @@ AUDITED, AUDIT_FACTOR = 64, 4
 
 @torch.no_grad()
 def discounted_integral(
-    dynamics: Dynamics, x0: Tensor, rho: float, horizon: float, steps: int
+    dynamics: Dynamics, x0: Tensor, rho: float, horizon: float, steps: int, wrap: bool = True
 ) -> tuple[Tensor, Tensor]:
     r"""`int_0^T rho e^{-rho t} rate(x_t) dt` ``(N,)`` and the end states ``(N, d)``, by classical RK4 with equal steps.
 
-    The discount multiplies the rate inside the scheme, so that state and integral are one smooth system of order 4.
+    End states are wrapped to the unit cell unless ``wrap`` is false: not every coordinate need be an angle. The discount
+    multiplies the rate inside the scheme, so that state and integral are one
+    smooth system of order 4.
     """
     h = horizon / steps
     x, total = x0, torch.zeros_like(x0[:, 0])
@@ -40,7 +42,7 @@ def discounted_integral(
         x, (r1, r2, r3, r4) = _step(dynamics, x, h)
         total = total + weight * h / 6.0 * (r1 + 2.0 * decay_half * (r2 + r3) + decay_full * r4)
         weight = weight * decay_full
-    return total, x.remainder(1.0)
+    return total, x.remainder(1.0) if wrap else x
 
 
 @torch.no_grad()
