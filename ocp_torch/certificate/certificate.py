@@ -31,6 +31,8 @@ class Certificate:
 
     ``lower``, ``upper``, ``perf`` and ``baseline`` map the names of `certificate.json` to estimates; ``searches`` says how
     each supremum behind them was found, ``speaks`` whether `J` and `G` are about the controller that is handed out.
+    ``confidence`` is the level of the intervals; ``subject`` names the controller in ``perf`` that all this is about, by
+    default the best of them; ``perf_lower`` bounds its performance from below without simulation.
     """
 
     run: Run
@@ -44,6 +46,8 @@ class Certificate:
     searches: list[str] = field(default_factory=list)
     speaks: dict[str, bool] = field(default_factory=dict)
     confidence: float = 0.95
+    subject: str | None = None
+    perf_lower: dict[str, Estimate | None] = field(default_factory=dict)
 
     @property
     def best_lower(self) -> tuple[str, float] | None:
@@ -58,12 +62,15 @@ class Certificate:
         holds = known.problem_holds and known.value_holds and known.cost_holds
         usable = {name: holds and self.speaks.get(name, True) for name in ("J", "G")}
         usable["J"] = usable["J"] and known.regular_holds
-        return _best(min, self.upper, {**usable, "lagrangian": known.problem_holds and known.regular_holds})
+        usable["lagrangian"] = known.problem_holds and known.regular_holds
+        return _best(min, self.upper, {**usable, "evaluation": known.problem_holds})
 
     @property
     def best_perf(self) -> tuple[str, float] | None:
-        """The controller with the smallest simulated performance, and that with its bias and two standard errors."""
-        known = {name: e for name, e in self.perf.items() if e is not None and e.finite}
+        """The controller with the smallest simulated performance (or the ``subject``), and that with its bias and two
+        standard errors."""
+        mine = lambda name: self.subject is None or name == self.subject
+        known = {name: e for name, e in self.perf.items() if e is not None and e.finite and mine(name)}
         if not known or not self.assumptions.problem_holds:
             return None
         name = min(known, key=lambda n: known[n].above)
@@ -79,6 +86,26 @@ class Certificate:
             "lower_from": lower[0] if lower else None,
             "upper_from": upper[0] if upper else None,
         }
+
+    @property
+    def suboptimality(self) -> dict:
+        """How much more than `OPT` the controller costs, relative to it: ``at_least`` and ``at_most``, jointly at the
+        level of ``confidence`` (the level of each interval that enters is raised accordingly); `None` where unknown."""
+        best, lower, upper = self.best_perf, self.best_lower, self.best_upper
+        known = [e for e in self.perf.values() if e is not None and e.finite]
+        level = 1.0 - (1.0 - self.confidence) / (len(known) + 2)
+        none = {"at_least": None, "at_most": None}
+        if best is None:
+            return none
+        low, high = self.perf[best[0]].interval(level)
+        # Whatever any controller costs, OPT does not exceed it.
+        above = [e.interval(level)[1] for e in known] + ([self.upper[upper[0]].interval(level)[1]] if upper else [])
+        found = dict(none)
+        if min(above) > 0.0:
+            found["at_least"] = max(0.0, low / min(above) - 1.0)
+        if lower is not None and (under := self.lower[lower[0]].interval(level)[0]) > 0.0:
+            found["at_most"] = max(0.0, high / under - 1.0)
+        return found
 
     def without_contradictions(self) -> Certificate:
         """Itself, or, where `F_M` is above an upper bound on `OPT` by more than chance allows, with `F_M` taken out."""
@@ -119,6 +146,8 @@ class Certificate:
             **as_json,
             "gap": self.gap,
             "share": self.share,
+            "suboptimality": self.suboptimality,
+            **({"perf_lower": {name: one(e) for name, e in self.perf_lower.items()}} if self.perf_lower else {}),
             "assumptions": self.assumptions.to_dict(),
             "warnings": list(self.warnings),
         }
@@ -169,10 +198,13 @@ def table(certificate: dict, searches: list[str] = ()) -> str:
     row("lower: shifted", certificate["lower"]["shifted"])
     if exact is not None:
         lines.append(f"{'OPT (exact)':26}{exact:14.8f}")
-    row("Perf: controller from V", certificate["perf"]["value"])
-    row("Perf: controller w/mu", certificate["perf"]["density"])
-    for name, label in (("lagrangian", "Lagrangian"), ("G", "G"), ("J", "J")):
-        row(f"upper: {label}", certificate["upper"][name])
+    row("Perf: controller from V", certificate["perf"].get("value"))
+    row("Perf: controller w/mu", certificate["perf"].get("density"))
+    for name, estimate in certificate.get("perf_lower", {}).items():
+        row(f"Perf, from below: {name}", estimate)
+    row("Perf: this controller", certificate["perf"].get("given"))
+    for name, label in (("lagrangian", "Lagrangian"), ("evaluation", "evaluation"), ("G", "G"), ("J", "J")):
+        row(f"upper: {label}", certificate["upper"].get(name))
     row("Perf: doing nothing", certificate["baseline"]["zero"])
     lines.append("-" * len(header))
     gap, share = certificate["gap"], certificate["share"]
@@ -180,6 +212,22 @@ def table(certificate: dict, searches: list[str] = ()) -> str:
         if gap[kind] is not None:
             part = f", {100 * share[kind]:.2f}% of the gain over doing nothing" if share[kind] is not None else ""
             lines.append(f"gap, {kind}: {100.0 * gap[kind]:.4f}%{part}")
+    lines += in_words(certificate)
     lines += searches
     lines += [f"warning: {warning}" for warning in certificate["warnings"]]
     return "\n".join(lines)
+
+
+def in_words(certificate: dict) -> list[str]:
+    """The sub-optimality of the controller as a sentence, if there is anything to say."""
+    found = certificate.get("suboptimality") or {}
+    percent = lambda x: f"{100.0 * x:.3g} %"
+    least, most = found.get("at_least"), found.get("at_most")
+    parts = [f"at most {percent(most)}"] if most is not None else []
+    if least:
+        parts.append(f"at least {percent(least)}")
+    if not parts:
+        return []
+    return [
+        f"the controller is {' and '.join(parts)} worse than the optimum ({percent(certificate['confidence'])} sure)"
+    ]

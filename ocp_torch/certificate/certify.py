@@ -116,7 +116,7 @@ def certify_fields(
         baseline={"zero": zero},
         assumptions=assumptions,
         warnings=warnings,
-        searches=_searches(lower, stage),
+        searches=searches_of(lower, stage),
         speaks=speaks,
         confidence=settings.confidence,
     )
@@ -210,7 +210,7 @@ def certification_stage(
     return closed_loop_bounds(loop, value, fitted.log_occupation, loop_sets, settings.ascents, kind, initial), []
 
 
-def _searches(lower: LowerSide | None, stage: ClosedLoopBounds | None) -> list[str]:
+def searches_of(lower: LowerSide | None, stage: ClosedLoopBounds | None) -> list[str]:
     """How each sampled supremum was found."""
     found = {"sup max(Q, 0)": lower.largest_slack} if lower else {}
     if stage is not None:

@@ -41,7 +41,7 @@ class StageSettings:
 def fit_closed_loop(
     problem: Problem,
     law: ControlLaw,
-    fields: Fields,
+    fields: Fields | None,
     network: Callable[..., torch.nn.Module],
     bounds: Bounds,
     settings: StageSettings,
@@ -49,17 +49,20 @@ def fit_closed_loop(
 ) -> Fields:
     """Fields with `log mu^u`, and with `V^u` where ``fields`` hold no `V`, of the closed loop of ``law``.
 
-    ``fields`` are the trained ones, ``law`` one of theirs in their precision; their `log mu`, if any, is the start.
+    ``fields`` are the trained ones, ``law`` one of theirs in their precision; their `log mu`, if any, is the start. With no
+    ``fields`` the law is somebody's own, in float64, and both `mu` and `V` are fitted in float32.
     """
-    like = next(fields.parameters())
+    like = torch.zeros(()) if fields is None else next(fields.parameters())
     loop = ClosedLoop(problem, law)
-    with_value = fields.value is None
+    with_value = fields is None or fields.value is None
     objective = PolicyEvaluation(loop, bounds, with_value)
     names = (LOG_OCCUPATION, VALUE) if with_value else (LOG_OCCUPATION,)
     fitted = Fields.build(problem, names, network, derive_seed(seed, STAGE_STREAM, 0)).to(like)
-    if fields.log_occupation is not None:
+    if fields is not None and fields.log_occupation is not None:
         fitted.log_occupation.load_state_dict(fields.log_occupation.state_dict())
-    pool = _pool(loop, min(POOL, settings.steps * settings.batch), derive_seed(seed, STAGE_STREAM, 1), like)
+    pool = _pool(
+        loop, min(POOL, settings.steps * settings.batch), derive_seed(seed, STAGE_STREAM, 1), like, fields is None
+    )
     picker = torch.Generator().manual_seed(derive_seed(seed, STAGE_STREAM, 2))
     draw = lambda: pool.take(torch.randint(len(pool), (settings.batch,), generator=picker).to(like.device))
     optimizer = optimizer_maker("soap", settings.lr, betas=(0.95, 0.95))
@@ -71,6 +74,7 @@ def fit_closed_loop(
     return average.module
 
 
-def _pool(loop: ClosedLoop, count: int, seed: int, like: torch.Tensor) -> Samples:
-    x = UniformSampler(loop.dim, seed, like.dtype).draw(count).to(like.device)
-    return Samples.concatenate([Samples.of(loop, part) for part in x.split(4096)])
+def _pool(loop: ClosedLoop, count: int, seed: int, like: torch.Tensor, double: bool) -> Samples:
+    """States and the closed loop's data there, evaluated in float64 if ``double``, kept in the precision of ``like``."""
+    x = UniformSampler(loop.dim, seed, torch.float64 if double else like.dtype).draw(count).to(like.device)
+    return Samples.concatenate([Samples.of(loop, part) for part in x.split(4096)]).to(like)
