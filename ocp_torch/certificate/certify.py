@@ -99,6 +99,9 @@ def certify_fields(
     warnings = list(bounds.warnings) + notes + warnings
     # J bounds the performance of w / mu and G that of w over the mu of Lemma 2: of nothing else.
     speaks = {"J": best == "density", "G": best == "density" and occupation == CLOSED and assumptions.value_holds}
+    if not assumptions.regular_holds:
+        # On a jump the divergence is not what the stage sees: a wrong number is not shown at all.
+        stage = None
     if stage is not None and not (speaks["J"] and assumptions.value_holds and J.value <= stage.J.value):
         if J is not None and not assumptions.value_holds:
             warnings.append(f"the J shown is that of the closed loop, with C_V = {stage.C_V:.4g} proved for it.")

@@ -83,6 +83,8 @@ def certify_policy(
         assumptions = assumptions.with_value_bound(evaluated.C_V)
         if coarse:
             notes.append("J is left out: the controller computes in float32, too coarse for its divergence.")
+    # On a jump the divergence is not what the formulas see: a wrong number is not shown at all.
+    smooth = evaluated if assumptions.regular_holds else None
     if value is None:
         notes.append("no lower bound: there is no V to give one.")
     certificate = Certificate(
@@ -90,9 +92,9 @@ def certify_policy(
         exact=problem.exact_optimum,
         lower={"F_M": lower.F_M if lower else None, "shifted": lower.shifted if lower else None},
         upper={
-            "J": evaluated.J if evaluated and not coarse else None,
+            "J": smooth.J if smooth and not coarse else None,
             "G": None,
-            "lagrangian": evaluated.lagrangian if evaluated else None,
+            "lagrangian": smooth.lagrangian if smooth else None,
             "evaluation": evaluated.sandwich[1] if evaluated else None,
         },
         perf=perf,
@@ -104,7 +106,7 @@ def certify_policy(
         subject=GIVEN,
         perf_lower={
             "evaluation": evaluated.sandwich[0] if evaluated else None,
-            "lagrangian": evaluated.below if evaluated else None,
+            "lagrangian": smooth.below if smooth else None,
         },
     )
     return certificate.without_contradictions()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import logging
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,12 +12,12 @@ from torch import Tensor, nn
 from ocp_torch.bounds import Bounds, resolve_bounds
 from ocp_torch.budgets import fill
 from ocp_torch.calculus import Field
-from ocp_torch.certificate import Certificate, CertificateSettings, Run, certify_policy, in_float64
+from ocp_torch.certificate import Certificate, CertificateSettings, Run, certify_policy, in_float64, table
 from ocp_torch.certificate.black_box import BlackBox
-from ocp_torch.config import build_certificate_settings, build_network
+from ocp_torch.config import build_certificate_settings, build_network, build_problem
 from ocp_torch.control_laws import ControlLaw, control_laws
-from ocp_torch.controller import Controller, load_controller, problem_name
-from ocp_torch.errors import InputError, nearest, require_integer
+from ocp_torch.controller import Controller, problem_name
+from ocp_torch.errors import InputError, require_flag, require_integer
 from ocp_torch.fields import Fields
 from ocp_torch.fields.fields import VALUE
 from ocp_torch.objectives import Dual
@@ -25,6 +25,10 @@ from ocp_torch.problems import Problem
 from ocp_torch.samplers import UniformSampler, derive_seed
 from ocp_torch.samples import Samples
 from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
+from ocp_torch.training import figures
+from ocp_torch.training.loading import load_law, load_saved
+
+log = logging.getLogger(__name__)
 
 # Branch of the seed tree for the V trained here, beside those of runs, evaluation and the stage.
 JUDGE_STREAM = 4
@@ -117,62 +121,32 @@ def value_of(value: Field | Controller, problem: Problem) -> Field:
     return value
 
 
-def load_law(source: str, problem: Problem) -> Callable | Controller:
-    """The controller the command line names: FILE.py:function, a run's folder or a file of ours, .onnx, or TorchScript."""
-    path, _, name = str(source).rpartition(":")
-    if path.endswith(".py"):
-        return _function(Path(path), name)
-    path = Path(str(source))
-    if path.suffix == ".py":
-        raise InputError(f"controller is {source!r}, but must name its function, as in {source}:function.")
-    if not path.exists():
-        raise InputError(
-            f"controller is {str(source)!r}, which does not exist; give FILE.py:function, a run's folder, a "
-            "controller.safetensors, an .onnx or a TorchScript file."
-        )
-    if path.is_dir() or path.suffix == ".safetensors":
-        return load_saved(path, problem)
-    return _onnx(path) if path.suffix == ".onnx" else _torchscript(path)
+def read(config: dict) -> dict:
+    """The arguments of `certify` that the plain ``config`` of the command line names; only it may name code to run."""
+    problem = build_problem(config["problem"])
+    filled = fill({"model": dict(MODEL), "trainer": {}, "optimizer": {}, "certificate": config["certificate"]}, problem)
+    train = require_flag("train", config["train"])
+    if config["steps"] is not None:
+        require_integer("steps", config["steps"], 1)
+    controller = load_law(config["controller"], problem)
+    law_of(controller, problem)
+    value = None if config["value"] is None else load_saved(Path(str(config["value"])), problem)
+    return {
+        "problem": problem,
+        "controller": controller,
+        "value": value,
+        "settings": build_certificate_settings(filled),
+        "seed": require_integer("seed", config["seed"], 0),
+        "train_steps": config["steps"] if train else 0,
+    }
 
 
-def load_saved(path: Path, problem: Problem) -> Controller:
-    """A controller of ours, by its file or its run's folder; of the same problem, whatever its parameters were."""
-    return load_controller(path / "controller.safetensors" if path.is_dir() else path, problem=problem)
-
-
-def _function(path: Path, name: str) -> Callable:
-    if not path.is_file():
-        raise InputError(f"controller names {path}, which does not exist.")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:  # whatever a stranger's code may raise
-        raise InputError(f"{path} cannot be run: {type(error).__name__}: {error}.") from None
-    found = getattr(module, name, None)
-    if not callable(found):
-        known = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
-        raise InputError(f"{path} has no function {name!r}{nearest(name, known)}.")
-    return found
-
-
-def _onnx(path: Path) -> Callable:
-    try:
-        import onnxruntime
-    except ImportError:
-        raise InputError(f"{path} needs onnxruntime: pip install onnxruntime.") from None
-    try:
-        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-        (entry,) = session.get_inputs()
-    except Exception as error:  # the runtime has no one type for a bad file
-        raise InputError(f"{path} is not a model with one input that onnxruntime can run: {error}.") from None
-    dtype = torch.float64 if "double" in entry.type else torch.float32
-    return lambda x: torch.from_numpy(session.run(None, {entry.name: x.to(dtype).numpy()})[0])
-
-
-def _torchscript(path: Path) -> Callable:
-    try:
-        return torch.jit.load(str(path), map_location="cpu").eval()
-    except Exception as error:  # the loader has no one type for a bad file
-        reason = next(iter(str(error).splitlines()), "")
-        raise InputError(f"{path} is not a TorchScript file ({reason}).") from None
+def certify_configured(config: dict, folder: Path) -> Certificate:
+    """Certify what ``config`` names; print the table and leave `certificate.json` and its figure in ``folder``."""
+    torch.set_num_threads(1)
+    certificate = certify(**read(config))
+    certificate.save(folder / "certificate.json")
+    figures.save({"certificate": figures.interval(certificate.to_dict())}, folder / "figures")
+    log.info("\n%s", table(certificate.to_dict(), certificate.searches))
+    log.info("in %s", folder)
+    return certificate

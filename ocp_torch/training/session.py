@@ -43,6 +43,7 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, fol
         controller_of(trainer, certificate, kind).save(folder / "controller.safetensors")
         if settings.figures:
             drawn = figures.draw(trainer.problem, trainer.averaged_fields, trainer.bounds, trainer.objective.occupation)
+            drawn["certificate"] = figures.interval(certificate.to_dict())
             figures.save(drawn, folder / "figures")
             monitor.figures(drawn, trainer.step)
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
