@@ -5,7 +5,7 @@ For any smooth `V`, `V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt` exactly alo
 simulate, with all its errors, is as small as `Q_u`.
 
 The infinite horizon is truncated, with the tail bounded; or each trajectory stops at a time `T ~ Exp(rho)` of its own,
-and `E[rate(x_T)]` is the discounted integral without a tail.
+and `E[rate(x_T)]` is the discounted integral, without a tail.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def simulate_performance(
     if random:
         times = -torch.log1p(-points[:, dim]) / rho
         longest = float(times.max())
-        integrate = lambda rows, count: rate_at(dynamics, x0[rows], times[rows], count)
+        integrate = lambda rows, count: rate_at(dynamics, x0[rows], rho, times[rows], count)
     else:
         longest = max(math.log(max(largest_rate / (TAIL * size), math.e)), 1.0) / rho
         integrate = lambda rows, count: discounted_integral(dynamics, x0[rows], rho, longest, count)

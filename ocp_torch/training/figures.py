@@ -61,7 +61,7 @@ def simulated_occupation(
     bins = BINS[problem.dim]
     points = evaluation_points(STARTS, problem.dim + 1, 0, derive_seed(seed, FIGURE_STREAM))
     x0, times = points[:, :-1], -torch.log1p(-points[:, -1]) / problem.discount
-    _, end = rate_at(lambda x: (problem.velocity(x, law(x)), x[:, 0]), x0, times, FIGURE_STEPS)
+    _, end = rate_at(lambda x: (problem.velocity(x, law(x)), x[:, 0]), x0, problem.discount, times, FIGURE_STEPS)
     cell = lambda x: ((x * bins).long().clamp(0, bins - 1) * bins ** torch.arange(problem.dim)).sum(dim=-1)
     mass = torch.zeros(bins**problem.dim, dtype=torch.float64)
     mass.index_add_(0, cell(end), problem.initial_density(x0))
