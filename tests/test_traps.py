@@ -1,5 +1,6 @@
 """What could make a certificate lie: each gets true bounds, or a clear refusal."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -14,8 +15,11 @@ from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems import Circle, Manufactured
 
 CHEAP = CertificateSettings(
-    points=256, replicates=4, trajectories=8, ascents=8, occupation_states=24, stage=StageSettings(steps=0)
+    points=256, replicates=4, trajectories=8, ascents=8, occupation_states=0, stage=StageSettings(steps=0)
 )
+
+
+LOOKING = replace(CHEAP, occupation_states=24)  # for the density, too
 
 
 class Field(torch.nn.Module):
@@ -169,7 +173,7 @@ class Hidden(Circle):
 def test_half_of_sup_mu_is_caught_on_a_problem_that_does_not_know_it(discount, seed):
     problem = Hidden(discount)
     half = resolve_bounds(problem, occupation_bound=0.5 * problem.true_sup)
-    certificate = certified(problem, bounds=half, seed=seed, value=problem.exact_value)
+    certificate = certified(problem, bounds=half, seed=seed, settings=LOOKING, value=problem.exact_value)
     assert certificate.gap["lower_from"] == "shifted"
     assert not certificate.assumptions.hold
     assert any("F_M is not used" in w for w in certificate.warnings)
@@ -178,7 +182,10 @@ def test_half_of_sup_mu_is_caught_on_a_problem_that_does_not_know_it(discount, s
 def test_twice_sup_mu_is_believed():
     problem = Hidden(2.0)
     certificate = certified(
-        problem, bounds=resolve_bounds(problem, occupation_bound=2.0 * problem.true_sup), value=problem.exact_value
+        problem,
+        bounds=resolve_bounds(problem, occupation_bound=2.0 * problem.true_sup),
+        settings=LOOKING,
+        value=problem.exact_value,
     )
     assert certificate.assumptions.occupation_holds
     assert certificate.assumptions.estimated_sup_occupation == pytest.approx(problem.true_sup, rel=0.02)
@@ -186,7 +193,8 @@ def test_twice_sup_mu_is_believed():
 
 def test_an_unbounded_density_is_caught_without_being_told():
     problem = Hidden(0.8)
-    certificate = certified(problem, bounds=resolve_bounds(problem, occupation_bound=50.0), value=problem.exact_value)
+    bounds = resolve_bounds(problem, occupation_bound=50.0)
+    certificate = certified(problem, bounds=bounds, settings=LOOKING, value=problem.exact_value)
     assert not certificate.assumptions.occupation_holds
     assert certificate.to_dict()["assumptions"]["estimated_sup_occupation"] is None
 
@@ -204,4 +212,4 @@ class TooLarge(Manufactured):
 
 def test_a_declared_sup_mu_that_the_controller_exceeds_is_not_believed():
     problem = TooLarge(dim=1, contrast=0.9)
-    assert not certified(problem, value=problem.exact_value).assumptions.occupation_holds
+    assert not certified(problem, settings=LOOKING, value=problem.exact_value).assumptions.occupation_holds

@@ -88,20 +88,24 @@ def refined(
     coarse, _ = integrate(everything, steps // 2)
     result, end = integrate(everything, steps)
     change, factor = (result - coarse).abs(), torch.ones_like(result)
-    first = steps
+    taken, finest = torch.full(weights.shape, steps), AUDIT_FACTOR * steps
     for _ in range(MAX_DOUBLINGS):
         active = (change > tolerance).nonzero().squeeze(-1)
         if not len(active):
             break
         steps *= 2
         finer, end[active] = integrate(active, steps)
+        taken[active] = steps
         before = float((weights[active] * change[active]).sum())
         change[active], result[active] = (finer - result[active]).abs(), finer
         ratio = min(float((weights[active] * change[active]).sum()) / max(before, 1e-300), SLOWEST)
         factor[active] = max(1.0, ratio / (1.0 - ratio))
     picked = torch.randperm(len(weights), generator=generator)[:AUDITED]
-    again, _ = integrate(picked, max(AUDIT_FACTOR * first, steps))
-    missed = weights[picked] * (again - result[picked])
+    missed = torch.zeros_like(weights[picked])
+    rough = taken[picked] < finest
+    if rough.any():
+        rows = picked[rough]
+        missed[rough] = weights[rows] * (integrate(rows, finest)[0] - result[rows])
     noise = float(missed.std()) / math.sqrt(len(missed)) if len(missed) > 1 else 0.0
     unseen = abs(float(missed.mean())) + 2.0 * noise
     return result, end, float((weights * change * factor).mean()) + unseen
