@@ -4,6 +4,7 @@ from ocp_torch.control_cost import PowerCost
 from ocp_torch.controller import Controller, load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.problems import PROBLEMS, Circle, Manufactured, Problem, Torus
+from ocp_torch.training.given import certify
 
 __version__ = "0.1.0"
 __all__ = [
@@ -15,5 +16,6 @@ __all__ = [
     "PowerCost",
     "Problem",
     "Torus",
+    "certify",
     "load_controller",
 ]

@@ -60,6 +60,10 @@ class Samples:
         """The samples at the rows ``index``."""
         return Samples(**{k: None if v is None else v[index] for k, v in self._columns()})
 
+    def to(self, like: Tensor) -> Samples:
+        """The samples in the precision and on the device of ``like``."""
+        return Samples(**{k: None if v is None else v.to(like) for k, v in self._columns()})
+
     def split(self, chunk: int) -> list[Samples]:
         """The samples in pieces of at most ``chunk`` states."""
         rows = torch.arange(len(self), device=self.x.device).split(chunk)

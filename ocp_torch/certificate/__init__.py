@@ -1,7 +1,20 @@
 """Bounds, performances and what they assume; needs no trainer."""
 
 from ocp_torch.certificate.certificate import Certificate, Run, table
-from ocp_torch.certificate.certify import CertificateSettings, Trained, certify_fields, raised
+from ocp_torch.certificate.certify import Trained, certify_fields, in_float64, raised
+from ocp_torch.certificate.policy import certify_policy
+from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.stage import StageSettings
 
-__all__ = ["Certificate", "CertificateSettings", "Run", "StageSettings", "Trained", "certify_fields", "raised", "table"]
+__all__ = [
+    "Certificate",
+    "CertificateSettings",
+    "Run",
+    "StageSettings",
+    "Trained",
+    "certify_fields",
+    "certify_policy",
+    "in_float64",
+    "raised",
+    "table",
+]

@@ -1,4 +1,4 @@
-r"""The assumptions the bounds rest on, checked under the learned controller as far as that can be done."""
+r"""The assumptions the bounds rest on, held against what was met under the learned controller."""
 
 from __future__ import annotations
 
@@ -6,23 +6,42 @@ import math
 from dataclasses import asdict, dataclass, replace
 
 import torch
-from torch import Tensor
 
-from ocp_torch import calculus
 from ocp_torch.bounds import FROM_PROBLEM, Bounds
-from ocp_torch.certificate.simulation import discounted_integral
-from ocp_torch.control_laws import ControlLaw
+from ocp_torch.certificate.occupation import estimated_sup_occupation, occupation_along_flow
+from ocp_torch.certificate.regularity import Jump
+from ocp_torch.certificate.wellposed import WellPosed
 from ocp_torch.problems.problem import Problem
+
+__all__ = ["Assumptions", "Met", "check_assumptions", "estimated_sup_occupation", "occupation_along_flow"]
 
 # An estimated supremum may exceed a bound by so much before it contradicts it.
 TOLERANCE = 0.02
+# An M that somebody gave must be so much above the density met. Trained with an M that is too small, a controller does
+# not exceed it: the dual keeps its density just below, and F_M is then above OPT.
+CLEARANCE = 1.1
+# A sup mu* that a problem declares, but does not show to be exact, may be exceeded by an imperfect controller's density.
+DECLARED = 1.25
+
+
+@dataclass(frozen=True)
+class Met:
+    """What the checks met; `None` where it was not looked for."""
+
+    sup_occupation: float | None = None
+    a_priori_occupation: float | None = None  # >= sup mu^u, by the divergence of the closed loop
+    sup_control: float | None = None
+    largest_value: float | None = None  # V^u at a simulated start
+    jump: Jump | None = None
+    problem: WellPosed | None = None
 
 
 @dataclass(frozen=True)
 class Assumptions:
     """The constants used, what was estimated beside them, and whether every check passed.
 
-    ``occupation_holds`` and ``value_holds`` say which bounds stand: `F_M` needs the first, `J` and `G` the second.
+    The flags say which bounds stand: `F_M` needs ``occupation_holds``; `J` and `G` need ``value_holds`` and
+    ``cost_holds``; `J` and the Lagrangian bound ``regular_holds``; everything needs ``problem_holds``.
     """
 
     M: float | None
@@ -33,10 +52,18 @@ class Assumptions:
     occupation_holds: bool
     value_holds: bool
     control_holds: bool
+    regular_holds: bool = True
+    cost_holds: bool = True
+    problem_holds: bool = True
+    a_priori_sup_occupation: float | None = None
+    largest_value: float | None = None
+    largest_jump: float | None = None
+    smallest_state_cost: float | None = None
+    initial_mass: float | None = None
 
     @property
     def hold(self) -> bool:
-        return self.occupation_holds and self.value_holds and self.control_holds
+        return all(v for k, v in vars(self).items() if k.endswith("_holds"))
 
     def with_value_bound(self, C_V: float) -> Assumptions:
         """With a `C_V` that was proved for the controller at hand."""
@@ -49,84 +76,78 @@ class Assumptions:
         return {**finite, "hold": self.hold}
 
 
-def occupation_along_flow(problem: Problem, law: ControlLaw, x: Tensor, horizon: float, steps: int) -> Tensor:
-    r"""`mu^u(x) = rho int e^{-rho t} mu0(y_t) exp(-int_0^t div g(y_s) ds) dt` along `dy/dt = -g(y)`, `y_0 = x`; ``(N,)``.
-
-    The density of a flow changes by its divergence (the representation behind Proposition 8 of the paper); valid for a
-    Lipschitz closed loop `g = a + B u`. The logarithm of the second factor is carried as one more coordinate.
-    """
-    velocity = lambda y: problem.velocity(y, law(y))
-
-    def backward(state: Tensor) -> tuple[Tensor, Tensor]:
-        y, log_factor = state[:, :-1], state[:, -1]
-        spread = calculus.divergence(velocity, y)
-        motion = torch.cat([-velocity(y), -spread.unsqueeze(-1)], dim=-1)
-        return motion, problem.initial_density(y) * log_factor.clamp_max(60.0).exp()
-
-    start = torch.cat([x, x.new_zeros(len(x), 1)], dim=-1)
-    density, _ = discounted_integral(backward, start, problem.discount, horizon, steps)
-    return density
-
-
-def estimated_sup_occupation(problem: Problem, law: ControlLaw, end_states: Tensor, states: int) -> float:
-    """The largest `mu^u` met at the ends of trajectories, where mass accumulates, and at uniform states."""
-    count = max(1, 2 * states // 3)
-    picked = end_states[:: max(1, len(end_states) // count)][:count]
-    uniform = torch.rand(
-        states - len(picked), problem.dim, dtype=picked.dtype, generator=torch.Generator().manual_seed(0)
-    )
-    x = torch.cat([picked, uniform.to(picked.device)])
-    horizon = 8.0 / problem.discount
-    speed = float(problem.velocity(x, law(x)).norm(dim=-1).max())
-    steps = int(min(400, max(40, math.ceil(horizon * max(problem.discount / 0.2, speed / 0.05)))))
-    density = occupation_along_flow(problem, law, x, horizon, steps)
-    return float(density.nan_to_num(nan=math.inf).max())
-
-
 def check_assumptions(
-    problem: Problem,
-    bounds: Bounds,
-    occupation_estimate: float | None,
-    sup_control: float | None,
-    largest_value: float | None,
-    uses: tuple[bool, bool],
+    problem: Problem, bounds: Bounds, met: Met, uses: tuple[bool, bool]
 ) -> tuple[Assumptions, list[str]]:
-    """Hold what was measured against ``bounds``; ``uses`` says whether a lower and an upper side are in the certificate."""
+    """Hold what was ``met`` against ``bounds``; ``uses`` says whether a lower and an upper side are in the certificate."""
     uses_M, uses_C_V = uses
-    warnings: list[str] = []
-    M_holds, why = _occupation_holds(problem, bounds, occupation_estimate)
+    warnings = list(met.problem.warnings) if met.problem else []
+    M_holds, why = occupation_holds(problem, bounds, met)
     if uses_M and not M_holds:
         warnings.append(f"F_M is not used: {why}.")
-    value_holds = largest_value is None or largest_value <= bounds.C_V * (1.0 + 1e-3)
+    value_holds = met.largest_value is None or met.largest_value <= bounds.C_V * (1.0 + 1e-3)
     if uses_C_V and not value_holds:
         warnings.append(
-            f"J and G are not used: the controller's value reaches {largest_value:.4g}, above C_V = {bounds.C_V:.4g}."
+            f"J with C_V = {bounds.C_V:.4g} and G are not used: the controller's value reaches {met.largest_value:.4g}."
         )
-    control_holds = sup_control is None or sup_control <= bounds.C_u * (1.0 + TOLERANCE)
+    control_holds = met.sup_control is None or met.sup_control <= bounds.C_u * (1.0 + TOLERANCE)
     if not control_holds:
-        warnings.append(f"the control reaches {sup_control:.4g}, beyond C_u = {bounds.C_u:.4g}.")
+        warnings.append(f"the control reaches {met.sup_control:.4g}, beyond C_u = {bounds.C_u:.4g}.")
+    jumps = met.jump is not None and met.jump.size > 0.0
+    if jumps:
+        at = [round(c, 4) for c in met.jump.x[:6].tolist()] + (["..."] if len(met.jump.x) > 6 else [])
+        warnings.append(
+            f"J and the Lagrangian bound are not used: the controller jumps by {met.jump.size:.3g}, at x = {at} "
+            "for one, and they need one without jumps."
+        )
     assumptions = Assumptions(
         bounds.M if uses_M else None,
         bounds.C_V if uses_C_V else None,
         bounds.C_u,
-        occupation_estimate,
-        sup_control,
+        met.sup_occupation,
+        met.sup_control,
         occupation_holds=M_holds or not uses_M,
         value_holds=value_holds or not uses_C_V,
         control_holds=control_holds or not uses_C_V,
+        regular_holds=not jumps and (met.problem is None or met.problem.smooth_seam),
+        cost_holds=met.problem is None or met.problem.nonnegative,
+        problem_holds=met.problem is None or met.problem.sound,
+        a_priori_sup_occupation=met.a_priori_occupation,
+        largest_value=met.largest_value,
+        largest_jump=met.jump.size if met.jump else None,
+        smallest_state_cost=met.problem.smallest_cost if met.problem else None,
+        initial_mass=met.problem.mass if met.problem else None,
     )
     return assumptions, warnings
 
 
-def _occupation_holds(problem: Problem, bounds: Bounds, estimate: float | None) -> tuple[bool, str]:
-    true = problem.occupation_bound
+def occupation_holds(problem: Problem, bounds: Bounds, met: Met) -> tuple[bool, str]:
+    """Whether `M >= sup mu*` can be believed, and if not, why."""
+    true, estimate = problem.occupation_bound, met.sup_occupation
     if true is not None and math.isinf(true):
         return False, "mu* is unbounded for this problem, so no M is large enough"
-    if bounds.sources["M"] == FROM_PROBLEM:
+    point = torch.full((1, problem.dim), 0.5, dtype=torch.float64)
+    if true is not None and bounds.M >= true and problem.exact_occupation(point) is not None:
         return True, ""
+    mean = 1.0 if met.problem is None else met.problem.mass
+    if bounds.M < mean * (1.0 - 1e-6):
+        return False, f"M = {bounds.M:.4g} is below the mean of every occupation density, {mean:.4g}"
+    if bounds.sources["M"] != FROM_PROBLEM and true is not None and bounds.M < true * (1.0 - TOLERANCE):
+        return False, f"M = {bounds.M:.4g} is below this problem's sup mu*, {true:.4g}"
+    if estimate is None:
+        return True, ""
+    reached = f"the occupation density under the controller reaches about {estimate:.4g}"
+    if not math.isfinite(estimate):
+        return False, "the occupation density under the controller grows beyond all bounds, so no M can be believed"
     if true is not None and bounds.M >= true:
+        return estimate <= DECLARED * bounds.M, f"M = {bounds.M:.4g}, as the problem declares, but {reached}"
+    if met.a_priori_occupation is not None and bounds.M >= met.a_priori_occupation and not _jumps(met):
         return True, ""
-    largest = max(estimate or 0.0, true or 0.0)
-    if bounds.M * (1.0 + TOLERANCE) >= largest and (estimate is None or math.isfinite(estimate)):
-        return True, ""
-    return False, f"M = {bounds.M:.4g}, but the occupation density reaches about {largest:.4g}"
+    return (
+        estimate * CLEARANCE <= bounds.M,
+        f"M = {bounds.M:.4g}, but {reached}, and must stay clearly below M to say that M did not shape it",
+    )
+
+
+def _jumps(met: Met) -> bool:
+    return met.jump is not None and met.jump.size > 0.0

@@ -5,22 +5,27 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import nn
 
 from ocp_torch.bounds import ESTIMATED, Bounds
-from ocp_torch.certificate.assumptions import check_assumptions, estimated_sup_occupation
+from ocp_torch.certificate.assumptions import Met, check_assumptions
 from ocp_torch.certificate.certificate import Certificate, Run
-from ocp_torch.certificate.estimate import replicated_samples
+from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
+from ocp_torch.certificate.occupation import a_priori_sup_occupation, estimated_sup_occupation
 from ocp_torch.certificate.performance import Simulated, simulate_performance
+from ocp_torch.certificate.regularity import largest_jump
 from ocp_torch.certificate.rigorous import RigorousBound, proved_lower
+from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.sides import CHUNK, LowerSide, lower_side, upper_side
-from ocp_torch.certificate.stage import StageSettings, fit_closed_loop
-from ocp_torch.control_laws import CLOSED, control_laws, occupation_density, zero_law
-from ocp_torch.errors import require_flag, require_integer
+from ocp_torch.certificate.stage import fit_closed_loop
+from ocp_torch.certificate.wellposed import WellPosed, check_problem
+from ocp_torch.control_laws import CLOSED, ControlLaw, control_laws, occupation_density, zero_law
+from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.problem import Problem
@@ -33,27 +38,6 @@ BASELINE_PART = 4
 TANGENT_PART = 8
 # Head-room of an M that is estimated from the learned controller's occupation density.
 OCCUPATION_ROOM = 1.25
-
-
-@dataclass(frozen=True)
-class CertificateSettings:
-    """How much is spent on a certificate. Raises `InputError` on counts that cannot give a standard error."""
-
-    points: int = 32768  # states per replicate for the integrals and sampled suprema
-    replicates: int = 8  # independent randomised point sets behind each standard error
-    trajectories: int = 256  # simulated starts per replicate; 0 skips every simulation
-    ascents: int = 32  # local ascents from the worst sampled states
-    occupation_states: int = 144  # where the supremum of the occupation density is looked for; 0 skips it
-    rigorous: bool = False  # a lower bound proved over cells, in one and two dimensions: a second, or up to two minutes
-    stage: StageSettings = field(default_factory=StageSettings)  # the fit to the closed loop
-
-    def __post_init__(self) -> None:
-        require_integer("certificate.points", self.points, 1)
-        require_integer("certificate.replicates", self.replicates, 2)
-        require_integer("certificate.trajectories", self.trajectories, 0)
-        require_integer("certificate.ascents", self.ascents, 1)
-        require_integer("certificate.occupation_states", self.occupation_states, 0)
-        require_flag("certificate.rigorous", self.rigorous)
 
 
 @dataclass(frozen=True)
@@ -78,29 +62,22 @@ def certify_fields(
 
     Both controllers are simulated; the better one is handed out, and the certification stage speaks of that one.
     """
+    require_finite(trained.fields)
     fields, occupation = in_float64(trained.fields), trained.occupation
     seed, count = run.seed, settings.replicates
     has_value, has_density = fields.value is not None, fields.control_density is not None
     lower = None
+    part = max(TANGENT_PART, problem.dim // 2)
+    few = replicated_samples(problem, max(1, settings.points // part), count, seed, divergences=True)
     if has_value:
         sets = replicated_samples(problem, settings.points, count, seed, divergences=False)
         lower = lower_side(problem, fields.value, sets, bounds.M, settings.ascents)
-    part = max(TANGENT_PART, problem.dim // 2)
-    few = replicated_samples(problem, max(1, settings.points // part), count, seed, divergences=True)
     proved, proof_notes = proved_lower(problem, fields.value, lower) if settings.rigorous and lower else (None, [])
+    posed = check_problem(problem, sets if has_value else few)
     laws = control_laws(occupation, problem, fields, bounds)
-    simulated: dict[str, Simulated] = {}
-    zero = sup_control = sup_occupation = stage = None
+    simulated, zero = simulations(problem, laws, fields, lower, settings, seed)
+    stage = None
     warnings: list[str] = []
-    if settings.trajectories:
-        initial = lower.initial if lower else None
-        for name, law in laws.items():
-            simulated[name] = simulate_performance(
-                problem, law, settings.trajectories, count, seed, value=fields.value, initial=initial
-            )
-        zero = simulate_performance(
-            problem, zero_law(problem), max(2, settings.trajectories // BASELINE_PART), count, seed
-        ).perf
     finite = {name: s for name, s in simulated.items() if s.perf.finite}
     best = min(finite, key=lambda n: finite[n].perf.above, default=next(iter(laws)))
     J = G = None
@@ -116,28 +93,26 @@ def certify_fields(
     if settings.stage.steps:
         stage, notes = certification_stage(problem, trained, fields, bounds, settings, few, lower, best, seed)
         warnings += notes
-    with torch.no_grad():
-        sup_control = max(float(laws[best](samples.x[:4096]).norm(dim=-1).max()) for samples in few)
-        if best in finite and settings.occupation_states:
-            ends, states = finite[best].end_states, settings.occupation_states
-            sup_occupation = estimated_sup_occupation(problem, laws[best], ends, states)
+    met = measured(problem, laws[best], finite.get(best), few, posed, settings)
     if lower is not None:
-        bounds = raised(bounds, sup_occupation)
+        bounds = raised(bounds, met.sup_occupation)
         lower = replace(lower, M=bounds.M)
-    largest_value = finite[best].largest_value if best in finite else None
-    assumptions, notes = check_assumptions(
-        problem, bounds, sup_occupation, sup_control, largest_value, uses=(has_value, J is not None)
-    )
+    assumptions, notes = check_assumptions(problem, bounds, met, uses=(has_value, J is not None))
     warnings = list(bounds.warnings) + notes + warnings + proof_notes
     # J bounds the performance of w / mu and G that of w over the mu of Lemma 2: of nothing else.
     speaks = {"J": best == "density", "G": best == "density" and occupation == CLOSED and assumptions.value_holds}
+    if not assumptions.regular_holds:
+        # On a jump the divergence is not what the stage sees: a wrong number is not shown at all.
+        stage = None
     if stage is not None and not (speaks["J"] and assumptions.value_holds and J.value <= stage.J.value):
+        if J is not None and not assumptions.value_holds:
+            warnings.append(f"the J shown is that of the closed loop, with C_V = {stage.C_V:.4g} proved for it.")
         J, assumptions, speaks["J"] = stage.J, assumptions.with_value_bound(stage.C_V), True
     if G is not None and not speaks["G"]:
         warnings.append("G bounds OPT, but not the controller that is handed out: the gap does not use it.")
     perf = {name: simulated[name].perf if name in simulated else None for name in ("value", "density")}
     warnings += _plausibility(perf, zero)
-    return Certificate(
+    certificate = Certificate(
         run=run,
         exact=problem.exact_optimum,
         lower={
@@ -150,9 +125,60 @@ def certify_fields(
         baseline={"zero": zero},
         assumptions=assumptions,
         warnings=warnings,
-        searches=_searches(lower, stage, proved),
+        searches=searches_of(lower, stage, proved),
         speaks=speaks,
+        confidence=settings.confidence,
     )
+    return certificate.without_contradictions()
+
+
+def require_finite(fields: Fields) -> None:
+    """Raises `InputError` where weights are not: no number computed from them would mean anything."""
+    for name, network in fields.networks.items():
+        if not all(bool(torch.isfinite(p).all()) for p in network.parameters()):
+            raise InputError(f"the network for {name} holds weights that are not finite; there is nothing to certify.")
+
+
+def simulations(
+    problem: Problem,
+    laws: dict[str, ControlLaw],
+    fields: Fields,
+    lower: LowerSide | None,
+    settings: CertificateSettings,
+    seed: int,
+) -> tuple[dict[str, Simulated], Estimate | None]:
+    """Performance of each of ``laws``, and of doing nothing."""
+    if not settings.trajectories:
+        return {}, None
+    simulate = partial(
+        simulate_performance, problem, replicates=settings.replicates, seed=seed, horizon=settings.horizon
+    )
+    initial = lower.initial if lower else None
+    found = {
+        name: simulate(law, trajectories=settings.trajectories, value=fields.value, initial=initial)
+        for name, law in laws.items()
+    }
+    return found, simulate(zero_law(problem), trajectories=max(2, settings.trajectories // BASELINE_PART)).perf
+
+
+def measured(
+    problem: Problem,
+    law: ControlLaw,
+    simulated: Simulated | None,
+    sets: list[Samples],
+    posed: WellPosed,
+    settings: CertificateSettings,
+) -> Met:
+    """What the assumptions are held against, under the controller ``law``."""
+    with torch.no_grad():
+        sup_control = max(float(law(samples.x[:4096]).norm(dim=-1).max()) for samples in sets)
+    jump = largest_jump(law, problem.dim)
+    occupation = a_priori = None
+    if simulated is not None and settings.occupation_states:
+        occupation = estimated_sup_occupation(problem, law, simulated.end_states, settings.occupation_states)
+        a_priori = a_priori_sup_occupation(problem, law, sets[0].x[:4096])
+    largest_value = simulated.largest_value if simulated is not None else None
+    return Met(occupation, a_priori, sup_control, largest_value, jump, posed)
 
 
 def raised(bounds: Bounds, sup_occupation: float | None) -> Bounds:
@@ -193,7 +219,9 @@ def certification_stage(
     return closed_loop_bounds(loop, value, fitted.log_occupation, loop_sets, settings.ascents, kind, initial), []
 
 
-def _searches(lower: LowerSide | None, stage: ClosedLoopBounds | None, proved: RigorousBound | None) -> list[str]:
+def searches_of(
+    lower: LowerSide | None, stage: ClosedLoopBounds | None, proved: RigorousBound | None = None
+) -> list[str]:
     """How each supremum was found."""
     found = {f"sup Q of {lower.theta:.4g} V": lower.largest_slack} if lower else {}
     if stage is not None:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ocp_torch.certificate.student import t_factor
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samplers import evaluation_points
 from ocp_torch.samples import Samples
@@ -16,18 +17,23 @@ from ocp_torch.samples import Samples
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value, its standard error, and a bound on what averaging cannot remove (integration and truncation)."""
+    """A value, its standard error, and a bound on what averaging cannot remove (integration and truncation).
+
+    ``replicates`` is how many independent ones the standard error comes from; 0 where there is no sampling error.
+    """
 
     value: float
     se: float
     bias: float | None = None
     controller: str | None = None
+    replicates: int = 0
 
     @classmethod
     def of(cls, replicates: list[float], bias: float | None = None, controller: str | None = None) -> Estimate:
         """Mean and standard error of independent ``replicates``."""
         values = np.asarray(replicates, dtype=np.float64)
-        return cls(float(values.mean()), float(values.std(ddof=1) / math.sqrt(len(values))), bias, controller)
+        se = float(values.std(ddof=1) / math.sqrt(len(values)))
+        return cls(float(values.mean()), se, bias, controller, len(values))
 
     @property
     def finite(self) -> bool:
@@ -38,10 +44,21 @@ class Estimate:
         """The value with its bias and two standard errors on top: what a simulated upper side may claim."""
         return self.value + (self.bias or 0.0) + 2.0 * self.se
 
-    def to_dict(self) -> dict:
-        """JSON form: fields that do not apply are left out."""
+    def half_width(self, level: float) -> float:
+        """Half of the confidence interval at ``level``: Student's t times the standard error, and all of the bias."""
+        factor = t_factor(level, self.replicates - 1) if self.replicates > 1 else 0.0
+        return factor * self.se + (self.bias or 0.0)
+
+    def interval(self, level: float) -> tuple[float, float]:
+        """The two-sided confidence interval at ``level``, widened by the bias."""
+        half = self.half_width(level)
+        return self.value - half, self.value + half
+
+    def to_dict(self, level: float | None = None) -> dict:
+        """JSON form, with the interval at ``level`` if one is given; fields that do not apply are left out."""
         extra = {k: v for k, v in (("bias", self.bias), ("controller", self.controller)) if v is not None}
-        return {"value": self.value, "se": self.se, **extra}
+        interval = {} if level is None else {"interval": list(self.interval(level))}
+        return {"value": self.value, "se": self.se, **extra, **interval}
 
 
 @torch.no_grad()

@@ -39,6 +39,8 @@ class ClosedLoopBounds:
     eps_hi: Extremum
     eps_lo: Extremum
     residual: float  # E[|r|]
+    below: Estimate  # of Perf(u) from below: 2. with the signs turned
+    sandwich: tuple[Estimate, Estimate]  # E[V mu0] - eps_lo <= Perf(u) <= E[V mu0] + eps_hi, by 1. alone
 
 
 def closed_loop_bounds(
@@ -62,16 +64,27 @@ def closed_loop_bounds(
     eps_lo = _climbed(slack, slack_all, states, ascents)
     eps_hi = _climbed(lambda x: -slack(x), -slack_all, states, ascents)
     C_V = top.value + eps_hi.value
-    lagrangian, J, residual = [], [], []
+    lagrangian, below, J, residual, low, high = [], [], [], [], [], []
     for i, (samples, (v, spent, r, _)) in enumerate(zip(sets, values, strict=True)):
         gain, loss = r.clamp_min(0.0), (-r).clamp_min(0.0)
         started = integral(samples, v * samples.mu0) if initial is None else initial[i]
         lagrangian.append(started + integral(samples, eps_hi.value * gain + eps_lo.value * loss - spent))
+        below.append(started - integral(samples, eps_lo.value * gain + eps_hi.value * loss + spent))
+        mass = integral(samples, samples.mu0)
+        low.append(started - eps_lo.value * mass)
+        high.append(started + eps_hi.value * mass)
         J.append(started + integral(samples, C_V * gain - v * r - spent))
         residual.append(integral(samples, r.abs()))
     mean_residual = sum(residual) / len(residual)
     return ClosedLoopBounds(
-        Estimate.of(lagrangian, controller=controller), Estimate.of(J), C_V, eps_hi, eps_lo, mean_residual
+        Estimate.of(lagrangian, controller=controller),
+        Estimate.of(J),
+        C_V,
+        eps_hi,
+        eps_lo,
+        mean_residual,
+        Estimate.of(below),
+        (Estimate.of(low), Estimate.of(high)),
     )
 
 

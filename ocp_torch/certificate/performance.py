@@ -3,6 +3,9 @@ r"""`Perf(u) = E_{x0 ~ mu0} rho int e^{-rho t} (f + R(u)) dt` by simulation, wit
 For any smooth `V`, `V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt` exactly along the closed loop, with the Bellman slack
 `Q_u = V - f - R(u) - grad V . (a + B u) / rho`. So `Perf(u) = E[V mu0] - E int rho e^{-rho t} Q_u`, and what is left to
 simulate, with all its errors, is as small as `Q_u`.
+
+The infinite horizon is truncated, with the tail bounded; or each trajectory stops at a time `T ~ Exp(rho)` of its own,
+and `E[rate(x_T)]` is the discounted integral, without a tail.
 """
 
 from __future__ import annotations
@@ -16,27 +19,29 @@ from torch import Tensor
 from ocp_torch import calculus, formulas
 from ocp_torch.calculus import Field
 from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.certificate.simulation import Dynamics, discounted_integral
+from ocp_torch.certificate.settings import RANDOM, TRUNCATED
+from ocp_torch.certificate.simulation import Dynamics, discounted_integral, rate_at, refined
 from ocp_torch.control_laws import ControlLaw, ValueLaw
 from ocp_torch.problems.problem import Problem
-from ocp_torch.samplers import evaluation_points
+from ocp_torch.samplers import derive_seed, evaluation_points
 from ocp_torch.samples import Samples
 
 # Simulation sets come after those of the bounds in the stream of evaluation points.
 SIMULATION_REPLICATE = 1000
 # What is left of the discount when simulation stops, times the rate's supremum, relative to the answer.
 TAIL = 2e-5
+# Head-room on the rate's supremum, met at starts and ends, for the states after the end.
+RATE_ROOM = 2.0
 # A trajectory is refined until halving its step changes it by less, relative to the answer, or the budget is used.
 TOLERANCE = 5e-5
-MAX_DOUBLINGS = 4
 
 
 @dataclass(frozen=True)
 class Simulated:
-    """A performance, and what the trajectories showed: the largest value met at a start and the end states."""
+    """A performance, and what the trajectories showed: the largest value at a start (where known) and the end states."""
 
     perf: Estimate
-    largest_value: float
+    largest_value: float | None
     end_states: Tensor
 
 
@@ -57,6 +62,12 @@ def _dynamics(problem: Problem, law: ControlLaw, value: Field | None) -> Dynamic
     return dynamics
 
 
+def starting_points(trajectories: int, dim: int, replicates: int, seed: int) -> Tensor:
+    """The starts of all replicates, one after the other, ``(replicates * trajectories, dim)``."""
+    sets = [evaluation_points(trajectories, dim, SIMULATION_REPLICATE + r, seed) for r in range(replicates)]
+    return torch.cat(sets)
+
+
 def simulate_performance(
     problem: Problem,
     law: ControlLaw,
@@ -65,43 +76,43 @@ def simulate_performance(
     seed: int,
     value: Field | None = None,
     initial: list[float] | None = None,
+    horizon: str = TRUNCATED,
 ) -> Simulated:
-    """Perf of ``law`` from ``replicates`` independent sets of ``trajectories`` scrambled Sobol starts.
+    """Perf of ``law`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts.
 
     With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is
-    added. ``bias`` is the mean absolute change on halving the step, plus the rate's supremum along the trajectories
-    times the discount left at the horizon.
+    added. ``bias`` is the error of integration (`refined`) plus, where the ``horizon`` is truncated, the discount left
+    there times the rate's supremum as met along the trajectories, with head-room.
     """
     dim, rho = problem.dim, problem.discount
-    starts = [evaluation_points(trajectories, dim, SIMULATION_REPLICATE + r, seed) for r in range(replicates)]
-    x0 = torch.cat(starts)
+    random = horizon == RANDOM
+    points = starting_points(trajectories, dim + random, replicates, seed)
+    x0 = points[:, :dim]
     mu0 = problem.initial_density(x0)
     dynamics = _dynamics(problem, law, value)
     with torch.no_grad():
         velocity, rate = dynamics(x0)
         base = value(x0) if value is not None else torch.zeros_like(rate)
+    if not (torch.isfinite(velocity).all() and torch.isfinite(rate).all()):
+        return Simulated(Estimate(math.nan, math.nan), math.nan, x0)
     size = abs(sum(initial) / len(initial)) if initial else float((mu0 * rate).mean().abs())
     size = max(size, 1e-12)
-    largest_rate = 2.0 * float(rate.abs().max())
-    horizon = max(math.log(max(largest_rate / (TAIL * size), math.e)), 1.0) / rho
+    largest_rate = RATE_ROOM * float(rate.abs().max())
+    if random:
+        times = -torch.log1p(-points[:, dim]) / rho
+        longest = float(times.max())
+        integrate = lambda rows, count: rate_at(dynamics, x0[rows], rho, times[rows], count)
+    else:
+        longest = max(math.log(max(largest_rate / (TAIL * size), math.e)), 1.0) / rho
+        integrate = lambda rows, count: discounted_integral(dynamics, x0[rows], rho, longest, count)
     speed = float(velocity.norm(dim=-1).max())
-    steps = max(8, 2 * math.ceil(0.5 * horizon * max(rho / 0.4, speed / 0.2)))
-    integrate = lambda starts, count: discounted_integral(dynamics, starts, rho, horizon, count)
-    coarse, _ = integrate(x0, steps // 2)
-    fine, end = integrate(x0, steps)
-    change = (fine - coarse).abs()
-    for _ in range(MAX_DOUBLINGS):
-        # Only the trajectories that still change are refined: those that pass a kink of the controller.
-        active = change > TOLERANCE * size
-        if not active.any():
-            break
-        steps *= 2
-        finer, end[active] = integrate(x0[active], steps)
-        change[active], fine[active] = (finer - fine[active]).abs(), finer
-    halving = float((mu0 * change).mean())
-    with torch.no_grad():
-        largest_rate = max(largest_rate / 2.0, float(dynamics(end)[1].abs().max()))
-    tail = math.exp(-rho * horizon) * largest_rate
-    parts = (mu0 * fine).reshape(replicates, trajectories).mean(dim=1).tolist()
+    steps = max(8, 2 * math.ceil(0.5 * longest * max(rho / 0.4, speed / 0.2)))
+    generator = torch.Generator().manual_seed(derive_seed(seed, SIMULATION_REPLICATE))
+    result, end, bias = refined(integrate, mu0, steps, TOLERANCE * size, generator)
+    if not random:
+        with torch.no_grad():
+            largest_rate = max(largest_rate, RATE_ROOM * float(dynamics(end)[1].abs().max()))
+        bias += math.exp(-rho * longest) * largest_rate * float(mu0.mean())
+    parts = (mu0 * result).reshape(replicates, trajectories).mean(dim=1).tolist()
     totals = [part + (initial[r % len(initial)] if initial else 0.0) for r, part in enumerate(parts)]
-    return Simulated(Estimate.of(totals, bias=halving + tail), float((base + fine).max()), end)
+    return Simulated(Estimate.of(totals, bias=bias), None if random else float((base + result).max()), end)

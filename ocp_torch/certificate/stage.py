@@ -54,7 +54,7 @@ class StageSettings:
 def fit_closed_loop(
     problem: Problem,
     law: ControlLaw,
-    fields: Fields,
+    fields: Fields | None,
     network: Callable[..., torch.nn.Module],
     bounds: Bounds,
     settings: StageSettings,
@@ -62,17 +62,20 @@ def fit_closed_loop(
 ) -> Fields:
     """Fields with `log mu^u`, and with `V^u` where ``fields`` hold no `V`, of the closed loop of ``law``.
 
-    ``fields`` are the trained ones, ``law`` one of theirs in their precision; their `log mu`, if any, is the start.
+    ``fields`` are the trained ones, ``law`` one of theirs in their precision; their `log mu`, if any, is the start. With no
+    ``fields`` the law is somebody's own, in float64, and both `mu` and `V` are fitted in float32.
     """
-    like = next(fields.parameters())
+    like = torch.zeros(()) if fields is None else next(fields.parameters())
     loop = ClosedLoop(problem, law)
-    with_value = fields.value is None
+    with_value = fields is None or fields.value is None
     objective = PolicyEvaluation(loop, bounds, with_value)
     names = (LOG_OCCUPATION, VALUE) if with_value else (LOG_OCCUPATION,)
     fitted = Fields.build(problem, names, network, derive_seed(seed, STAGE_STREAM, 0)).to(like)
-    if fields.log_occupation is not None:
+    if fields is not None and fields.log_occupation is not None:
         fitted.log_occupation.load_state_dict(fields.log_occupation.state_dict())
-    pool = Pool(loop, derive_seed(seed, STAGE_STREAM, 1), derive_seed(seed, STAGE_STREAM, 2), like)
+    pool = Pool(
+        loop, derive_seed(seed, STAGE_STREAM, 1), derive_seed(seed, STAGE_STREAM, 2), like, double=fields is None
+    )
     draw = lambda: pool.draw(settings.batch)
     optimizer = optimizer_maker("soap", settings.lr, betas=(0.95, 0.95))
     makers = {player: optimizer for player in objective.players}
@@ -91,11 +94,16 @@ def fit_closed_loop(
 
 
 class Pool:
-    """Samples of a closed loop that are drawn from again and again, and grow when more are wanted."""
+    """Samples of a closed loop that are drawn from again and again, and grow when more are wanted.
 
-    def __init__(self, loop: ClosedLoop, states_seed: int, draws_seed: int, like: torch.Tensor) -> None:
-        self.loop, self.device = loop, like.device
-        self.states = UniformSampler(loop.dim, states_seed, like.dtype)
+    The loop is evaluated in float64 if ``double``; samples are kept in the precision and on the device of ``like``.
+    """
+
+    def __init__(
+        self, loop: ClosedLoop, states_seed: int, draws_seed: int, like: torch.Tensor, double: bool = False
+    ) -> None:
+        self.loop, self.like = loop, like
+        self.states = UniformSampler(loop.dim, states_seed, torch.float64 if double else like.dtype)
         self.picker = torch.Generator().manual_seed(draws_seed)
         self.samples: Samples | None = None
 
@@ -103,14 +111,14 @@ class Pool:
         """Fresh states up to ``count`` in all."""
         missing = count - (0 if self.samples is None else len(self.samples))
         if missing > 0:
-            fresh = self.states.draw(missing).to(self.device).split(CHUNK)
+            fresh = self.states.draw(missing).to(self.like.device).split(CHUNK)
             kept = [] if self.samples is None else [self.samples]
-            self.samples = Samples.concatenate([*kept, *(Samples.of(self.loop, x) for x in fresh)])
+            self.samples = Samples.concatenate([*kept, *(Samples.of(self.loop, x).to(self.like) for x in fresh)])
 
     def draw(self, count: int) -> Samples:
         """``count`` of them, with replacement."""
         index = torch.randint(len(self.samples), (count,), generator=self.picker)
-        return self.samples.take(index.to(self.device))
+        return self.samples.take(index.to(self.like.device))
 
 
 @torch.no_grad()

@@ -50,6 +50,7 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, fol
             kind = _hand_out(trainer, certificate, fields, folder)
             if trainer.settings.figures:
                 drawn = figures.draw(trainer.problem, fields, trainer.bounds, trainer.objective.occupation)
+                drawn["certificate"] = figures.interval(certificate.to_dict())
                 figures.save(drawn, folder / "figures")
                 monitor.figures(drawn, trainer.step)
             # Last, so that a start that was killed before this point leaves no points to be doubled.

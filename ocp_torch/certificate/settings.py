@@ -1,0 +1,36 @@
+"""How much is spent on a certificate, and how sure its intervals are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ocp_torch.certificate.stage import StageSettings
+from ocp_torch.errors import require_choice, require_flag, require_integer, require_number
+
+# How performance deals with the infinite horizon: stop late and bound the rest, or stop at an exponential time.
+TRUNCATED, RANDOM = "truncated", "random"
+
+
+@dataclass(frozen=True)
+class CertificateSettings:
+    """Effort and level of a certificate. Raises `InputError` on counts that cannot give a standard error."""
+
+    points: int = 32768  # states per replicate for the integrals and sampled suprema
+    replicates: int = 8  # independent randomised point sets behind each standard error
+    trajectories: int = 256  # simulated starts per replicate; 0 skips every simulation
+    ascents: int = 32  # local ascents from the worst sampled states
+    occupation_states: int = 144  # where the supremum of the occupation density is looked for; 0 skips it
+    rigorous: bool = False  # a lower bound proved over cells, in one and two dimensions: a second, or up to two minutes
+    confidence: float = 0.95  # how often an interval covers the truth, by Student's t over the replicates
+    horizon: str = TRUNCATED  # truncated: bounded tail in `bias`; random: an exponential time, no tail and more noise
+    stage: StageSettings = field(default_factory=StageSettings)  # the fit to the closed loop
+
+    def __post_init__(self) -> None:
+        require_integer("certificate.points", self.points, 1)
+        require_integer("certificate.replicates", self.replicates, 2)
+        require_integer("certificate.trajectories", self.trajectories, 0)
+        require_integer("certificate.ascents", self.ascents, 1)
+        require_integer("certificate.occupation_states", self.occupation_states, 0)
+        require_flag("certificate.rigorous", self.rigorous)
+        require_number("certificate.confidence", self.confidence, above=0.0, at_most=0.999999)
+        require_choice("certificate.horizon", self.horizon, (TRUNCATED, RANDOM))

@@ -1,0 +1,153 @@
+"""Certify a controller somebody brings: load it, train a `V` to judge it by, and put both into a certificate."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from ocp_torch.bounds import Bounds, resolve_bounds
+from ocp_torch.budgets import fill
+from ocp_torch.calculus import Field
+from ocp_torch.certificate import Certificate, CertificateSettings, Run, certify_policy, in_float64, table
+from ocp_torch.certificate.black_box import BlackBox
+from ocp_torch.config import build_certificate_settings, build_network, build_problem
+from ocp_torch.control_laws import ControlLaw, control_laws
+from ocp_torch.controller import Controller, problem_name
+from ocp_torch.errors import InputError, require_flag, require_integer
+from ocp_torch.fields import Fields
+from ocp_torch.fields.fields import VALUE
+from ocp_torch.objectives import Dual
+from ocp_torch.problems import Problem
+from ocp_torch.process import prepare
+from ocp_torch.samplers import UniformSampler, derive_seed
+from ocp_torch.samples import Samples
+from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
+from ocp_torch.training import figures
+from ocp_torch.training.loading import load_law, load_saved
+
+log = logging.getLogger(__name__)
+
+# Branch of the seed tree for the V trained here, beside those of runs, evaluation and the stage.
+JUDGE_STREAM = 4
+MODEL = {"name": "mlp", "modes": None, "width": None, "depth": 3, "activation": None, "gated": None}
+
+
+def certify(
+    problem: Problem,
+    controller: Callable | Controller,
+    value: Field | Controller | None = None,
+    settings: CertificateSettings | None = None,
+    seed: int = 0,
+    train_steps: int | None = None,
+) -> Certificate:
+    """What ``controller`` costs on ``problem``, and how far from optimal it can be.
+
+    ``controller`` maps states ``(N, d)`` in the unit cell to controls ``(N, m)``: any function of tensors or arrays, or a
+    `Controller` of ours. ``value`` is a `V` to judge it by, ``(N, d) -> (N,)`` and smooth, or a `Controller` that holds
+    one; where it is `None` one is trained by the dual, for ``train_steps`` (default: by dimension; 0 for none, and then
+    there is no lower bound). Raises `InputError` where the controller or the value fails.
+    """
+    require_integer("seed", seed, 0)
+    defaults = fill({"model": dict(MODEL), "trainer": {}, "optimizer": {}, "certificate": {}}, problem)
+    settings = settings or build_certificate_settings(defaults)
+    bounds = resolve_bounds(problem)
+    network = build_network(defaults["model"])
+    law = law_of(controller, problem)
+    steps = defaults["trainer"]["steps"] if train_steps is None else require_integer("train_steps", train_steps, 0)
+    run = Run(problem_name(problem), "given", seed)
+    if value is None and steps:
+        batch, lr = defaults["trainer"]["batch"], defaults["optimizer"]["lr"]
+        value = in_float64(train_value(problem, bounds, network, steps, batch, lr, seed)).value
+        run = Run(problem_name(problem), "given", seed, steps, steps * batch)
+    elif value is not None:
+        value = value_of(value, problem)
+    return certify_policy(problem, law, value, network, bounds, settings, run)
+
+
+def train_value(
+    problem: Problem,
+    bounds: Bounds,
+    network: Callable[..., nn.Module],
+    steps: int,
+    batch: int,
+    lr: float,
+    seed: int,
+) -> Fields:
+    """A `V` by the dual, with the defaults of a run."""
+    fields = Fields.build(problem, (VALUE,), network, derive_seed(seed, JUDGE_STREAM, 0))
+    objective = Dual(problem, bounds)
+    sampler = UniformSampler(problem.dim, derive_seed(seed, JUDGE_STREAM, 1), torch.float32)
+    draw = lambda: Samples.of(problem, sampler.draw(batch), divergences=False)
+    makers = {player: optimizer_maker("soap", lr, betas=(0.95, 0.95)) for player in objective.players}
+    stepper = Simultaneous(fields, objective, makers, schedule_maker("cosine", steps))
+    average = averaged(fields, decay=0.98)
+    for _ in range(steps):
+        stepper.step(draw, lambda: average.update_parameters(fields))
+    return average.module
+
+
+def law_of(controller: Callable | Controller, problem: Problem) -> ControlLaw:
+    """A law in float64: the networks of a `Controller` of ours, or a `BlackBox` around anything else."""
+    if not isinstance(controller, Controller):
+        return BlackBox(controller, problem)
+    if (controller.problem.dim, controller.problem.control_dim) != (problem.dim, problem.control_dim):
+        raise InputError(
+            f"the controller is for d = {controller.problem.dim} and m = {controller.problem.control_dim}, "
+            f"but the problem has d = {problem.dim} and m = {problem.control_dim}."
+        )
+    fields = in_float64(controller.fields)
+    return control_laws(controller.occupation, controller.problem, fields, controller.bounds)[controller.kind]
+
+
+def value_of(value: Field | Controller, problem: Problem) -> Field:
+    """`V` in float64, tried on a few states."""
+    if isinstance(value, Controller):
+        if value.fields.value is None:
+            raise InputError("value is a controller without V; give one trained by dual or pd.")
+        value = in_float64(value.fields).value
+    elif isinstance(value, nn.Module):
+        value = in_float64(value)
+    x = torch.full((2, problem.dim), 0.25, dtype=torch.float64)
+    try:
+        out = value(x)
+    except Exception as error:  # whatever a stranger's code may raise
+        raise InputError(f"value raised {type(error).__name__}: {error}.") from None
+    if not isinstance(out, Tensor) or out.shape != (2,) or not bool(torch.isfinite(out).all()):
+        shape = tuple(getattr(out, "shape", ()))
+        raise InputError(f"value gave {shape} for states (2, {problem.dim}), but must give finite numbers (N,).")
+    return value
+
+
+def read(config: dict) -> dict:
+    """The arguments of `certify` that the plain ``config`` of the command line names; only it may name code to run."""
+    problem = build_problem(config["problem"])
+    filled = fill({"model": dict(MODEL), "trainer": {}, "optimizer": {}, "certificate": config["certificate"]}, problem)
+    train = require_flag("train", config["train"])
+    if config["steps"] is not None:
+        require_integer("steps", config["steps"], 1)
+    controller = load_law(config["controller"], problem)
+    law_of(controller, problem)
+    value = None if config["value"] is None else load_saved(Path(str(config["value"])), problem)
+    return {
+        "problem": problem,
+        "controller": controller,
+        "value": value,
+        "settings": build_certificate_settings(filled),
+        "seed": require_integer("seed", config["seed"], 0),
+        "train_steps": config["steps"] if train else 0,
+    }
+
+
+def certify_configured(config: dict, folder: Path) -> Certificate:
+    """Certify what ``config`` names; print the table and leave `certificate.json` and its figure in ``folder``."""
+    prepare(1)
+    certificate = certify(**read(config))
+    certificate.save(folder / "certificate.json")
+    figures.save({"certificate": figures.interval(certificate.to_dict())}, folder / "figures")
+    log.info("\n%s", table(certificate.to_dict(), certificate.searches))
+    log.info("in %s", folder)
+    return certificate

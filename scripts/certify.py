@@ -1,0 +1,23 @@
+"""Certify any controller: python scripts/certify.py problem=circle controller=mine.py:u (--help for all fields)."""
+
+from __future__ import annotations
+
+import hydra
+from omegaconf import DictConfig
+
+from ocp_torch.launch import finish, job, launch
+from ocp_torch.training.given import certify_configured, read
+
+
+def certify(config: dict, folder) -> None:
+    certify_configured(config, folder)
+
+
+@hydra.main(version_base="1.3", config_path="../configs", config_name="certify")
+def main(config: DictConfig) -> None:
+    job(certify, config)
+
+
+if __name__ == "__main__":
+    launch(main, "certify", read)
+    finish()
