@@ -1,4 +1,6 @@
-"""Derivatives of networks at a batch of states: gradients by one reverse pass, directional derivatives by forward mode.
+"""Derivatives of networks at a batch of states, by one reverse pass for each output.
+
+Forward mode would need one pass for each direction, but runs PyTorch's operators through Python, at several times the cost.
 
 A field is any callable `(N, d) -> (N,)` or `(N, d) -> (N, m)` whose rows do not depend on one another. Everything here
 is differentiable again with respect to the field's parameters, and only networks are ever differentiated: the
@@ -25,23 +27,27 @@ def value_and_gradient(field: Field, x: Tensor) -> tuple[Tensor, Tensor]:
     return value, gradient
 
 
+def value_and_jacobian(field: Field, x: Tensor) -> tuple[Tensor, Tensor]:
+    """`w(x)` ``(N, m)`` and its Jacobian ``(m, N, d)``."""
+    value, pullback = torch.func.vjp(field, x)
+    basis = torch.eye(value.shape[1], dtype=value.dtype, device=value.device).unsqueeze(1).expand(-1, len(x), -1)
+    (jacobian,) = torch.func.vmap(pullback)(basis)
+    return value, jacobian
+
+
 def directional_derivative(field: Field, x: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """`field(x)` and its derivative along ``direction`` ``(N, d)``, both of the field's own shape."""
-    return torch.func.jvp(field, (x,), (direction,))
+    """`V(x)` and its derivative along ``direction`` ``(N, d)``, both ``(N,)``."""
+    value, gradient = value_and_gradient(field, x)
+    return value, (gradient * direction).sum(dim=-1)
 
 
 def control_flux_divergence(control_density: Field, x: Tensor, B: Tensor, div_B: Tensor) -> tuple[Tensor, Tensor]:
-    r"""`w` ``(N, m)`` and `div(B w) = (div B) . w + sum_k (d w_k along column k of B)` ``(N,)``: `m` forward tangents."""
-    columns = B.permute(2, 0, 1)
-    w, tangents = torch.func.vmap(
-        lambda column: directional_derivative(control_density, x, column), out_dims=(None, 0)
-    )(columns)
-    along = torch.diagonal(tangents, dim1=0, dim2=2).sum(dim=-1)
-    return w, (div_B * w).sum(dim=-1) + along
+    r"""`w` ``(N, m)`` and `div(B w) = (div B) . w + sum_k (d w_k along column k of B)` ``(N,)``."""
+    w, jacobian = value_and_jacobian(control_density, x)
+    return w, (div_B * w).sum(dim=-1) + torch.einsum("mnd,ndm->n", jacobian, B)
 
 
 def divergence(vector_field: Field, x: Tensor) -> Tensor:
-    """`div v(x)` ``(N,)`` of a field ``(N, d) -> (N, d)``, by `d` forward tangents."""
-    basis = torch.eye(x.shape[1], dtype=x.dtype, device=x.device).unsqueeze(1).expand(-1, x.shape[0], -1)
-    tangents = torch.func.vmap(lambda e: directional_derivative(vector_field, x, e)[1])(basis)
-    return torch.diagonal(tangents, dim1=0, dim2=2).sum(dim=-1)
+    """`div v(x)` ``(N,)`` of a field ``(N, d) -> (N, d)``."""
+    _, jacobian = value_and_jacobian(vector_field, x)
+    return torch.diagonal(jacobian, dim1=0, dim2=2).sum(dim=-1)

@@ -35,9 +35,16 @@ def test_value_and_gradient_of_a_network(d, device):
     torch.testing.assert_close(gradient, partials(network, x), **TOLERANCE)
 
 
-@pytest.mark.parametrize("outputs", [None, 3])
-def test_directional_derivative_of_a_network(outputs, device):
+@pytest.mark.parametrize("outputs", [1, 3])
+def test_value_and_jacobian_of_a_network(outputs, device):
     network, x = zoo.rough_network(2, seed=1, outputs=outputs).to(device), uniform(2, device=device)
+    value, jacobian = calculus.value_and_jacobian(network, x)
+    torch.testing.assert_close(value, network(x))
+    torch.testing.assert_close(jacobian.movedim(0, 1), partials(network, x), **TOLERANCE)
+
+
+def test_directional_derivative_of_a_network(device):
+    network, x = zoo.rough_network(2, seed=1).to(device), uniform(2, device=device)
     direction = uniform(2, seed=9, device=device) - 0.5
     value, derivative = calculus.directional_derivative(network, x, direction)
     torch.testing.assert_close(value, network(x))
@@ -70,11 +77,11 @@ def test_everything_is_differentiable_again_in_the_parameters(device):
 
     def number():
         value, gradient = calculus.value_and_gradient(first, x)
-        _, derivative = calculus.directional_derivative(network, x, x)
+        _, derivative = calculus.directional_derivative(first, x, x)
         _, flux = calculus.control_flux_divergence(network, x, B, torch.ones_like(x))
         squares = [
             gradient.square().sum(-1),
-            derivative.square().sum(-1),
+            derivative**2,
             flux**2,
             calculus.divergence(network, x) ** 2,
         ]
@@ -105,7 +112,7 @@ def test_divergences_of_the_problem_are_those_of_finite_differences(problem):
 
 @pytest.mark.parametrize("name", zoo.ALL)
 def test_single_precision_stays_single_and_agrees_with_double(name, device):
-    """Also when its very first evaluation is inside a forward-mode derivative."""
+    """Also when its very first evaluation is inside a derivative."""
     problem = zoo.fresh(name)
     x = zoo.states(problem, N, off_kinks=True).to(device, torch.float32)
     div_a, div_B = problem.drift_divergence(x), problem.control_divergence(x)

@@ -90,6 +90,12 @@ class Certificate:
         }
 
     @property
+    def plain_gap(self) -> float | None:
+        """The simulated gap as measured, without bias and standard errors on top: to decide by, not to claim."""
+        best = self.best_perf
+        return None if best is None else _relative_gap(self.best_lower, (best[0], self.perf[best[0]].value))
+
+    @property
     def suboptimality(self) -> dict:
         """How much more than `OPT` the controller costs, relative to it: ``at_least`` and ``at_most``, jointly at the
         level of ``confidence`` (the level of each interval that enters is raised accordingly); `None` where unknown."""

@@ -151,7 +151,12 @@ def simulations(
     if not settings.trajectories:
         return {}, None
     simulate = partial(
-        simulate_performance, problem, replicates=settings.replicates, seed=seed, horizon=settings.horizon
+        simulate_performance,
+        problem,
+        replicates=settings.replicates,
+        seed=seed,
+        horizon=settings.horizon,
+        tolerance=settings.tolerance,
     )
     initial = lower.initial if lower else None
     found = {

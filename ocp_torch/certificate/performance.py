@@ -19,7 +19,7 @@ from torch import Tensor
 from ocp_torch import calculus, formulas
 from ocp_torch.calculus import Field
 from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.certificate.settings import RANDOM, TRUNCATED
+from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
 from ocp_torch.certificate.simulation import Dynamics, discounted_integral, rate_at, refined
 from ocp_torch.control_laws import ControlLaw, ValueLaw
 from ocp_torch.problems.problem import Problem
@@ -32,8 +32,6 @@ SIMULATION_REPLICATE = 1000
 TAIL = 2e-5
 # Head-room on the rate's supremum, met at starts and ends, for the states after the end.
 RATE_ROOM = 2.0
-# A trajectory is refined until halving its step changes it by less, relative to the answer, or the budget is used.
-TOLERANCE = 5e-5
 
 
 @dataclass(frozen=True)
@@ -77,12 +75,14 @@ def simulate_performance(
     value: Field | None = None,
     initial: list[float] | None = None,
     horizon: str = TRUNCATED,
+    tolerance: float = CertificateSettings.tolerance,
 ) -> Simulated:
     """Perf of ``law`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts.
 
     With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is
-    added. ``bias`` is the error of integration (`refined`) plus, where the ``horizon`` is truncated, the discount left
-    there times the rate's supremum as met along the trajectories, with head-room.
+    added. Steps are halved until a trajectory changes by less than ``tolerance``, relative to the answer. ``bias`` is the
+    error of integration (`refined`) plus, where the ``horizon`` is truncated, the discount left there times the rate's
+    supremum as met along the trajectories, with head-room.
     """
     dim, rho = problem.dim, problem.discount
     random = horizon == RANDOM
@@ -108,7 +108,7 @@ def simulate_performance(
     speed = float(velocity.norm(dim=-1).max())
     steps = max(8, 2 * math.ceil(0.5 * longest * max(rho / 0.4, speed / 0.2)))
     generator = torch.Generator().manual_seed(derive_seed(seed, SIMULATION_REPLICATE))
-    result, end, bias = refined(integrate, mu0, steps, TOLERANCE * size, generator)
+    result, end, bias = refined(integrate, mu0, steps, tolerance * size, generator)
     if not random:
         with torch.no_grad():
             largest_rate = max(largest_rate, RATE_ROOM * float(dynamics(end)[1].abs().max()))

@@ -58,7 +58,7 @@ def certify_policy(
     if settings.stage.steps and evaluated is None:
         warnings.append("no bound on Perf without simulation: this problem gives no divergences of a and B.")
     simulate = lambda law, number, value=None, initial=None: simulate_performance(
-        problem, law, number, count, seed, value, initial, settings.horizon
+        problem, law, number, count, seed, value, initial, settings.horizon, settings.tolerance
     )
     number, perf, zero, given, best = settings.trajectories, {}, None, None, None
     lower = lower_side(problem, value, wide, bounds.M, ascents) if value is not None else None

@@ -22,6 +22,7 @@ class CertificateSettings:
     occupation_states: int = 144  # where the supremum of the occupation density is looked for; 0 skips it
     rigorous: bool = False  # a lower bound proved over cells, in one and two dimensions: a second, or up to two minutes
     confidence: float = 0.95  # how often an interval covers the truth, by Student's t over the replicates
+    tolerance: float = 5e-5  # relative; a trajectory's steps are halved until its cost changes by less
     horizon: str = TRUNCATED  # truncated: bounded tail in `bias`; random: an exponential time, no tail and more noise
     stage: StageSettings = field(default_factory=StageSettings)  # the fit to the closed loop
 
@@ -33,4 +34,5 @@ class CertificateSettings:
         require_integer("certificate.occupation_states", self.occupation_states, 0)
         require_flag("certificate.rigorous", self.rigorous)
         require_number("certificate.confidence", self.confidence, above=0.0, at_most=0.999999)
+        require_number("certificate.tolerance", self.tolerance, above=0.0)
         require_choice("certificate.horizon", self.horizon, (TRUNCATED, RANDOM))

@@ -20,6 +20,8 @@ Integrate = Callable[[Tensor, int], tuple[Tensor, Tensor]]
 # How often steps are halved at most, and the slowest decay of the changes that is extrapolated.
 MAX_DOUBLINGS = 4
 SLOWEST = 0.8
+# The mean change, as a part of the tolerance for one trajectory, at which nothing needs to be refined.
+GOOD_PART = 0.1
 # The trajectories looked at again, blindly, with steps at least so many times finer than at first.
 AUDITED, AUDIT_FACTOR = 64, 4
 
@@ -79,8 +81,8 @@ def refined(
 ) -> tuple[Tensor, Tensor, float]:
     r"""Results and end states of all trajectories, and a bound on the error of the results' mean by ``weights`` ``(N,)``.
 
-    Trajectories that still change by more than ``tolerance`` on halving the step are halved again: those that cross a
-    jump or a kink of the controller, or slide along one. The error has three parts: the last change of each trajectory;
+    While the mean change is above a tenth of ``tolerance``, trajectories that still change by more than ``tolerance`` on
+    halving the step are halved again: those that cross a jump or a kink of the controller, or slide along one. The error has three parts: the last change of each trajectory;
     what its slow decay leaves to come (`r/(1-r)` of it, at ratio `r`: a jump makes the order 1, not 4); and, because a
     trajectory may agree with itself by missing a feature twice, what a random few of all of them change on far finer steps.
     """
@@ -91,7 +93,7 @@ def refined(
     taken, finest = torch.full(weights.shape, steps), AUDIT_FACTOR * steps
     for _ in range(MAX_DOUBLINGS):
         active = (change > tolerance).nonzero().squeeze(-1)
-        if not len(active):
+        if not len(active) or float((weights * change * factor).mean()) <= GOOD_PART * tolerance:
             break
         steps *= 2
         finer, end[active] = integrate(active, steps)

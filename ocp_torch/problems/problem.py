@@ -73,7 +73,7 @@ class Problem:
         return type(self).drift is Problem.drift
 
     def drift_divergence(self, x: Tensor) -> Tensor | None:
-        """`div a`, ``(N,)``: by forward-mode autograd through `drift`. Override where it is known, or give `None`."""
+        """`div a`, ``(N,)``: by autograd through `drift`. Override where it is known, or give `None`."""
         if self.driftless:
             return torch.zeros_like(x[:, 0])
         return calculus.divergence(self.drift, x)
@@ -83,7 +83,7 @@ class Problem:
         if type(self).control_matrix is Problem.control_matrix:
             return x.new_zeros(len(x), self.control_dim)
         basis = torch.eye(self.dim, dtype=x.dtype, device=x.device)
-        along = lambda e: calculus.directional_derivative(self.control_matrix, x, e.expand_as(x))[1]
+        along = lambda e: torch.func.jvp(self.control_matrix, (x,), (e.expand_as(x),))[1]
         tangents = torch.func.vmap(along)(basis)  # (d, N, d, m): derivative of B along coordinate i
         return torch.einsum("inim->nm", tangents)
 

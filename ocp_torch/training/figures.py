@@ -22,7 +22,7 @@ from ocp_torch.samplers import derive_seed, evaluation_points
 
 LINE_POINTS, MAP_POINTS = 400, 80
 # Of the simulated occupation density: bins a coordinate by dimension, starts, steps of a trajectory, branch of the seeds.
-BINS, STARTS, FIGURE_STEPS, FIGURE_STREAM = {1: 50, 2: 20}, 4096, 48, 5
+BINS, STARTS, FIGURE_STEPS, FIGURE_STREAM = {1: 50, 2: 20}, 2048, 16, 5
 TITLES = {
     "value": "V",
     "control_value": "u from V",
