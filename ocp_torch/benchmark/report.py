@@ -35,8 +35,8 @@ def table(curves: list[Curve], exact: float | None) -> str:
     optimum, what = reference(curves, exact)
     off = lambda number: 100.0 * (number / optimum - 1.0)
     lines = [
-        f"Per cent are relative to {what} = {optimum:.8g}; the gap is that of the full certificate at the end, relative to the "
-        "lower bound; seconds are CPU seconds of training, those of the certificate after the sign +.",
+        f"Per cent are relative to {what} = {optimum:.8g}; the gap is that of the full certificate at the end, relative "
+        "to the lower bound; seconds are CPU seconds of training, those of the certificate after the sign +.",
         "",
         "| contender | samples | seconds | F_M | J | G | Perf | gap, certified | 1 % on Perf after samples | seconds |",
         "|---|---|---|---|---|---|---|---|---|---|",

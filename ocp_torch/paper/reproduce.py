@@ -77,7 +77,7 @@ def report(
 ) -> str:
     """The numbers as Markdown: what was found, beside what an independent re-implementation of the paper found."""
     lines = [
-        f"Circle, rho = 2, M = 2, C_V = 2; regularity 2, {modes} modes; averaged iterates; seeds {', '.join(map(str, seeds))}.",
+        f"Circle, rho = 2, M = 2, C_V = 2; regularity 2, {modes} modes; averages; seeds {', '.join(map(str, seeds))}.",
         "Per cent above (+) or below (-) OPT: median [smallest, largest] over seeds.",
         "",
         "| method | steps | number | here | re-implementation |",
