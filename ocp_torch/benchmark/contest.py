@@ -14,9 +14,10 @@ from ocp_torch.benchmark.environment import require_rl
 from ocp_torch.benchmark.kernels import KernelContender
 from ocp_torch.benchmark.measure import Judge
 from ocp_torch.benchmark.networks import NetworkContender
-from ocp_torch.benchmark.report import save
+from ocp_torch.benchmark.report import plot, save
 from ocp_torch.benchmark.rl import RLContender
 from ocp_torch.bounds import Bounds, resolve_bounds
+from ocp_torch.budgets import fill
 from ocp_torch.certificate import CertificateSettings
 from ocp_torch.config import build_certificate_settings, build_problem, build_trainer
 from ocp_torch.errors import InputError, call, require_choice, require_integer, require_section
@@ -67,13 +68,8 @@ def build(config: dict) -> tuple[Problem, Bounds, list, list[int], CertificateSe
         log.info("kernel_primal is left out: Lemma 2 needs a problem without drift.")
         names = [name for name in names if name != "kernel_primal"]
     made = [contender(name, config, problem, bounds) for name in names]
-    trainer = build_trainer({**NetworkContender(_any_network(config)).config, "seed": 0})
-    return problem, bounds, made, seeds, build_certificate_settings(trainer.config)
-
-
-def _any_network(config: dict) -> dict:
     training = {group: config[group] for group in TRAINING}
-    return {"problem": config["problem"], "method": config["methods"]["dual"], **training}
+    return problem, bounds, made, seeds, build_certificate_settings(fill(training, problem))
 
 
 def contest(config: dict, folder: Path, say: Callable[[str], None] = log.info) -> list[Curve]:
@@ -88,5 +84,6 @@ def contest(config: dict, folder: Path, say: Callable[[str], None] = log.info) -
                 curves.append(made.run(seed, judge, certificate))
                 text = save(curves, problem.exact_optimum, folder)
                 bar.update()
+    plot(curves, problem.exact_optimum).savefig(folder / "benchmark.png", dpi=130)
     say(f"\n{text}\n\nwritten to {folder}")
     return curves

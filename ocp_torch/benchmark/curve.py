@@ -52,7 +52,7 @@ class Curve:
         return reached
 
 
-def due(first: int, per_decade: int = 6):
+def due(first: int, per_decade: int = 4):
     """Sample counts at which to look: ``first``, and then ``per_decade`` for each factor of ten, without end."""
     k, last = 0, 0
     while True:

@@ -49,7 +49,7 @@ class KernelContender:
         iteration = Iteration(self.problem, self.method, self.bounds, (seed,), features=features)
         sizes = step_sizes(self.step, self.longest, SCHEDULE[self.method])
         points, spent = [], 0.0
-        for count in due(200):
+        for count in due(500):
             stop = min(count, self.longest)
             while iteration.n < stop and spent < self.seconds:
                 started = time.process_time()

@@ -111,12 +111,11 @@ def draw(axis, curves: list[Curve], place, height, color: str, name: str) -> Non
 
 
 def save(curves: list[Curve], exact: float | None, folder: Path) -> str:
-    """Write `benchmark.md`, `benchmark.png` and `curves.json`; returns the table."""
+    """Write `benchmark.md` and `curves.json`; returns the table."""
     folder.mkdir(parents=True, exist_ok=True)
     text = table(curves, exact)
     (folder / "benchmark.md").write_text(text + "\n")
     (folder / "curves.json").write_text(json.dumps([asdict(c) for c in curves], indent=1, default=float) + "\n")
-    plot(curves, exact).savefig(folder / "benchmark.png", dpi=130)
     return text
 
 

@@ -94,7 +94,9 @@ def iterates(history: History) -> Figure:
     figure, axes = _figure(2, len(titles) // 2)
     for axis, title in zip(axes, titles, strict=True):
         for k, (n, drawn) in enumerate(curves.items()):
-            axis.plot(x, drawn[title], color=str(0.8 - 0.8 * k / max(1, len(curves) - 1)), label=f"n = {n:,}")
+            axis.plot(
+                x, drawn[title], color=(max(0.0, 0.8 - 0.8 * k / max(1, len(curves) - 1)),) * 3, label=f"n = {n:,}"
+            )
         axis.plot(x, exact[title], "r:", linewidth=2.0, label="exact")
         axis.set(title=title, xlabel="x")
     axes[0].legend(fontsize=8)

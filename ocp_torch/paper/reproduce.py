@@ -52,11 +52,6 @@ def reproduce(config: dict, folder: Path) -> None:
             bar.update(exact[name])
             measured[name] = cost_per_step(recipe, exact[name], modes, max(1, exact[name] // 10))
             bar.update(exact[name])
-    for name, history in histories.items():
-        drawn |= {f"{name}_performance": figures.evolution(history), f"{name}_iterates": figures.iterates(history)}
-    drawn["cost_per_step"] = figures.costs(measured)
-    for name, figure in drawn.items():
-        figure.savefig(folder / "figures" / f"{name}.png", dpi=130)
     text = report(histories, agreements, measured, seeds, modes) + f"\nIn all {time.perf_counter() - started:.0f} s.\n"
     (folder / "numbers.md").write_text(text)
     record = {
@@ -65,6 +60,11 @@ def reproduce(config: dict, folder: Path) -> None:
         "cost_per_step": measured,
     }
     (folder / "numbers.json").write_text(json.dumps(record, indent=1) + "\n")
+    for name, history in histories.items():
+        drawn |= {f"{name}_performance": figures.evolution(history), f"{name}_iterates": figures.iterates(history)}
+    drawn["cost_per_step"] = figures.costs(measured)
+    for name, figure in drawn.items():
+        figure.savefig(folder / "figures" / f"{name}.png", dpi=130)
     log.info("\n%s\nwritten to %s", text, folder)
 
 
