@@ -58,6 +58,9 @@ def fill(config: dict, problem: Problem) -> dict:
         ("certificate", "stage", "steps"): budget.stage_steps,
     }
     for (*path, name), value in defaults.items():
+        # The table's sizes are those of perceptrons; a linear model chooses its own.
+        if path == ["model"] and config["model"].get("name") == "sobolev":
+            continue
         section = filled
         for depth, key in enumerate(path, start=1):
             require_section(".".join(path[:depth]), section.setdefault(key, {}))

@@ -82,9 +82,10 @@ def refined(
     r"""Results and end states of all trajectories, and a bound on the error of the results' mean by ``weights`` ``(N,)``.
 
     While the mean change is above a tenth of ``tolerance``, trajectories that still change by more than ``tolerance`` on
-    halving the step are halved again: those that cross a jump or a kink of the controller, or slide along one. The error has three parts: the last change of each trajectory;
-    what its slow decay leaves to come (`r/(1-r)` of it, at ratio `r`: a jump makes the order 1, not 4); and, because a
-    trajectory may agree with itself by missing a feature twice, what a random few of all of them change on far finer steps.
+    halving the step are halved again: those that cross a jump or a kink of the controller, or slide along one. The error
+    has three parts: the last change of each trajectory; what its slow decay leaves to come (`r/(1-r)` of it, at ratio `r`:
+    a jump makes the order 1, not 4); and, because a trajectory may agree with itself by missing a feature twice, what a
+    random few of all of them change on far finer steps.
     """
     everything = torch.arange(len(weights))
     coarse, _ = integrate(everything, steps // 2)

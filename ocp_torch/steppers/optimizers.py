@@ -46,22 +46,36 @@ def optimizer_maker(name: str, lr: float, **options) -> Callable[[list[Tensor]],
     return lambda parameters: make(parameters, lr=rate, **options)
 
 
-def schedule_maker(name: str, steps: int, decay: float = 0.75, every: int = 20000) -> Callable[..., LRScheduler]:
+def schedule_maker(
+    name: str,
+    steps: int,
+    decay: float = 0.75,
+    every: int = 20000,
+    exponent: float = 0.5,
+) -> Callable[..., LRScheduler]:
     """A maker of the learning-rate schedule of an optimiser whose player rests for the part ``resting`` of ``steps``.
 
-    ``constant``; ``cosine`` to zero over the player's own moves, and again over twice as many in each further round; or
-    ``decay``, a factor ``decay`` every ``every`` moves (the paper decreases by 25 % every 20,000).
+    ``constant``; ``cosine`` to zero over the player's own moves, and again over twice as many in each further round;
+    ``decay``, a factor ``decay`` every ``every`` moves (the paper decreases by 25 % every 20,000); ``power``, a factor
+    `k^-exponent` at move `k`; or ``horizon``, the factor `n^-exponent` throughout a first round of `n` moves, as in the
+    paper's theorems (2/3 for the dual, 1/2 for the primal and the primal-dual).
     """
-    require_choice("schedule.name", name, ("constant", "cosine", "decay"))
+    require_choice("schedule.name", name, ("constant", "cosine", "decay", "power", "horizon"))
     factor = require_number("schedule.decay", decay, above=0.0, at_most=1.0)
     period = require_integer("schedule.every", every, 1)
+    exponent = require_number("schedule.exponent", exponent, at_least=0.0, at_most=1.0)
 
     def make(optimizer: Optimizer, resting: float = 0.0) -> LRScheduler:
+        moves = max(1, steps - math.ceil(resting * steps))
         if name == "cosine":
-            moves = max(1, steps - math.ceil(resting * steps))
             return CosineAnnealingWarmRestarts(optimizer, T_0=moves, T_mult=2)
         if name == "decay":
             return StepLR(optimizer, step_size=period, gamma=factor)
-        return LambdaLR(optimizer, lambda _: 1.0)
+        factors = {
+            "constant": lambda moved: 1.0,
+            "power": lambda moved: (moved + 1.0) ** -exponent,
+            "horizon": lambda moved: float(moves) ** -exponent,
+        }
+        return LambdaLR(optimizer, factors[name])
 
     return make

@@ -1,0 +1,18 @@
+"""Compare methods and models on one problem: python scripts/benchmark.py problem=circle seeds=[0,1,2]"""
+
+from __future__ import annotations
+
+import hydra
+from omegaconf import DictConfig
+
+from ocp_torch.benchmark.contest import build, contest
+from ocp_torch.launch import job, launch
+
+
+@hydra.main(version_base="1.3", config_path="../configs", config_name="benchmark")
+def main(config: DictConfig) -> None:
+    job(contest, config)
+
+
+if __name__ == "__main__":
+    launch(main, "benchmark", build)
