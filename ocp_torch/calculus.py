@@ -22,9 +22,18 @@ def value_and_gradient(field: Field, x: Tensor) -> tuple[Tensor, Tensor]:
     explicit = getattr(field, "value_and_gradient", None)
     if explicit is not None:
         return explicit(x)
-    value, pullback = torch.func.vjp(field, x)
-    (gradient,) = pullback(torch.ones_like(value))
-    return value, gradient
+    again = torch.is_grad_enabled()
+    try:
+        at = x if x.requires_grad else x.detach().requires_grad_(True)
+    except RuntimeError:  # inside a transform of torch.func, where only its own derivatives work; they cost more
+        value, pullback = torch.func.vjp(field, x)
+        return value, pullback(torch.ones_like(value))[0]
+    with torch.enable_grad():
+        value = field(at)
+        if not value.requires_grad:
+            return value, torch.zeros_like(x)
+        gradient = torch.autograd.grad(value, at, torch.ones_like(value), create_graph=again, materialize_grads=True)[0]
+    return (value, gradient) if again else (value.detach(), gradient)
 
 
 def value_and_jacobian(field: Field, x: Tensor) -> tuple[Tensor, Tensor]:
