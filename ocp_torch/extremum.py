@@ -8,6 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+# How often `minimiser` narrows its interval: (2/3)^30 of it is left.
+NARROWINGS = 30
+
 
 @dataclass(frozen=True)
 class Extremum:
@@ -69,3 +72,12 @@ def _gradient(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
         x = x.detach().requires_grad_(True)
         (gradient,) = torch.autograd.grad(function(x).sum(), x)
     return gradient
+
+
+def minimiser(function: Callable[[float], float], low: float, high: float) -> float:
+    """Where a convex ``function`` is smallest in ``[low, high]``, narrowed by thirds to `5e-6` of its length."""
+    for _ in range(NARROWINGS):
+        third = (high - low) / 3.0
+        left, right = low + third, high - third
+        low, high = (left, high) if function(right) < function(left) else (low, right)
+    return 0.5 * (low + high)

@@ -10,10 +10,10 @@ import zoo
 from ocp_torch import calculus, formulas
 from ocp_torch.bounds import resolve_bounds
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
-from ocp_torch.certificate.lagrangian import closed_loop_bounds
+from ocp_torch.certificate.lagrangian import Terms, _integrands, best_multiples, closed_loop_bounds
 from ocp_torch.certificate.performance import simulate_performance
 from ocp_torch.certificate.simulation import discounted_integral
-from ocp_torch.certificate.stage import StageSettings, fit_closed_loop, relative_excess
+from ocp_torch.certificate.stage import StageSettings, fit_closed_loop, missing_price, relative_excess
 from ocp_torch.control_laws import ValueLaw
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -119,3 +119,31 @@ def test_the_excess_is_what_the_bound_adds_to_its_integral():
     # The bound's suprema are climbed, the excess's only sampled.
     assert without + excess <= found.lagrangian.value + 1e-12
     assert without + 1.1 * excess >= found.lagrangian.value
+
+
+@zoo.on(zoo.FEW_SMOOTH)
+def test_the_bounds_do_not_depend_on_the_mass_that_mu_was_given(problem):
+    """Every multiple of `mu` is a candidate, and none is above the bound of `mu` itself by more than chance allows."""
+    loop = ClosedLoop(problem, problem.exact_control)
+    value, bump = (zoo.rough_network(problem.dim, seed, size=0.1) for seed in (3, 4))
+    shifted = lambda x: 1.0 + value(x)
+    log_mu = lambda x: problem.exact_occupation(x).log() + bump(x)
+    sets = [Samples.of(loop, s.x) for s in replicated_samples(problem, 512, 4, 0, divergences=False)]
+    here, heavier = (
+        closed_loop_bounds(loop, shifted, lambda x, c=c: log_mu(x) + c, sets, 1, "value") for c in (0.0, 0.2)
+    )
+    for name in ("lagrangian", "J", "below"):
+        assert getattr(here, name).value == pytest.approx(getattr(heavier, name).value, rel=1e-4)
+    terms = [Terms(s, *parts[:3]) for s in sets for parts in [_integrands(loop, shifted, log_mu, s)]]
+    bound = lambda t, scale: t.lagrangian(scale, 2.0, 0.5)
+    assert sum(best_multiples(terms, bound)) <= sum(bound(t, 1.0) for t in terms) + 1e-3
+
+
+def test_the_price_of_missing_mass_follows_the_slack():
+    """Deep slack on one side makes that side of the residual dear, within limits; a sign turned turns the price."""
+    problem = zoo.build("manufactured 2-d q=2")
+    loop = ClosedLoop(problem, problem.exact_control)
+    samples = Samples.of(loop, zoo.states(problem, 4000))
+    low, high = ((lambda x, c=c: problem.exact_value(x) + c) for c in (-0.1, 0.1))
+    assert missing_price(loop, low, samples) == pytest.approx(4.0)
+    assert missing_price(loop, high, samples) == pytest.approx(0.25)

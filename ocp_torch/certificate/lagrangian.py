@@ -12,21 +12,30 @@ Write `Q_u` for the Bellman slack of `V` and `r = mu0 - mu - div(mu g_u) / rho` 
 3. By parts again `E[(f + R(u)) mu + V r] = E[V mu0 - mu Q_u]`: the same number with far less variance.
 4. `0 <= V^u <= C_V` with `C_V = sup V + eps_hi` gives `J = E[(f + R(u)) mu + C_V max(r, 0)]`, with `w = mu u`, for the
    smallest `C_V` that these facts prove for this very controller.
+5. All this holds for every multiple `s mu` too, with residual `mu0 - s (mu0 - r)`, and each bound is convex in `s`. Where
+   `Q_u` is deep on one side only, as at kinks, a little more mass (`s > 1`) makes the dear side of `r` rare. Each half
+   of the sets is evaluated with the `s` that is best on the other half: the search does not flatter the bound.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
+from torch import Tensor
 
 from ocp_torch import formulas
 from ocp_torch.calculus import Field
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.sides import CHUNK, chunked_gradient, slack_function
-from ocp_torch.extremum import Extremum, supremum
+from ocp_torch.extremum import Extremum, minimiser, supremum
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.samples import Samples
+
+# Multiples of mu that are tried.
+MULTIPLES = (0.0, 2.0)
 
 
 @dataclass(frozen=True)
@@ -64,17 +73,21 @@ def closed_loop_bounds(
     eps_lo = _climbed(slack, slack_all, states, ascents)
     eps_hi = _climbed(lambda x: -slack(x), -slack_all, states, ascents)
     C_V = top.value + eps_hi.value
+    terms = [Terms(samples, *parts[:3]) for samples, parts in zip(sets, values, strict=True)]
     lagrangian, below, J, residual, low, high = [], [], [], [], [], []
-    for i, (samples, (v, spent, r, _)) in enumerate(zip(sets, values, strict=True)):
-        gain, loss = r.clamp_min(0.0), (-r).clamp_min(0.0)
-        started = integral(samples, v * samples.mu0) if initial is None else initial[i]
-        lagrangian.append(started + integral(samples, eps_hi.value * gain + eps_lo.value * loss - spent))
-        below.append(started - integral(samples, eps_lo.value * gain + eps_hi.value * loss + spent))
-        mass = integral(samples, samples.mu0)
-        low.append(started - eps_lo.value * mass)
-        high.append(started + eps_hi.value * mass)
-        J.append(started + integral(samples, C_V * gain - v * r - spent))
-        residual.append(integral(samples, r.abs()))
+    hi, lo = eps_hi.value, eps_lo.value
+    excess = best_multiples(terms, lambda t, s: t.lagrangian(s, hi, lo))
+    shortfall = best_multiples(terms, lambda t, s: -t.lagrangian(s, -lo, -hi))
+    penalised = best_multiples(terms, lambda t, s: t.J(s, C_V))
+    for i, own in enumerate(terms):
+        started = integral(own.samples, own.v * own.samples.mu0) if initial is None else initial[i]
+        lagrangian.append(started + excess[i])
+        below.append(started - shortfall[i])
+        J.append(started + penalised[i])
+        mass = integral(own.samples, own.samples.mu0)
+        low.append(started - lo * mass)
+        high.append(started + hi * mass)
+        residual.append(integral(own.samples, own.r.abs()))
     mean_residual = sum(residual) / len(residual)
     return ClosedLoopBounds(
         Estimate.of(lagrangian, controller=controller),
@@ -86,6 +99,43 @@ def closed_loop_bounds(
         Estimate.of(below),
         (Estimate.of(low), Estimate.of(high)),
     )
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What the bounds on one set of states are made of: `V`, `mu Q_u` and `r`, each ``(N,)``."""
+
+    samples: Samples
+    v: Tensor
+    spent: Tensor
+    r: Tensor
+
+    def residual(self, scale: float) -> Tensor:
+        """The residual of ``scale`` times `mu`."""
+        return self.samples.mu0 - scale * (self.samples.mu0 - self.r)
+
+    def lagrangian(self, scale: float, hi: float, lo: float) -> float:
+        """`E[hi max(r, 0) + lo max(-r, 0) - mu Q_u]` of ``scale`` times `mu`: the bound of 2. without `E[V mu0]`."""
+        r = self.residual(scale)
+        return integral(self.samples, hi * r.clamp_min(0.0) + lo * (-r).clamp_min(0.0) - scale * self.spent)
+
+    def J(self, scale: float, C_V: float) -> float:
+        """The bound of 4., without `E[V mu0]`."""
+        r = self.residual(scale)
+        return integral(self.samples, C_V * r.clamp_min(0.0) - self.v * r - scale * self.spent)
+
+    @staticmethod
+    def join(terms: list[Terms]) -> Terms:
+        """All states of ``terms`` in one."""
+        columns = (torch.cat([getattr(t, name) for t in terms]) for name in ("v", "spent", "r"))
+        return Terms(Samples.concatenate([t.samples for t in terms]), *columns)
+
+
+def best_multiples(terms: list[Terms], bound: Callable[[Terms, float], float]) -> list[float]:
+    """``bound`` of each of ``terms`` with the multiple of `mu` that makes it smallest on the other half of them."""
+    halves = [Terms.join(terms[k::2]) for k in (0, 1)]
+    scales = [minimiser(partial(bound, half), *MULTIPLES) for half in halves]
+    return [bound(t, scales[1 - i % 2]) for i, t in enumerate(terms)]
 
 
 @torch.no_grad()

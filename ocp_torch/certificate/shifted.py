@@ -16,12 +16,12 @@ from torch import Tensor
 from ocp_torch import calculus, formulas
 from ocp_torch.calculus import Field
 from ocp_torch.control_cost import PowerCost
-from ocp_torch.extremum import Extremum, supremum
+from ocp_torch.extremum import Extremum, minimiser, supremum
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
 
-# The search: theta in [0, TOP], narrowed by thirds.
-TOP, NARROWINGS = 1.5, 40
+# The largest theta that is tried.
+TOP = 1.5
 
 
 @dataclass(frozen=True)
@@ -96,10 +96,4 @@ def best_shift(
 
 def scaled_by(parts: SlackParts, initial: float) -> float:
     """The `theta` in `[0, TOP]` that maximises the sampled bound, concave in `theta`."""
-    bound = lambda theta: theta * initial - float(parts.slack(theta).max())
-    low, high = 0.0, TOP
-    for _ in range(NARROWINGS):
-        third = (high - low) / 3.0
-        left, right = low + third, high - third
-        low, high = (left, high) if bound(left) < bound(right) else (low, right)
-    return 0.5 * (low + high)
+    return minimiser(lambda theta: float(parts.slack(theta).max()) - theta * initial, 0.0, TOP)

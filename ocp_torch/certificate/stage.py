@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,9 +11,11 @@ import torch
 from ocp_torch import calculus, formulas
 from ocp_torch.bounds import Bounds
 from ocp_torch.calculus import Field
+from ocp_torch.certificate.lagrangian import MULTIPLES, Terms
 from ocp_torch.certificate.sides import CHUNK
 from ocp_torch.control_laws import ControlLaw
 from ocp_torch.errors import require_integer, require_number
+from ocp_torch.extremum import minimiser
 from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
 from ocp_torch.objectives.policy_evaluation import PolicyEvaluation
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -25,6 +28,8 @@ from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule
 STAGE_STREAM = 3
 # The closed loop's data are computed once on so many states at most: their divergences cost more than a step.
 POOL = 2**16
+# Beyond that ratio of the two suprema of the slack the residual is not weighed any more lopsidedly.
+MOST_LOPSIDED = 16.0
 # Where the stage looks at its own excess after a round.
 EXCESS_STATES = 4096
 
@@ -68,7 +73,6 @@ def fit_closed_loop(
     like = torch.zeros(()) if fields is None else next(fields.parameters())
     loop = ClosedLoop(problem, law)
     with_value = fields is None or fields.value is None
-    objective = PolicyEvaluation(loop, bounds, with_value)
     names = (LOG_OCCUPATION, VALUE) if with_value else (LOG_OCCUPATION,)
     fitted = Fields.build(problem, names, network, derive_seed(seed, STAGE_STREAM, 0)).to(like)
     if fields is not None and fields.log_occupation is not None:
@@ -77,6 +81,9 @@ def fit_closed_loop(
         loop, derive_seed(seed, STAGE_STREAM, 1), derive_seed(seed, STAGE_STREAM, 2), like, double=fields is None
     )
     draw = lambda: pool.draw(settings.batch)
+    pool.grow(min(POOL, settings.steps * settings.batch))
+    price = 1.0 if with_value else missing_price(loop, fields.value, pool.samples.take(slice(EXCESS_STATES)))
+    objective = PolicyEvaluation(loop, bounds, with_value, price)
     optimizer = optimizer_maker("soap", settings.lr, betas=(0.95, 0.95))
     makers = {player: optimizer for player in objective.players}
     stepper = Simultaneous(fitted, objective, makers, schedule_maker("cosine", settings.steps))
@@ -122,14 +129,22 @@ class Pool:
 
 
 @torch.no_grad()
-def relative_excess(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples) -> float:
-    """`(eps_hi E[max(r, 0)] + eps_lo E[max(-r, 0)]) / |E[V mu0]|` on ``samples``: what the residual costs.
-
-    That is the part of the Lagrangian bound above `E[V mu0 - mu Q_u]`.
-    """
+def missing_price(loop: ClosedLoop, value: Field, samples: Samples) -> float:
+    """How much more a positive residual should weigh than a negative one: the root of `eps_hi / eps_lo`, within limits."""
     v, gradient = calculus.value_and_gradient(value, samples.x)
     slack = formulas.hjb_slack(samples, v, gradient, loop.control_cost, loop.discount)
-    r = samples.mu0 - formulas.drifting_loss(samples, log_occupation, loop.discount)[1]
-    missing, surplus = samples.mean(r.clamp_min(0.0)), samples.mean((-r).clamp_min(0.0))
-    excess = (-slack).max().clamp_min(0.0) * missing + slack.max().clamp_min(0.0) * surplus
-    return float(excess / samples.mean(v * samples.mu0).abs().clamp_min(1e-30))
+    hi, lo = float((-slack).max().clamp_min(1e-30)), float(slack.max().clamp_min(1e-30))
+    return math.sqrt(min(max(hi / lo, 1.0 / MOST_LOPSIDED), MOST_LOPSIDED))
+
+
+@torch.no_grad()
+def relative_excess(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples) -> float:
+    """What the residual costs the Lagrangian bound on ``samples``, relative to `|E[V mu0]|`: the bound's part above
+    `E[V mu0 - mu Q_u]`, for the best multiple of `mu`."""
+    v, gradient = calculus.value_and_gradient(value, samples.x)
+    slack = formulas.hjb_slack(samples, v, gradient, loop.control_cost, loop.discount)
+    mu, spent = formulas.drifting_loss(samples, log_occupation, loop.discount)
+    terms = Terms(samples, v, mu * slack, samples.mu0 - spent)
+    hi, lo = float((-slack).max().clamp_min(0.0)), float(slack.max().clamp_min(0.0))
+    least = terms.lagrangian(minimiser(lambda s: terms.lagrangian(s, hi, lo), *MULTIPLES), hi, lo)
+    return (least + float(samples.mean(terms.spent))) / max(abs(float(samples.mean(v * samples.mu0))), 1e-30)

@@ -2,6 +2,7 @@ r"""Policy evaluation by least squares: `V^u` and `mu^u` of a closed loop, two l
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from ocp_torch import calculus, formulas
@@ -17,18 +18,21 @@ class PolicyEvaluation(Objective):
 
     `r = mu0 - mu (1 + (grad log mu . g_u + div g_u) / rho)` is the Liouville residual, `Q_u` the Bellman slack and `s` the
     scale of the `V` network: the strong forms of P(u) and D(u) (section 5.4 of the paper). The two players do not
-    interact; there is no hinge and no game.
+    interact; there is no hinge and no game. Where missing mass (`r > 0`) costs the bounds more than surplus, ``price`` is by
+    how much more it weighs.
     """
 
     needs_divergences = True
 
-    def __init__(self, problem: ClosedLoop, bounds: Bounds, with_value: bool) -> None:
+    def __init__(self, problem: ClosedLoop, bounds: Bounds, with_value: bool, price: float = 1.0) -> None:
         super().__init__(problem, bounds)
+        self.price = price
         self.players = {"occupation": (LOG_OCCUPATION,)} | ({"value": (VALUE,)} if with_value else {})
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         _, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
-        losses = {"occupation": samples.mean((samples.mu0 - loss).square())}
+        r = samples.mu0 - loss
+        losses = {"occupation": samples.mean(torch.where(r > 0.0, self.price, 1.0) * r.square())}
         if "value" in self.players:
             value, gradient = calculus.value_and_gradient(fields.value, samples.x)
             slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
