@@ -91,7 +91,8 @@ def estimated_sup_occupation(problem: Problem, law: ControlLaw, end_states: Tens
     generator = torch.Generator().manual_seed(0)
     uniform = torch.rand(states - len(picked), problem.dim, dtype=picked.dtype, generator=generator)
     x = torch.cat([picked, uniform])
-    density = settled_occupation(problem, law, x).nan_to_num(nan=math.inf, posinf=math.inf)
+    met = lambda x: settled_occupation(problem, law, x).nan_to_num(nan=math.inf, posinf=math.inf)
+    density = met(x)
     if not bool(torch.isfinite(density).all()):
         return math.inf
     top = x[density.topk(min(TOP, len(x))).indices]
