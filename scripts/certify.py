@@ -5,7 +5,7 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 
-from ocp_torch.launch import finish, job, launch
+from ocp_torch.launch import job, launch
 from ocp_torch.training.given import certify_configured, read
 
 
@@ -20,4 +20,3 @@ def main(config: DictConfig) -> None:
 
 if __name__ == "__main__":
     launch(main, "certify", read)
-    finish()

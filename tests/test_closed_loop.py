@@ -69,7 +69,7 @@ def test_the_value_differs_from_that_of_the_loop_by_the_slack_met_along_its_traj
     loop = ClosedLoop(problem, problem.exact_control)
     value, x = zoo.rough_network(problem.dim, 8, size=0.3), zoo.states(problem, 20)
     along = lambda y: (loop.drift(y), bellman_slack(loop, value, Samples.of(loop, y, divergences=False))[1])
-    met, _ = discounted_integral(along, x, problem.discount, horizon=14.0 / problem.discount, steps=300)
+    met, _ = discounted_integral(along, x, problem.discount, horizon=14.0 / problem.discount, steps=120)
     torch.testing.assert_close(value(x) - problem.exact_value(x), met, rtol=1e-4, atol=1e-4)
 
 
@@ -84,7 +84,7 @@ def test_the_bounds_of_a_poor_controller_are_above_its_own_performance(problem):
     log_mu = lambda x: problem.exact_occupation(x).log() + 0.3 * bump(x)
     bounds = closed_loop_bounds(loop, value, log_mu, [Samples.of(loop, s.x) for s in sets], 8, "value")
     initial = [float((value(s.x) * s.mu0).mean()) for s in sets]
-    perf = simulate_performance(problem, law, 64, 8, 0, value=value, initial=initial).perf
+    perf = simulate_performance(problem, law, 64, 8, 0, value=value, initial=initial, tolerance=1e-3).perf
     assert perf.value - 3.0 * perf.se > problem.exact_optimum
     for bound in (bounds.lagrangian, bounds.J):
         assert bound.value >= perf.value - perf.bias - 4.0 * (perf.se + bound.se)

@@ -11,11 +11,11 @@ import torch
 import zoo
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Circle, Manufactured, Problem, Torus
-from ocp_torch.reference import linear, solve_reference
+from ocp_torch.reference import linear, semi_lagrangian, solve_reference
 from ocp_torch.reference.grid import Grid
 from ocp_torch.reference.richardson import extrapolate
 from ocp_torch.reference.semi_lagrangian import SemiLagrangian, discounted_weights
-from ocp_torch.reference.session import prepare
+from ocp_torch.reference.session import prepare, table
 from test_controller import controllers
 
 TURN = 2.0 * math.pi
@@ -73,6 +73,7 @@ def assert_true_within_its_error(make, side, close):
 def test_kinked_problems_are_solved_within_the_stated_error(name):
     reference = assert_true_within_its_error(*KINKED[name], close=5e-3)
     assert 1.6 <= reference.order <= 2.5
+    assert "settled" not in table(reference)
 
 
 @pytest.mark.parametrize("name", SMOOTH)
@@ -121,6 +122,16 @@ def test_no_control_at_all_is_better_than_the_candidates(make):
         best = torch.minimum(best, scheme._judged(solution.value, everything, held)[0])
     off = (solution.grid.nodes()[:, 0] - 0.5).abs() < 0.5 - 4.0 * solution.grid.spacing
     assert float((solution.value - best)[off].max()) <= 2e-4 * scheme.gain
+
+
+@pytest.mark.parametrize("policies", [1, 2])
+def test_an_iteration_that_is_stopped_early_says_so_and_states_what_it_leaves(policies, monkeypatch):
+    monkeypatch.setattr(semi_lagrangian, "MOST_POLICIES", policies)
+    problem = Manufactured(dim=1, seed=1)
+    reference = solve_reference(problem, 64)
+    assert reference.unsettled > 1e-4 * problem.exact_optimum
+    assert abs(reference.optimum - problem.exact_optimum) <= reference.error
+    assert "stopped before it settled" in table(reference)
 
 
 def test_pure_transport_has_its_closed_form():

@@ -30,6 +30,8 @@ from ocp_torch.samples import Samples
 SIMULATION_REPLICATE = 1000
 # What is left of the discount when simulation stops, times the rate's supremum, relative to the answer.
 TAIL = 2e-5
+# The answer is taken to be at least this part of the mean state cost at the starts.
+LEAST = 0.1
 # Head-room on the rate's supremum, met at starts and ends, for the states after the end.
 RATE_ROOM = 2.0
 
@@ -95,8 +97,8 @@ def simulate_performance(
         base = value(x0) if value is not None else torch.zeros_like(rate)
     if not (torch.isfinite(velocity).all() and torch.isfinite(rate).all()):
         return Simulated(Estimate(math.nan, math.nan), math.nan, x0)
-    size = abs(sum(initial) / len(initial)) if initial else float((mu0 * rate).mean().abs())
-    size = max(size, 1e-12)
+    # By the slack's definition `V - Q_u = f + R(u) + grad V . g / rho`: the answer's size also where `E[V mu0]` is far off.
+    size = max(float((mu0 * (base + rate)).mean().abs()), LEAST * float((mu0 * problem.state_cost(x0)).mean()), 1e-12)
     largest_rate = RATE_ROOM * float(rate.abs().max())
     if random:
         times = -torch.log1p(-points[:, dim]) / rho

@@ -178,8 +178,9 @@ def _evaluate(problem: Problem, value: PeriodicMLP, theta: float, centre: Tensor
     loose = bent + Q.radius.unsqueeze(-1) * half / half.sum(dim=-1, keepdim=True)
     axis = loose.nan_to_num(nan=math.inf, posinf=math.inf).argmax(dim=-1)
     axis = torch.where(half.amax(dim=-1) > 4.5 * half.amin(dim=-1), half.argmax(dim=-1), axis)
+    upper = upper.nan_to_num(nan=math.inf, posinf=math.inf)
     reached = (Q.coefficients[0] - Q.radius).nan_to_num(nan=-math.inf)
-    return _Cover(centre, half, upper.nan_to_num(nan=math.inf), reached, mean * volume, radius * volume, axis)
+    return _Cover(centre, half, upper, reached, mean * volume, radius * volume, axis)
 
 
 def rigorous_lower_bound(

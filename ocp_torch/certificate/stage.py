@@ -93,7 +93,7 @@ def fit_closed_loop(
         pool.grow(min(POOL, steps * settings.batch))
         for _ in range(steps):
             stepper.step(draw, lambda: average.update_parameters(fitted))
-        value = fields.value if fields.value is not None else average.module.value
+        value = average.module.value if with_value else fields.value
         excess = relative_excess(loop, value, average.module.log_occupation, pool.samples.take(slice(EXCESS_STATES)))
         if excess <= settings.good_excess:
             break

@@ -13,7 +13,7 @@ MOST_DIMENSIONS = 3
 FEWEST_NODES = 8
 # Ratio of the sides of successive grids, and the finest side by dimension.
 RATIO = {1: 2.0, 2: 2.0, 3: 1.5}
-FINEST = {1: 1024, 2: 192, 3: 48}
+FINEST = {1: 1024, 2: 192, 3: 40}
 # Index, weights and their copies, per entry of the interpolation matrix.
 BYTES_PER_ENTRY = 40
 TOLERANCE = 1e-6

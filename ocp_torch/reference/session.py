@@ -88,6 +88,10 @@ def table(reference: Reference) -> str:
     order = "none (the three grids do not approach evenly)" if math.isnan(reference.order) else f"{reference.order:.2f}"
     lines.append(f"order    {order}")
     lines.append(f"V        changes by up to {reference.value_change:.2g} from the second grid to the finest")
+    if not reference.unsettled < 0.5 * reference.error and not reference.unsettled <= 1e-6 * abs(reference.optimum):
+        lines.append(
+            f"warning: policy iteration stopped before it settled; {reference.unsettled:.2g} of the stated error is for that."
+        )
     if not reference.error < 0.01 * abs(reference.optimum):
         lines.append("warning: the stated error is above 1 % of OPT; a larger side lowers it.")
     return "\n".join(lines)
