@@ -22,7 +22,7 @@ from ocp_torch.launch import composed
 from ocp_torch.paper import figures
 from ocp_torch.paper.recipes import RECIPES
 from ocp_torch.paper.reproduce import check, report, reproduce
-from ocp_torch.paper.runs import carry_out, circle, compare_with_exact, cost_per_step
+from ocp_torch.paper.runs import carry_out, circle, compare_with_exact
 from ocp_torch.samples import Samples
 
 TINY = (
@@ -37,6 +37,7 @@ TINY = (
     "certificate.replicates=2",
     "certificate.trajectories=4",
     "certificate.ascents=2",
+    "certificate.tolerance=1e-2",
     "certificate.occupation_states=0",
     "certificate.stage.steps=2",
 )
@@ -45,7 +46,7 @@ TINY = (
 @pytest.fixture
 def quick(monkeypatch):
     """Few states and trajectories for each measurement."""
-    for name, count in (("POINTS", 128), ("TRAJECTORIES", 16), ("TABLE", 2**10)):
+    for name, count in (("POINTS", 128), ("TRAJECTORIES", 16), ("TABLE", 2**10), ("TOLERANCE", 1e-2)):
         monkeypatch.setattr(measure, name, count)
 
 
@@ -255,16 +256,21 @@ def test_a_recipe_in_small_gives_its_numbers_and_figures(name, quick):
         assert wanted <= set(numbers)
         assert numbers.get("F_M", -1.0) < 0.0 < min(numbers[n] for n in wanted - {"F_M"})
     assert history.numbers[60][0] != history.numbers[60][1]
-    (axis,) = figures.evolution(history).axes
-    assert len(axis.lines) == len(history.numbers[60][0]) + 1 - ("shifted" in history.numbers[60][0])
+    axis, distance = figures.evolution(history).axes
+    assert len(axis.lines) - 1 == len(distance.lines) == len(wanted)
+    assert distance.lines[-1].get_ydata()[-1] == pytest.approx(
+        median_and_spread([m[history.recipe.numbers[-1]] for m in history.numbers[60]])[0]
+    )
     panels = figures.iterates(history).axes
     assert len(panels) == (4 if name == "pd" else 2)
     assert all(len(panel.lines) == 3 for panel in panels)
-    agreement = compare_with_exact(small(name), 30, 32, seed=0)
-    assert all(0.0 < d < 1e-3 for d in agreement.differences.values())
-    measured = {name: cost_per_step(small(name), 40, 8, 10)}
-    assert [n for n, _ in measured[name]["exact"]] == [10, 20, 30, 40]
-    text = report({name: history}, [agreement], measured, (0, 1), 8)
+    comparison = compare_with_exact(small(name), 40, 32, seed=0, windows=4, tick=ticks.append)
+    assert sum(ticks) == 60 + 2 * 40
+    assert all(0.0 < d < 1e-3 for d in comparison.differences.values())
+    assert [n for n, _ in comparison.costs["exact"]] == [10, 20, 30, 40]
+    (axis,) = figures.costs([comparison]).axes
+    assert len(axis.lines) == 2
+    text = report({name: history}, [comparison], (0, 1), 8)
     assert text.count(f"| {name} | 60 |") == len(wanted)
 
 

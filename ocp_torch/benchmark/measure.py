@@ -17,7 +17,7 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
 
 # Integrals and simulations of one measurement: enough for 0.02 % on a curve.
-POINTS, TRAJECTORIES, REPLICATES = 2048, 256, 2
+POINTS, TRAJECTORIES, REPLICATES, TOLERANCE = 2048, 256, 2, 2e-4
 # In one dimension a control law is simulated from a table of so many states, with straight lines between them.
 TABLE = 2**14
 
@@ -55,7 +55,8 @@ class Judge:
         """`Perf` of a control law, by simulation."""
         if self.problem.dim == 1:
             law = tabulated(law, TABLE)
-        return simulate_performance(self.problem, law, self.effort * TRAJECTORIES, REPLICATES, self.seed).perf.value
+        count = self.effort * TRAJECTORIES
+        return simulate_performance(self.problem, law, count, REPLICATES, self.seed, tolerance=TOLERANCE).perf.value
 
 
 def tabulated(law: ControlLaw, count: int) -> ControlLaw:
