@@ -13,7 +13,9 @@ from ocp_torch.benchmark import measure
 from ocp_torch.benchmark.contest import build, contest
 from ocp_torch.benchmark.curve import Curve, Point, due, median_and_spread
 from ocp_torch.benchmark.environment import make_environment, observe, require_rl
+from ocp_torch.benchmark.kernels import KernelContender
 from ocp_torch.benchmark.measure import Judge, relative, tabulated
+from ocp_torch.benchmark.networks import NetworkContender
 from ocp_torch.benchmark.report import load, reference, save, table
 from ocp_torch.bounds import resolve_bounds
 from ocp_torch.errors import InputError
@@ -135,8 +137,36 @@ def test_the_report_says_what_was_reached_and_comes_back_from_its_file(tmp_path)
     row = next(line for line in text.splitlines() if line.startswith("| fast"))
     assert "| 20 |" in row
     assert load(tmp_path / "curves.json") == curves
+    assert "1 % on Perf in the fewest samples: fast, 20." in text
+    assert "slow" not in text.rsplit("\n\n", 1)[1]
     assert reference(curves, None) == (0.9, "the best lower bound found")
     assert "the best lower bound found" in table(curves, None)
+
+
+def test_certified_gaps_are_held_against_the_paper_s_primal_dual():
+    few = [curve("kernel pd", s, [1.1], gap) for s, gap in enumerate((0.1, 0.12, 0.2))]
+    text = table([*few, curve("a", 0, [1.1], 0.004)], 1.0)
+    rows = {row.split(" | ")[0].strip("| "): row.split(" | ") for row in text.split("\n")}
+    place = rows["contender"].index("times smaller")
+    assert rows["a"][place] == "30"
+    assert rows["kernel pd"][place] == "1"
+    assert "nan" not in table([curve("a", 0, [1.1], 0.004), curve("b", 0, [1.1])], 1.0)
+
+
+def test_a_kernel_method_without_a_time_of_its_own_gets_that_of_the_longest_run_before_it(tmp_path, monkeypatch):
+    given = []
+
+    def run(self, seed, judge, certificate):
+        given.append(getattr(self, "seconds", None))
+        return Curve(self.name, seed, [Point(1, 7.0 + seed, {"F_M": 0.1, "value": 0.2})])
+
+    for made in (KernelContender, NetworkContender):
+        monkeypatch.setattr(made, "run", run)
+    free = [o for o in TINY if "kernel.seconds" not in o]
+    contest(composed("benchmark", [*free, "seeds=[0,2]", "contenders=[kernel_pd,network_dual,kernel_dual]"]), tmp_path)
+    assert given == [30.0, 30.0, None, None, 9.0, 9.0]
+    contest(composed("benchmark", [*TINY, "seeds=[0]", "contenders=[network_dual,kernel_dual]"]), tmp_path)
+    assert given[6:] == [None, 0.01]
 
 
 def test_a_whole_contest_in_small(tmp_path, quick):
