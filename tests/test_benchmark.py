@@ -48,7 +48,7 @@ TINY = (
 @pytest.fixture
 def quick(monkeypatch):
     """Few states and trajectories for each measurement."""
-    for name, count in (("POINTS", 128), ("TRAJECTORIES", 16), ("TABLE", 2**10), ("TOLERANCE", 1e-2)):
+    for name, count in dict(POINTS=128, TRAJECTORIES=16, ON_THE_CIRCLE=16, TABLE=2**10, TOLERANCE=1e-2).items():
         monkeypatch.setattr(measure, name, count)
 
 
@@ -88,6 +88,22 @@ def test_the_judge_finds_the_optimum_of_the_optimal_controller():
     drifting = zoo.build("manufactured 1-d q=2")
     found = Judge(drifting, resolve_bounds(drifting)).performance(drifting.exact_control)
     assert found == pytest.approx(drifting.exact_optimum, rel=5e-4)
+
+
+class Exact(torch.nn.Module):
+    def __init__(self, problem):
+        super().__init__()
+        self.forward = problem.exact_value
+
+
+def test_beyond_one_dimension_the_value_is_a_control_variate(quick):
+    """With `V*` itself nothing is left to simulate: sixteen starts give `OPT` as exactly as its mean is known."""
+    problem = zoo.build("manufactured 2-d mu0")
+    judge = Judge(problem, resolve_bounds(problem))
+    numbers = judge(Fields({VALUE: Exact(problem)}), None)
+    assert numbers["value"] == pytest.approx(numbers["F_M"], rel=1e-6)
+    alone = judge.performance(control_laws.ValueLaw(problem, Exact(problem)))
+    assert abs(alone - numbers["value"]) > 1e-4 * numbers["value"]
 
 
 def test_a_table_of_a_law_is_periodic_and_of_second_order():

@@ -73,7 +73,8 @@ def report(
     """The numbers as Markdown: what was found, beside what an independent re-implementation of the paper found."""
     lines = [
         f"Circle, rho = 2, M = 2, C_V = 2; regularity 2, {modes} modes; averages; seeds {', '.join(map(str, seeds))}.",
-        "Per cent above (+) or below (-) OPT: median [smallest, largest] over seeds.",
+        "Per cent above (+) or below (-) OPT: median [smallest, largest] over seeds. The re-implementation's ranges are over "
+        "three seeds of its own; a single pass depends on its samples, so that the two need not coincide.",
         "",
         "| method | steps | number | here | re-implementation |",
         "|---|---|---|---|---|",
