@@ -13,7 +13,9 @@ from ocp_torch.benchmark import measure
 from ocp_torch.benchmark.contest import build, contest
 from ocp_torch.benchmark.curve import Curve, Point, due, median_and_spread
 from ocp_torch.benchmark.environment import make_environment, observe, require_rl
+from ocp_torch.benchmark.kernels import KernelContender
 from ocp_torch.benchmark.measure import Judge, relative, tabulated
+from ocp_torch.benchmark.networks import NetworkContender
 from ocp_torch.benchmark.report import load, reference, save, table
 from ocp_torch.bounds import resolve_bounds
 from ocp_torch.errors import InputError
@@ -22,7 +24,7 @@ from ocp_torch.launch import composed
 from ocp_torch.paper import figures
 from ocp_torch.paper.recipes import RECIPES
 from ocp_torch.paper.reproduce import check, report, reproduce
-from ocp_torch.paper.runs import carry_out, circle, compare_with_exact, cost_per_step
+from ocp_torch.paper.runs import carry_out, circle, compare_with_exact
 from ocp_torch.samples import Samples
 
 TINY = (
@@ -37,6 +39,7 @@ TINY = (
     "certificate.replicates=2",
     "certificate.trajectories=4",
     "certificate.ascents=2",
+    "certificate.tolerance=1e-2",
     "certificate.occupation_states=0",
     "certificate.stage.steps=2",
 )
@@ -45,7 +48,7 @@ TINY = (
 @pytest.fixture
 def quick(monkeypatch):
     """Few states and trajectories for each measurement."""
-    for name, count in (("POINTS", 128), ("TRAJECTORIES", 16), ("TABLE", 2**10)):
+    for name, count in dict(POINTS=128, TRAJECTORIES=16, ON_THE_CIRCLE=16, TABLE=2**10, TOLERANCE=1e-2).items():
         monkeypatch.setattr(measure, name, count)
 
 
@@ -85,6 +88,22 @@ def test_the_judge_finds_the_optimum_of_the_optimal_controller():
     drifting = zoo.build("manufactured 1-d q=2")
     found = Judge(drifting, resolve_bounds(drifting)).performance(drifting.exact_control)
     assert found == pytest.approx(drifting.exact_optimum, rel=5e-4)
+
+
+class Exact(torch.nn.Module):
+    def __init__(self, problem):
+        super().__init__()
+        self.forward = problem.exact_value
+
+
+def test_beyond_one_dimension_the_value_is_a_control_variate(quick):
+    """With `V*` itself nothing is left to simulate: sixteen starts give `OPT` as exactly as its mean is known."""
+    problem = zoo.build("manufactured 2-d mu0")
+    judge = Judge(problem, resolve_bounds(problem))
+    numbers = judge(Fields({VALUE: Exact(problem)}), None)
+    assert numbers["value"] == pytest.approx(numbers["F_M"], rel=1e-6)
+    alone = judge.performance(control_laws.ValueLaw(problem, Exact(problem)))
+    assert abs(alone - numbers["value"]) > 1e-4 * numbers["value"]
 
 
 def test_a_table_of_a_law_is_periodic_and_of_second_order():
@@ -134,8 +153,36 @@ def test_the_report_says_what_was_reached_and_comes_back_from_its_file(tmp_path)
     row = next(line for line in text.splitlines() if line.startswith("| fast"))
     assert "| 20 |" in row
     assert load(tmp_path / "curves.json") == curves
+    assert "1 % on Perf in the fewest samples: fast, 20." in text
+    assert "slow" not in text.rsplit("\n\n", 1)[1]
     assert reference(curves, None) == (0.9, "the best lower bound found")
     assert "the best lower bound found" in table(curves, None)
+
+
+def test_certified_gaps_are_held_against_the_paper_s_primal_dual():
+    few = [curve("kernel pd", s, [1.1], gap) for s, gap in enumerate((0.1, 0.12, 0.2))]
+    text = table([*few, curve("a", 0, [1.1], 0.004)], 1.0)
+    rows = {row.split(" | ")[0].strip("| "): row.split(" | ") for row in text.split("\n")}
+    place = rows["contender"].index("times smaller")
+    assert rows["a"][place] == "30"
+    assert rows["kernel pd"][place] == "1"
+    assert "nan" not in table([curve("a", 0, [1.1], 0.004), curve("b", 0, [1.1])], 1.0)
+
+
+def test_a_kernel_method_without_a_time_of_its_own_gets_that_of_the_longest_run_before_it(tmp_path, monkeypatch):
+    given = []
+
+    def run(self, seed, judge, certificate):
+        given.append(getattr(self, "seconds", None))
+        return Curve(self.name, seed, [Point(1, 7.0 + seed, {"F_M": 0.1, "value": 0.2})])
+
+    for made in (KernelContender, NetworkContender):
+        monkeypatch.setattr(made, "run", run)
+    free = [o for o in TINY if "kernel.seconds" not in o]
+    contest(composed("benchmark", [*free, "seeds=[0,2]", "contenders=[kernel_pd,network_dual,kernel_dual]"]), tmp_path)
+    assert given == [30.0, 30.0, None, None, 9.0, 9.0]
+    contest(composed("benchmark", [*TINY, "seeds=[0]", "contenders=[network_dual,kernel_dual]"]), tmp_path)
+    assert given[6:] == [None, 0.01]
 
 
 def test_a_whole_contest_in_small(tmp_path, quick):
@@ -255,16 +302,21 @@ def test_a_recipe_in_small_gives_its_numbers_and_figures(name, quick):
         assert wanted <= set(numbers)
         assert numbers.get("F_M", -1.0) < 0.0 < min(numbers[n] for n in wanted - {"F_M"})
     assert history.numbers[60][0] != history.numbers[60][1]
-    (axis,) = figures.evolution(history).axes
-    assert len(axis.lines) == len(history.numbers[60][0]) + 1 - ("shifted" in history.numbers[60][0])
+    axis, distance = figures.evolution(history).axes
+    assert len(axis.lines) - 1 == len(distance.lines) == len(wanted)
+    assert distance.lines[-1].get_ydata()[-1] == pytest.approx(
+        median_and_spread([m[history.recipe.numbers[-1]] for m in history.numbers[60]])[0]
+    )
     panels = figures.iterates(history).axes
     assert len(panels) == (4 if name == "pd" else 2)
     assert all(len(panel.lines) == 3 for panel in panels)
-    agreement = compare_with_exact(small(name), 30, 32, seed=0)
-    assert all(0.0 < d < 1e-3 for d in agreement.differences.values())
-    measured = {name: cost_per_step(small(name), 40, 8, 10)}
-    assert [n for n, _ in measured[name]["exact"]] == [10, 20, 30, 40]
-    text = report({name: history}, [agreement], measured, (0, 1), 8)
+    comparison = compare_with_exact(small(name), 40, 32, seed=0, windows=4, tick=ticks.append)
+    assert sum(ticks) == 60 + 2 * 40
+    assert all(0.0 < d < 1e-3 for d in comparison.differences.values())
+    assert [n for n, _ in comparison.costs["exact"]] == [10, 20, 30, 40]
+    (axis,) = figures.costs([comparison]).axes
+    assert len(axis.lines) == 2
+    text = report({name: history}, [comparison], (0, 1), 8)
     assert text.count(f"| {name} | 60 |") == len(wanted)
 
 

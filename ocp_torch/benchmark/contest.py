@@ -29,6 +29,8 @@ METHODS = ("dual", "primal", "pd")
 # The groups of a training configuration, beside its problem and its method.
 TRAINING = ("model", "optimizer", "schedule", "stepper", "averaging", "sampler", "trainer", "certificate")
 EVERYONE = tuple(f"{kind}_{m}" for kind in ("kernel", "network") for m in METHODS) + ("sac", "ppo")
+# CPU seconds of a kernel method where no time is given, and nobody ran before it.
+UNHURRIED = 30.0
 
 
 def contender(name: str, config: dict, problem: Problem, bounds: Bounds):
@@ -73,12 +75,17 @@ def build(config: dict) -> tuple[Problem, Bounds, list, list[int], CertificateSe
 
 
 def contest(config: dict, folder: Path, say: Callable[[str], None] = log.info) -> list[Curve]:
-    """Run everyone with every seed; what is there so far is saved after each run."""
+    """Run everyone with every seed; what is there so far is saved after each run.
+
+    A kernel method without a time of its own gets that of the longest run before it: they are compared at equal time.
+    """
     problem, bounds, contenders, seeds, certificate = build(config)
     judge = Judge(problem, bounds)
     curves: list[Curve] = []
     with tqdm(total=len(contenders) * len(seeds), unit="run", disable=None) as bar:
         for made in contenders:
+            if isinstance(made, KernelContender):
+                made = made.in_time(max((c.points[-1].seconds for c in curves), default=UNHURRIED))
             for seed in seeds:
                 bar.set_postfix_str(f"{made.name}, seed {seed}")
                 curves.append(made.run(seed, judge, certificate))

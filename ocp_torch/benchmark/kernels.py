@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ocp_torch import control_laws
 from ocp_torch.benchmark.curve import Curve, Point, due
@@ -23,41 +24,49 @@ SCHEDULE = {"dual": "constant", "primal": "constant", "pd": "decay"}
 
 @dataclass(frozen=True)
 class KernelContender:
-    """One of the paper's methods with truncated features, its step size ``step``, for ``seconds`` of CPU time."""
+    """One of the paper's methods with truncated features, its step size ``step``, for ``seconds`` of CPU time.
+
+    With ``seconds=None`` nothing but ``longest``, in steps, ends a run; a contest then gives it the time the others took.
+    """
 
     method: str
     problem: Problem
     bounds: Bounds
     step: float
-    seconds: float
+    seconds: float | None = None
     regularity: float = 2.0
     modes: int | None = None
     longest: int = 2_000_000
 
     def __post_init__(self) -> None:
         require_number(f"kernel.step.{self.method}", self.step, above=0.0)
-        require_number("kernel.seconds", self.seconds, above=0.0)
+        if self.seconds is not None:
+            require_number("kernel.seconds", self.seconds, above=0.0)
         require_integer("kernel.longest", self.longest, 1)
 
     @property
     def name(self) -> str:
         return f"kernel {self.method}"
 
+    def in_time(self, seconds: float) -> KernelContender:
+        """The same within ``seconds``, where none are given."""
+        return self if self.seconds is not None else replace(self, seconds=seconds)
+
     def run(self, seed: int, judge: Judge, certificate: CertificateSettings | None) -> Curve:
         """Train, look at the bounds at growing counts outside the clock, and certify the end."""
         features = SobolevFeatures(self.problem.dim, self.regularity, modes=self.modes)
         iteration = Iteration(self.problem, self.method, self.bounds, (seed,), features=features)
         sizes = step_sizes(self.step, self.longest, SCHEDULE[self.method])
-        points, spent = [], 0.0
+        points, spent, most = [], 0.0, math.inf if self.seconds is None else self.seconds
         for count in due(500):
             stop = min(count, self.longest)
-            while iteration.n < stop and spent < self.seconds:
+            while iteration.n < stop and spent < most:
                 started = time.process_time()
                 iteration.advance(sizes[iteration.n : min(iteration.n + 2000, stop)])
                 spent += time.process_time() - started
             fields = iteration.fields(0)
             points.append(Point(iteration.samples, spent, judge(fields, OCCUPATION[self.method])))
-            if spent >= self.seconds or iteration.n >= self.longest:
+            if spent >= most or iteration.n >= self.longest:
                 break
         if certificate is None:
             return Curve(self.name, seed, points)

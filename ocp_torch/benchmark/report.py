@@ -13,6 +13,8 @@ from matplotlib.figure import Figure
 
 from ocp_torch.benchmark.curve import Curve, Point, median_and_spread
 
+# The certified gaps of all are held against that of the paper's primal-dual.
+BASELINE = "kernel pd"
 # "Reaches 1 %" in the table: the performance stays within so much of the optimum.
 TOLERANCE = 0.01
 
@@ -36,15 +38,19 @@ def table(curves: list[Curve], exact: float | None) -> str:
     off = lambda number: 100.0 * (number / optimum - 1.0)
     lines = [
         f"Per cent are relative to {what} = {optimum:.8g}; the gap is that of the full certificate at the end, relative "
-        "to the lower bound; seconds are CPU seconds of training, those of the certificate after the sign +.",
+        f"to the lower bound, and `times smaller` holds its median against that of {BASELINE}; seconds are CPU seconds of "
+        "training, those of the certificate after the sign +.",
         "",
-        "| contender | samples | seconds | F_M | J | G | Perf | gap, certified | 1 % on Perf after samples | seconds |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| contender | samples | seconds | F_M | J | G | Perf | gap, certified | times smaller "
+        "| 1 % on Perf after samples | seconds |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
+    widest = gaps(by_contender(curves).get(BASELINE, []))
     for name, own in by_contender(curves).items():
         ends = [c.points[-1] for c in own]
         number = lambda key, ends=ends: spread([off(p.numbers[key]) for p in ends if key in p.numbers], "+.3g", " %")
-        certified = [100.0 * c.certified for c in own if c.certified is not None]
+        certified = gaps(own)
+        ratio = median_and_spread(widest)[0] / median_and_spread(certified)[0] if widest and certified else math.nan
         hits = [c.first_within(TOLERANCE, optimum) for c in own]
         reached = [hit for hit in hits if hit is not None]
         few = "" if len(reached) == len(own) else f" ({len(reached)} of {len(own)} seeds)"
@@ -59,11 +65,34 @@ def table(curves: list[Curve], exact: float | None) -> str:
             number("G"),
             spread([off(p.perf) for p in ends if math.isfinite(p.perf)], "+.3g", " %"),
             spread(certified, ".3g", " %"),
+            f"{ratio:.3g}" if math.isfinite(ratio) else "-",
             spread([float(p.samples) for p in reached], ",.0f", "") + few if reached else "not reached",
             spread([p.seconds for p in reached], ".3g", "") if reached else "-",
         ]
         lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    return "\n".join([*lines, "", *winners(curves, optimum)])
+
+
+def winners(curves: list[Curve], optimum: float) -> list[str]:
+    """Who reaches the tolerance first with every seed, in samples and in CPU seconds, by the median over seeds."""
+    reached = {
+        name: [hit for c in own if (hit := c.first_within(TOLERANCE, optimum)) is not None]
+        for name, own in by_contender(curves).items()
+    }
+    sure = {name: hits for name, hits in reached.items() if len(hits) == len(by_contender(curves)[name])}
+    if not sure:
+        return []
+    found = []
+    for unit, measure in (("samples", lambda p: p.samples), ("seconds", lambda p: p.seconds)):
+        medians = {name: median_and_spread([measure(hit) for hit in hits])[0] for name, hits in sure.items()}
+        first = min(medians, key=medians.get)
+        found.append(f"1 % on Perf in the fewest {unit}: {first}, {medians[first]:,.6g}.")
+    return found
+
+
+def gaps(curves: list[Curve]) -> list[float]:
+    """The certified gaps, in per cent, of those that have both sides."""
+    return [100.0 * c.certified for c in curves if c.certified is not None]
 
 
 def spread(values: list[float], form: str, unit: str) -> str:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from ocp_torch.benchmark.kernels import OCCUPATION
 from ocp_torch.control_laws import control_laws, occupation_density
-from ocp_torch.paper.runs import History, circle
+from ocp_torch.paper.runs import Comparison, History, circle
 from ocp_torch.problems import Circle
 
 DISCOUNTS = (0.5, 1.0, 1.5, 2.0, 4.0)
@@ -45,19 +45,25 @@ def optimal_occupation() -> Figure:
 
 
 def evolution(history: History) -> Figure:
-    """The costs and performances in units of `OPT` against the number of steps; bands are the range over seeds."""
-    figure, (axis,) = _figure(1, width=6.5)
-    looks = list(history.numbers)
-    for k, name in enumerate(n for n in LABELS if n in history.numbers[looks[-1]][0]):
-        ratios = lambda look, name=name: [1.0 + m[name] / 100.0 for m in history.numbers[look] if name in m]
-        axis.plot(looks, [np.median(ratios(n)) for n in looks], marker=".", color=f"C{k}", label=LABELS[name])
-        if name not in ("value", "density"):
-            low, high = ([pick(ratios(n)) for n in looks] for pick in (min, max))
-            axis.fill_between(looks, low, high, color=f"C{k}", alpha=0.2)
+    """The costs and performances against the number of steps, in units of `OPT` and how far from it; bands are seeds."""
+    figure, (axis, distance) = _figure(2)
+    recipe, looks = history.recipe, list(history.numbers)
+    for k, name in enumerate(recipe.numbers):
+        percents = [[m[name] for m in history.numbers[n] if name in m] for n in looks]
+        ratios = [[1.0 + p / 100.0 for p in row] for row in percents]
+        away = [[abs(p) for p in row] for row in percents]
+        for where, rows in ((axis, ratios), (distance, away)):
+            where.plot(looks, [np.median(row) for row in rows], marker=".", color=f"C{k}", label=LABELS[name])
+            if min(map(len, rows)) > 1:
+                where.fill_between(
+                    looks, *([pick(row) for row in rows] for pick in (min, max)), color=f"C{k}", alpha=0.2
+                )
     axis.axhline(1.0, color="k", linestyle=":", label="OPT")
-    axis.set(xscale="log", xlabel="n", ylabel="cost / OPT", ylim=(0.4, 2.6 if history.recipe.method == "pd" else 1.4))
-    axis.set_title(f"{history.recipe.method}, section {history.recipe.section}")
+    axis.set(xscale="log", xlabel="n", title=f"{recipe.method}, section {recipe.section}: cost / OPT")
+    axis.set_ylim(0.4, 2.6 if "J" in recipe.numbers else 1.4)
     axis.legend(fontsize=8)
+    distance.set(xscale="log", yscale="log", xlabel="n", title="distance to OPT, %")
+    distance.grid(alpha=0.3)
     return figure
 
 
@@ -103,13 +109,13 @@ def iterates(history: History) -> Figure:
     return figure
 
 
-def costs(measured: dict[str, dict[str, list[tuple[int, float]]]]) -> Figure:
+def costs(comparisons: list[Comparison]) -> Figure:
     """CPU time per step against `n`: it grows for the exact kernel, and does not for truncated features."""
     figure, (axis,) = _figure(1, width=6.0)
-    for k, (method, forms) in enumerate(measured.items()):
+    for k, c in enumerate(comparisons):
         for form, style in (("exact", "-"), ("truncated", "--")):
-            n, seconds = zip(*forms[form], strict=True)
-            axis.plot(n, 1e6 * np.array(seconds), style, color=f"C{k}", label=f"{method}, {form}")
+            n, seconds = zip(*c.costs[form], strict=True)
+            axis.plot(n, 1e6 * np.array(seconds), style, color=f"C{k}", label=f"{c.method}, {form}", marker=".")
     axis.set(xlabel="n", ylabel="CPU time per step, µs", ylim=(0.0, None))
     axis.legend()
     return figure

@@ -14,11 +14,13 @@ DISCOUNT, OCCUPATION_BOUND, VALUE_BOUND = 2.0, 2.0, 2.0
 @dataclass(frozen=True)
 class Recipe:
     """``looks`` are the step counts at which the averages are measured, ``drawn`` those at which they are drawn, and
-    ``tabled`` those the table of numbers has; ``paper`` is what an independent re-implementation found there, in per cent
-    of `OPT`, as ranges over seeds."""
+    ``tabled`` those the table of numbers has. ``numbers`` are the method's own, in the order of the keys of
+    `figures.LABELS`; ``known`` is what an independent re-implementation found, in per cent of `OPT`, as ranges over seeds.
+    """
 
     method: str
     section: str
+    numbers: tuple[str, ...]
     step: float
     schedule: str
     looks: tuple[int, ...]
@@ -42,6 +44,7 @@ RECIPES = {
     "dual": Recipe(
         "dual",
         "4.4",
+        ("F_M", "value"),
         5e-4,
         "constant",
         SHORT,
@@ -57,6 +60,7 @@ RECIPES = {
     "primal": Recipe(
         "primal",
         "5.6",
+        ("G", "density"),
         2e-3,
         "constant",
         SHORT,
@@ -67,6 +71,7 @@ RECIPES = {
     "pd": Recipe(
         "pd",
         "6.3",
+        ("F_M", "J", "G", "value", "density"),
         1e-3,
         "decay",
         (2000, 5000, 10000, 20000, 50000, 100000, 150000, 200000),

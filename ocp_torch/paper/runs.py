@@ -21,6 +21,9 @@ from ocp_torch.problems import Circle
 
 Tick = Callable[[int], None]
 
+# Parts of a window whose time is taken.
+PARTS = 5
+
 
 def circle() -> tuple[Circle, Bounds]:
     """The paper's example and its constants."""
@@ -40,11 +43,7 @@ class History:
 
 
 def carry_out(recipe: Recipe, seeds: tuple[int, ...], modes: int, tick: Tick = lambda steps: None) -> History:
-    """All ``seeds`` of one recipe at once, with truncated features. ``tick`` is told the steps made.
-
-    Bounds are measured for every seed at every look; performances, which are simulated, of the first seed at every look
-    and of the others where the table wants them.
-    """
+    """All ``seeds`` of one recipe at once, with truncated features. ``tick`` is told the steps made."""
     problem, bounds = circle()
     iteration = Iteration(problem, recipe.method, bounds, seeds, features=SobolevFeatures(1, modes=modes))
     judge, history, sizes = Judge(problem, bounds), History(recipe), recipe.sizes
@@ -58,8 +57,7 @@ def carry_out(recipe: Recipe, seeds: tuple[int, ...], modes: int, tick: Tick = l
         history.numbers[look] = []
         for run in range(len(seeds)):
             fields = iteration.fields(run)
-            perf = run == 0 or look in recipe.tabled
-            measured = judge(fields, OCCUPATION[recipe.method], perf)
+            measured = judge(fields, OCCUPATION[recipe.method])
             history.numbers[look].append({k: relative(v, problem.exact_optimum) for k, v in measured.items()})
             if run == 0 and look in recipe.drawn:
                 history.fields[look] = fields
@@ -69,51 +67,47 @@ def carry_out(recipe: Recipe, seeds: tuple[int, ...], modes: int, tick: Tick = l
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """How far the averaged fields of the exact kernel and of its truncation are apart on the same samples."""
+class Comparison:
+    """The exact kernel beside its truncation on the same samples: how far the averaged fields are apart, and the cost."""
 
     method: str
     steps: int
     modes: int
     differences: dict[str, float]  # field -> largest difference on a grid, relative to the field's largest value
-    exact_seconds: float
-    truncated_seconds: float
+    costs: dict[str, list[tuple[int, float]]]  # exact, truncated -> n, and CPU seconds per step there
 
 
-def compare_with_exact(recipe: Recipe, steps: int, modes: int, seed: int) -> Agreement:
-    """The first ``steps`` of a recipe in both forms."""
+def compare_with_exact(
+    recipe: Recipe, steps: int, modes: int, seed: int, windows: int = 10, tick: Tick = lambda steps: None
+) -> Comparison:
+    """The first ``steps`` of a recipe in both forms, timed over consecutive ``windows``."""
     problem, bounds = circle()
-    features = SobolevFeatures(1, modes=modes)
-    sizes = recipe.sizes[:steps]
-    exact = Iteration(problem, recipe.method, bounds, (seed,), kernel=BernoulliKernel(2), capacity=2 * steps)
-    truncated = Iteration(problem, recipe.method, bounds, (seed,), features=features)
-    seconds = []
-    for iteration in (exact, truncated):
-        started = time.process_time()
-        iteration.advance(sizes)
-        seconds.append(time.process_time() - started)
+    make = lambda **form: Iteration(problem, recipe.method, bounds, (seed,), **form)
+    exact = make(kernel=BernoulliKernel(2), capacity=2 * steps)
+    truncated = make(features=SobolevFeatures(1, modes=modes))
+    forms = {"exact": exact, "truncated": truncated}
+    costs = {name: timed(form, recipe.sizes[:steps], windows, tick) for name, form in forms.items()}
     grid = np.linspace(0.0, 1.0, 201)[None, :, None]
     differences = {}
     for name, network in truncated.fields(0).networks.items():
         there = exact.expansions[name].at(grid, average=True)[0, :, 0, 0]
         here = network(torch.from_numpy(grid[0])).reshape(-1).numpy()
         differences[name] = float(np.abs(there - here).max() / np.abs(there).max())
-    return Agreement(recipe.method, steps, modes, differences, *seconds)
+    return Comparison(recipe.method, steps, modes, differences, costs)
 
 
-def cost_per_step(recipe: Recipe, steps: int, modes: int, window: int) -> dict[str, list[tuple[int, float]]]:
-    """CPU seconds per step of both forms, over consecutive windows: ``{"exact": [(n, seconds)], "truncated": ...}``."""
-    problem, bounds = circle()
-    forms = {
-        "exact": dict(kernel=BernoulliKernel(2), capacity=2 * steps),
-        "truncated": dict(features=SobolevFeatures(1, modes=modes)),
-    }
-    measured: dict[str, list[tuple[int, float]]] = {}
-    for name, form in forms.items():
-        iteration = Iteration(problem, recipe.method, bounds, (0,), **form)
-        measured[name] = []
-        while iteration.n < steps:
+def timed(iteration: Iteration, sizes: np.ndarray, windows: int, tick: Tick) -> list[tuple[int, float]]:
+    """Make all steps; at the end of each window, `n` and the CPU seconds per step of its fastest part.
+
+    The fastest of `PARTS`, because whatever else a machine does only ever slows a part down.
+    """
+    costs = []
+    for window in np.array_split(sizes, min(windows, len(sizes))):
+        per_step = []
+        for part in np.array_split(window, min(PARTS, len(window))):
             started = time.process_time()
-            iteration.advance(recipe.sizes[iteration.n : iteration.n + window])
-            measured[name].append((iteration.n, (time.process_time() - started) / window))
-    return measured
+            iteration.advance(part)
+            per_step.append((time.process_time() - started) / len(part))
+            tick(len(part))
+        costs.append((iteration.n, min(per_step)))
+    return costs
