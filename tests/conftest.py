@@ -5,6 +5,7 @@ import torch
 from hypothesis import Phase, settings
 
 import zoo
+from composing import quickly
 
 # The same examples on every run: a failure is then a change in the code, never luck. No shrinking: most examples are
 # seeds of networks, and a smaller seed is not a simpler network.
@@ -18,6 +19,13 @@ settings.load_profile("repeatable")
 def one_thread():
     """Small networks are faster on one thread, and sums are then added in one order."""
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def quick_composition():
+    """For modules that compose hundreds of configurations."""
+    with quickly():
+        yield
 
 
 @pytest.fixture(params=["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"])

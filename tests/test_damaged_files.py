@@ -17,6 +17,8 @@ from ocp_torch.training.monitor import Silent
 from ocp_torch.training.start import prepare
 from test_training import small
 
+pytestmark = pytest.mark.usefixtures("quick_composition")
+
 STATES = [{"step": k, "weights": torch.arange(100.0) + k} for k in range(6)]
 
 

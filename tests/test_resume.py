@@ -245,6 +245,8 @@ pathlib.Path({canary!r}).touch()
 import torch
 from ocp_torch import Problem
 
+pytestmark = pytest.mark.usefixtures("quick_composition")
+
 class Mine(Problem):
     def __init__(self, height=0.5):
         super().__init__(dim=1)

@@ -18,6 +18,8 @@ from ocp_torch.training.monitor import Silent
 from ocp_torch.training.session import run_session
 from test_config import configured
 
+pytestmark = pytest.mark.usefixtures("quick_composition")
+
 SMALL = (
     "experiment=debug",
     "model.width=8",
@@ -25,6 +27,8 @@ SMALL = (
     "trainer.batch=16",
     "trainer.evaluate_every=0",
     "trainer.device=cpu",
+    "certificate.tolerance=0.01",
+    "certificate.occupation_states=8",
 )
 METHODS = {
     "dual": ("method=dual",),
@@ -190,7 +194,7 @@ def test_a_run_leaves_exactly_the_documented_files(run):
 
 
 NUMBERS = {
-    "top": {"schema", "seed", "step", "samples", "train_seconds"},
+    "top": {"schema", "seed", "step", "samples", "train_seconds", "confidence"},
     "lower": {"F_M", "shifted"},
     "upper": {"J", "G", "lagrangian"},
     "perf": {"value", "density"},
@@ -206,8 +210,9 @@ def is_number(value) -> bool:
 def test_certificate_json_has_the_documented_schema_with_numbers_or_null(run):
     folder, config = run
     certificate = json.loads((folder / "certificate.json").read_text())
-    groups = {"lower", "upper", "perf", "baseline", "gap", "share", "assumptions"}
+    groups = {"lower", "upper", "perf", "baseline", "gap", "share", "suboptimality", "assumptions"}
     assert certificate.keys() == NUMBERS["top"] | groups | {"problem", "method", "exact", "warnings", "stopped"}
+    assert certificate["confidence"] == config["certificate"]["confidence"]
     assert certificate["stopped"] == "steps"
     assert all(is_number(certificate[name]) for name in NUMBERS["top"])
     assert (certificate["schema"], certificate["seed"], certificate["step"]) == (1, 5, 20)
@@ -218,18 +223,24 @@ def test_certificate_json_has_the_documented_schema_with_numbers_or_null(run):
     for group in ("lower", "upper", "perf", "baseline"):
         assert certificate[group].keys() == NUMBERS[group]
         for name, estimate in certificate[group].items():
-            wanted = {"value", "se", "bias"} if group in ("perf", "baseline") else {"value", "se"}
+            wanted = {"value", "se", "interval"} | ({"bias"} if group in ("perf", "baseline") else set())
             wanted |= {"controller"} if name == "lagrangian" else set()
-            assert estimate is None or estimate.keys() == wanted, name
-            assert estimate is None or all(is_number(v) for k, v in estimate.items() if k != "controller"), name
+            if estimate is None:
+                continue
+            assert estimate.keys() == wanted, name
+            low, high = estimate["interval"]
+            assert low <= estimate["value"] <= high
+            assert all(is_number(v) for k, v in estimate.items() if k not in ("controller", "interval")), name
     gap, share, assumptions = (certificate[group] for group in ("gap", "share", "assumptions"))
     assert gap.keys() == {"certified", "simulated", "lower_from", "upper_from"}
     assert gap["lower_from"] in (None, "F_M", "shifted")
     assert gap["upper_from"] in (None, "J", "G", "lagrangian")
     assert share.keys() == NUMBERS["share"]
-    constants = {"M", "C_V", "C_u", "estimated_sup_occupation", "sup_control"}
+    assert certificate["suboptimality"].keys() == {"at_least", "at_most"}
+    constants = {"M", "C_V", "C_u", "estimated_sup_occupation", "sup_control", "a_priori_sup_occupation"}
+    constants |= {"largest_value", "largest_jump", "smallest_state_cost", "initial_mass"}
     assert assumptions.keys() == constants | {"hold"}
-    numbers = [*share.values(), gap["certified"], gap["simulated"], *(assumptions[name] for name in constants)]
+    numbers = [*share.values(), *certificate["suboptimality"].values(), gap["certified"], gap["simulated"], *(assumptions[name] for name in constants)]
     assert all(value is None or is_number(value) for value in numbers)
     assert isinstance(assumptions["hold"], bool)
     assert all(isinstance(warning, str) for warning in certificate["warnings"])
