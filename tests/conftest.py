@@ -1,5 +1,7 @@
 """What every test shares: one thread, repeatable hypothesis examples, the devices there are, and the zoo as a fixture."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import Phase, settings
@@ -25,6 +27,17 @@ def one_thread():
 def quick_composition():
     """For modules that compose hundreds of configurations."""
     with quickly():
+        yield
+
+
+@pytest.fixture(scope="module")
+def cheap_looks():
+    """For modules whose looks on the way need not say much."""
+    from ocp_torch.training import trainer
+
+    little = replace(trainer.QUICK, points=64, replicates=2, trajectories=2, ascents=1, tolerance=0.01)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trainer, "QUICK", little)
         yield
 
 

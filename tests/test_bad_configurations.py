@@ -18,6 +18,7 @@ from ocp_torch.training.start import prepare
 pytestmark = pytest.mark.usefixtures("quick_composition")
 EXAMPLES = int(os.environ.get("OCP_TORCH_EXAMPLES", "500"))
 
+
 def entered(*arguments: str) -> tuple[int, str, str]:
     """Exit status and output of `scripts/train.py` with ``arguments``, where the run itself would only say so."""
     out, err = io.StringIO(), io.StringIO()

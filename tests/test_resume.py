@@ -22,6 +22,8 @@ from ocp_torch.training.start import prepare
 from test_config import configured
 from test_training import METHODS, SMALL, differences, small, state_of
 
+pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
+
 STEPPERS, SAMPLERS, OPTIMIZERS = ("simultaneous", "extragradient"), ("uniform", "sobol"), ("soap", "adam", "sgd")
 # Every method with every stepper; samplers and optimisers go round. (More combinations, once interrupted: test_training.)
 WAYS = [
@@ -49,7 +51,7 @@ class Recorder(Silent):
 
 @pytest.mark.parametrize("way", WAYS, ids=" ".join)
 def test_from_any_step_a_resumed_run_reaches_the_same_bits(way, tmp_path):
-    steps, made = (1, 7, 13), maker(*way)
+    steps, made = (1, 4, 7), maker(*way, "trainer.steps=10")
     whole = made()
     whole.fit(Recorder(tmp_path, *steps))
     for step in steps:
@@ -95,21 +97,23 @@ def test_random_numbers_that_a_problem_draws_itself_are_resumed_too(monkeypatch,
 @pytest.mark.parametrize("method", ["dual", "pd"])
 def test_with_other_steps_a_run_is_one_of_the_new_length(method, schedule, tmp_path):
     """Learning rates and the warm start are, at every step, those of a run that had that length from the start."""
-    way = (f"method={method}", f"schedule={schedule}", *(["schedule.every=7"] if schedule == "decay" else []))
+    way = (f"method={method}", f"schedule={schedule}", *(["schedule.every=3"] if schedule == "decay" else []))
     rates = lambda seen: type("Rates", (Silent,), {"stepped": lambda _, t, r, log: seen.__setitem__(t.step, told(t))})()
     told = lambda t: (t.stepper.learning_rates(), t.objective.needs_divergences)
     made = maker(*way)
-    made().fit(Recorder(tmp_path, 16, 20))
-    for start, steps in ((20, 60), (16, 60), (16, 18), (20, 12)):
-        wanted, seen = {}, {}
-        made(steps=steps).fit(rates(wanted))
+    made(steps=10).fit(Recorder(tmp_path, 8, 10))
+    wanted = {steps: {} for steps in (24, 9, 6)}
+    for steps, seen in wanted.items():
+        made(steps=steps).fit(rates(seen))
+    for start, steps in ((10, 24), (8, 24), (8, 9), (10, 6)):
+        seen = {}
         resumed = made(steps=steps)
         resumed.resume(tmp_path / f"{start}.pt")
         resumed.fit(rates(seen))
         assert list(seen) == list(range(start + 1, steps + 1))
         for step, (got, resting) in seen.items():
-            assert got == pytest.approx(wanted[step][0]), step
-            assert resting == wanted[step][1]
+            assert got == pytest.approx(wanted[steps][step][0]), step
+            assert resting == wanted[steps][step][1]
 
 
 def test_the_round_follows_the_new_length(tmp_path):
@@ -244,8 +248,6 @@ import pathlib
 pathlib.Path({canary!r}).touch()
 import torch
 from ocp_torch import Problem
-
-pytestmark = pytest.mark.usefixtures("quick_composition")
 
 class Mine(Problem):
     def __init__(self, height=0.5):

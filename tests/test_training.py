@@ -18,7 +18,7 @@ from ocp_torch.training.monitor import Silent
 from ocp_torch.training.session import run_session
 from test_config import configured
 
-pytestmark = pytest.mark.usefixtures("quick_composition")
+pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
 
 SMALL = (
     "experiment=debug",
@@ -96,26 +96,28 @@ def test_equal_seeds_give_equal_bits_and_another_seed_does_not():
 
 @pytest.mark.parametrize("way", WAYS, ids=" ".join)
 def test_an_interrupted_run_goes_on_to_the_same_bits(way, tmp_path):
+    way = (*way, "trainer.steps=12", "trainer.checkpoint_every=5")
     whole = small(*way)
     start = {k: v.clone() for k, v in whole.fields.state_dict().items()}
     whole.fit(Silent())
     assert differences(start, whole.fields.state_dict()) != []
     file = tmp_path / "last.pt"
     with pytest.raises(KeyboardInterrupt):
-        small(*way, "trainer.checkpoint_every=10").fit(Interruption(13), file)
+        small(*way).fit(Interruption(8), file)
     resumed = small(*way)
     resumed.resume(file)
-    assert resumed.step == 10
+    assert resumed.step == 5
     resumed.fit(Silent())
-    assert resumed.step == whole.step == 20
+    assert resumed.step == whole.step == 12
     assert differences(state_of(resumed), state_of(whole)) == []
 
 
-@pytest.mark.parametrize("sampler", ["uniform", "sobol"])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("sampler", "seed"), [("uniform", 0), ("sobol", 1)])
 def test_no_state_of_a_training_batch_is_ever_used_for_evaluation(sampler, seed, monkeypatch):
     # Float64 throughout: rounding training states alone would make them differ.
-    trainer = small("problem=torus", "method=dual", f"sampler={sampler}", "trainer.dtype=float64", f"seed={seed}")
+    little = ("certificate.points=128", "certificate.trajectories=2", "certificate.ascents=1")
+    way = ("problem=torus", "method=dual", f"sampler={sampler}", "trainer.dtype=float64", f"seed={seed}")
+    trainer = small(*way, *little)
     met: dict[str, set] = {"training": set(), "stage": set(), "evaluation": set()}
     phase, cost, fit = ["training"], trainer.problem.state_cost, certify.fit_closed_loop
 
@@ -170,7 +172,7 @@ RUNS = {
 @pytest.fixture(scope="module", params=RUNS, ids=lambda d: f"d={d}")
 def run(request, tmp_path_factory):
     """A finished run in its folder, and its configuration."""
-    trainer = small(*RUNS[request.param], "certificate.points=64", "certificate.ascents=2", "seed=5")
+    trainer = small(*RUNS[request.param], "certificate.points=64", "certificate.ascents=1", "seed=5")
     folder = tmp_path_factory.mktemp("run")
     session(trainer, folder)
     return folder, trainer.config
@@ -240,7 +242,8 @@ def test_certificate_json_has_the_documented_schema_with_numbers_or_null(run):
     constants = {"M", "C_V", "C_u", "estimated_sup_occupation", "sup_control", "a_priori_sup_occupation"}
     constants |= {"largest_value", "largest_jump", "smallest_state_cost", "initial_mass"}
     assert assumptions.keys() == constants | {"hold"}
-    numbers = [*share.values(), *certificate["suboptimality"].values(), gap["certified"], gap["simulated"], *(assumptions[name] for name in constants)]
+    numbers = [*share.values(), *certificate["suboptimality"].values(), gap["certified"], gap["simulated"]]
+    numbers += [assumptions[name] for name in constants]
     assert all(value is None or is_number(value) for value in numbers)
     assert isinstance(assumptions["hold"], bool)
     assert all(isinstance(warning, str) for warning in certificate["warnings"])
