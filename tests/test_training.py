@@ -33,7 +33,7 @@ SMALL = (
 METHODS = {
     "dual": ("method=dual",),
     "primal, mu closed": ("method=primal",),
-    "primal, mu a network": ("method=primal", "problem=manufactured", "problem.dim=1"),
+    "primal, mu a network": ("method=primal", "method.occupation=network"),
     "pd": ("method=pd",),
     "pd, plain": ("method=pd", "method.augmentation=0"),
 }
