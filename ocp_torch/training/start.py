@@ -13,6 +13,7 @@ from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.resume import (
     filled_from,
     keep_configuration,
+    latest_subfolder,
     load_state,
     require_same_run,
     result_of,
@@ -69,5 +70,6 @@ def train(config: dict, folder: Path) -> None:
         if result is not None:
             log.info("\n%s\n%s is finished; a larger trainer.steps would go on.", result, folder)
             return
+    if run.state is not None or latest_subfolder(folder) != folder / ".hydra":
         keep_configuration(folder, config)
     run_session(run.trainer, run.certificate_settings, folder)
