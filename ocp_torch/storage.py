@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -61,10 +62,11 @@ def sync(path: Path) -> None:
 
 
 def sweep_temporaries(folder: Path) -> None:
-    """Remove what a killed process left half-written in ``folder``."""
-    for leftover in folder.glob(".*.pt.*"):
-        with contextlib.suppress(OSError):
-            leftover.unlink()
+    """Remove what a process that was killed in `write_atomically` left half-written in ``folder``."""
+    for leftover in folder.glob(".*"):
+        if re.fullmatch(r"\..+\.(pt|json|safetensors|yaml)\.[a-z0-9_]{8}", leftover.name):
+            with contextlib.suppress(OSError):
+                leftover.unlink()
 
 
 def finite(data):

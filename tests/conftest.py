@@ -1,10 +1,13 @@
 """What every test shares: one thread, repeatable hypothesis examples, the devices there are, and the zoo as a fixture."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import Phase, settings
 
 import zoo
+from composing import quickly
 
 # The same examples on every run: a failure is then a change in the code, never luck. No shrinking: most examples are
 # seeds of networks, and a smaller seed is not a simpler network.
@@ -18,6 +21,24 @@ settings.load_profile("repeatable")
 def one_thread():
     """Small networks are faster on one thread, and sums are then added in one order."""
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def quick_composition():
+    """For modules that compose hundreds of configurations."""
+    with quickly():
+        yield
+
+
+@pytest.fixture(scope="module")
+def cheap_looks():
+    """For modules whose looks on the way need not say much."""
+    from ocp_torch.training import trainer
+
+    little = replace(trainer.QUICK, points=64, replicates=2, trajectories=2, ascents=1, tolerance=0.01)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trainer, "QUICK", little)
+        yield
 
 
 @pytest.fixture(params=["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"])

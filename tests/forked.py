@@ -11,8 +11,13 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import ocp_torch.training.start  # noqa: F401 (so that no child has to import it)
+import pytorch_optimizer  # noqa: F401 (so that no child has to import it)
+import torch
+
+import ocp_torch.training.start  # noqa: F401 (as above)
 from ocp_torch.launch import CHECKOUT
+
+torch.optim.SGD([torch.zeros(1, requires_grad=True)])  # the first optimiser of a process imports much more
 
 # A run of well under a second whose steps, looks, checkpoints and certificate all take a while to be killed in.
 TINY = (

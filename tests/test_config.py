@@ -12,6 +12,8 @@ from ocp_torch.errors import InputError
 from ocp_torch.launch import CONFIGS, composed, known_fields, register_resolvers
 from ocp_torch.training.trainer import Trainer
 
+pytestmark = pytest.mark.usefixtures("quick_composition")
+
 register_resolvers()
 
 

@@ -16,6 +16,8 @@ from ocp_torch.config import build_trainer
 from ocp_torch.storage import DIGEST_KEY, METADATA_KEY, digest
 from test_config import configured
 
+pytestmark = pytest.mark.usefixtures("quick_composition")
+
 SMALL = ("experiment=debug", "model.width=8", "trainer.device=cpu")
 METHODS = {
     "dual": ("method=dual", "problem=torus"),

@@ -17,6 +17,8 @@ from ocp_torch.training.monitor import Silent
 from ocp_torch.training.start import prepare
 from test_training import small
 
+pytestmark = pytest.mark.usefixtures("quick_composition")
+
 STATES = [{"step": k, "weights": torch.arange(100.0) + k} for k in range(6)]
 
 
@@ -163,12 +165,21 @@ def test_a_run_on_a_full_disk_stops_with_a_sentence_and_can_go_on_later(tmp_path
     assert newest(folder / "checkpoints")[0]["step"] == 40
 
 
-def test_what_a_killed_process_left_half_written_is_removed(tmp_path):
-    folder = tmp_path / "checkpoints"
-    save_checkpoint(folder / "last.pt", STATES[0])
-    (folder / ".last.pt.abc123").write_bytes(b"half")
-    storage.sweep_temporaries(folder)
-    assert [p.name for p in folder.iterdir()] == ["last.pt"]
+@pytest.mark.parametrize("name", ["last.pt", "certificate.json", "controller.safetensors", "config.yaml"])
+def test_what_a_killed_process_left_half_written_is_removed(name, tmp_path, monkeypatch):
+    def killed(path):
+        monkeypatch.setattr(Path, "unlink", lambda *_, **__: None)
+        raise KeyboardInterrupt
+
+    others = [tmp_path / other for other in (name, ".hidden.pt", f".{name}.bak", f"{name}.abcdefgh")]
+    for other in others:
+        other.touch()
+    with pytest.raises(KeyboardInterrupt):
+        storage.write_atomically(tmp_path / name, killed)
+    monkeypatch.undo()
+    assert len(list(tmp_path.iterdir())) == len(others) + 1
+    storage.sweep_temporaries(tmp_path)
+    assert sorted(tmp_path.iterdir()) == sorted(others)
 
 
 def test_a_run_goes_on_from_the_newest_good_checkpoint_and_says_which_was_not(tmp_path):

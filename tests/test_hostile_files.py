@@ -24,6 +24,8 @@ from ocp_torch.training.session import controller_of
 from ocp_torch.training.start import prepare
 from test_training import small
 
+pytestmark = pytest.mark.usefixtures("quick_composition")
+
 WAY = ("method=dual", "trainer.steps=3", "optimizer=adam")
 
 

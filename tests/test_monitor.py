@@ -9,6 +9,8 @@ from ocp_torch.samples import Samples
 from ocp_torch.training.monitor import Monitor, liouville_residual
 from test_training import METHODS, small
 
+pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
+
 DRIFTING = ("problem=manufactured", "problem.dim=2")
 WAYS = {**METHODS, "saddle with drift": ("method=pd", "method.augmentation=0", *DRIFTING), "pd with drift": DRIFTING}
 

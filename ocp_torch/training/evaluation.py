@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields, table
@@ -11,6 +12,7 @@ from ocp_torch.controller import Controller, load_controller
 from ocp_torch.errors import InputError, require_integer
 from ocp_torch.process import prepare
 from ocp_torch.training.settings import MOST_THREADS
+from ocp_torch.training.watch import hopeless
 
 log = logging.getLogger(__name__)
 
@@ -51,5 +53,8 @@ def certify_saved(controller: Controller, settings: CertificateSettings, seed: i
         run = Run(**{**vars(run), "seed": require_integer("seed", seed, 0)})
     trained = Trained(controller.fields, controller.occupation, build_network(controller.model))
     certificate = certify_fields(controller.problem, trained, controller.bounds, settings, run)
+    found = hopeless(controller.problem, controller.bounds, certificate, run.seed)
+    fresh = [note for note in found if note not in certificate.warnings]
+    certificate = replace(certificate, warnings=[*certificate.warnings, *fresh])
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
     return certificate

@@ -6,6 +6,7 @@ imported because a file names it.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import json
 import os
@@ -71,10 +72,10 @@ def saved_configuration(path: Path) -> dict:
     folder, checkpoint = locate(path)
     starts = sorted((folder / ".hydra").glob("resume_*"), key=_number, reverse=True) if folder else []
     for start in starts:
-        if (start / CONFIG).is_file():
+        # Until a start has been checked, its file is what was asked for, names a run, and may be half written.
+        with contextlib.suppress(InputError, OSError):
             config = read_configuration(start / CONFIG)
-            # Until a resume has been checked, its file is what was asked for, and still names the run.
-            if config.get("resume") is None:
+            if config.get("resume", "") is None and (start / CONFIG).read_bytes().endswith(b"\n"):
                 return config
     if folder is not None and (folder / ".hydra" / CONFIG).is_file():
         return {**read_configuration(folder / ".hydra" / CONFIG), "resume": None}
@@ -225,7 +226,7 @@ def result_of(folder: Path, state: dict, config: dict) -> str | None:
 
 
 def keep_configuration(folder: Path, config: dict) -> None:
-    """Write the configuration with which a run goes on beside its first start's."""
+    """Write the configuration with which a run goes on, or begins again, beside its first start's."""
     file = latest_subfolder(folder) / CONFIG
     text = yaml.safe_dump({**config, "resume": None}, sort_keys=False, allow_unicode=True)
     write_atomically(file, lambda temporary: temporary.write_text(text))

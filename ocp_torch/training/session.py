@@ -35,7 +35,8 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, fol
     """
     started = time.perf_counter()
     last = folder / "checkpoints" / LAST
-    sweep_temporaries(last.parent)
+    for place in (folder, last.parent, *folder.glob(".hydra/resume_*")):
+        sweep_temporaries(place)
     if trainer.step == 0:
         seed_generators(trainer.seed)
     log.info(summary(trainer))

@@ -8,10 +8,12 @@ from pathlib import Path
 
 from ocp_torch.certificate import CertificateSettings
 from ocp_torch.config import build_certificate_settings, build_trainer
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, require_integer
+from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.resume import (
     filled_from,
     keep_configuration,
+    latest_subfolder,
     load_state,
     require_same_run,
     result_of,
@@ -40,16 +42,22 @@ def prepare(config: dict) -> Prepared:
     config = dict(config)
     path = config.pop("resume", None)
     if path is None:
-        trainer = build_trainer(config)
+        trainer = _built(config)
         return Prepared(trainer, build_certificate_settings(trainer.config))
     state, checkpoint, notes = load_state(Path(path))
     made = state.get("config") if isinstance(state, dict) else None
     if not isinstance(made, dict):
         raise InputError(f"{checkpoint} is not the state of a run.")
-    trainer = build_trainer(filled_from(config, made))
+    trainer = _built(filled_from(config, made))
     require_same_run(trainer.config, made)
     trainer.resume(checkpoint)
     return Prepared(trainer, build_certificate_settings(trainer.config), state, tuple(notes))
+
+
+def _built(config: dict) -> Trainer:
+    """The trainer of ``config``: a problem that draws random numbers is met with the same ones in every process."""
+    seed_generators(require_integer("seed", config["seed"], 0))
+    return build_trainer(config)
 
 
 def train(config: dict, folder: Path) -> None:
@@ -62,5 +70,6 @@ def train(config: dict, folder: Path) -> None:
         if result is not None:
             log.info("\n%s\n%s is finished; a larger trainer.steps would go on.", result, folder)
             return
+    if run.state is not None or latest_subfolder(folder) != folder / ".hydra":
         keep_configuration(folder, config)
     run_session(run.trainer, run.certificate_settings, folder)

@@ -246,6 +246,7 @@ class Trainer:
 
     def load_state_dict(self, state: dict) -> None:
         """The way back from `state_dict`; see `restore` for what other `trainer.steps` mean."""
+        self._seen = None
         restore(self, state)
 
     def resume(self, checkpoint: Path) -> None:

@@ -17,6 +17,8 @@ from ocp_torch.samplers import evaluation_points
 GROWN_WEIGHTS, GROWN_LOSS = 100.0, 1e4
 # States on which the bound of the best constant V is computed.
 CONSTANT_STATES = 2**13
+# A lower bound that falls short of it by less is as good: networks round, and both are sampled.
+ROUNDING = 1e-4
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ def hopeless(problem: Problem, bounds: Bounds, certificate: Certificate, seed: i
     trained = [e for e in certificate.lower.values() if e is not None]
     constant = best_constant(problem, bounds, seed) if trained else None
     if constant is not None and certificate.assumptions.occupation_holds:
-        if lower is None or lower[1] + 2.0 * certificate.lower[lower[0]].se < constant:
+        if lower is None or lower[1] + 2.0 * certificate.lower[lower[0]].se < constant - ROUNDING * abs(constant):
             value = f"{lower[1]:.6g}" if lower else "not finite"
             notes.append(f"the lower bound, {value}, is worse than {constant:.6g}, that of the best constant V.")
     if perf is not None and zero is not None and zero.finite and perf[1] > zero.above:

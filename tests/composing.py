@@ -1,0 +1,40 @@
+"""Composition without reading every file again: for tests that compose hundreds of command lines."""
+
+from __future__ import annotations
+
+import contextlib
+
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from omegaconf import OmegaConf
+
+from ocp_torch import composition
+
+
+def is_field(override: str) -> bool:
+    """Whether it sets a field, not a choice of a group: ``trainer.steps=3``, ``seed=1``."""
+    name = override.split("=")[0]
+    return ("." in name and "@" not in name) or name in ("seed", "resume")
+
+
+@contextlib.contextmanager
+def quickly():
+    """Within, each choice of files is composed once; fields are then set by Hydra's own step, which reads none."""
+    real, kept = composition.compose, {}
+
+    def compose(config_name, overrides=()):
+        files = tuple(o for o in overrides if not is_field(o))
+        fields = composition.parsed([o for o in overrides if is_field(o) and not o.startswith("hydra.run.dir=")])
+        if any(o.is_sweep_override() for o in fields):
+            return real(config_name, list(overrides))
+        if (config_name, files) not in kept:
+            kept[config_name, files] = real(config_name, list(files))
+        config = kept[config_name, files].copy()
+        OmegaConf.set_struct(config, True)
+        ConfigLoaderImpl._apply_overrides_to_config(fields, config)
+        return config
+
+    composition.compose = compose
+    try:
+        yield
+    finally:
+        composition.compose = real
