@@ -29,7 +29,10 @@ def culprit(objective: Objective, fields: Fields, samples: Samples) -> str:
     for one in samples.split(1):
         where = f"at x = {[round(c, 6) for c in one.x[0].tolist()]}"
         cause = _bad_data(one)
-        alone = objective.losses(fields, one)
+        try:
+            alone = objective.losses(fields, one)
+        except RuntimeError:  # the loss is not a mean over states
+            return f"the loss of player {bad[0]!r} is not finite" if bad else "a gradient is not finite"
         for player in bad:
             if not torch.isfinite(alone[player]):
                 return f"the loss of player {player!r} is not finite {where}{cause}"
