@@ -1,6 +1,7 @@
 """A controller somebody brings: what it truly costs is inside what is printed, or it is refused in one sentence."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,14 +18,15 @@ from test_jumps import cost_of_switching
 
 TURN = 2.0 * math.pi
 CHEAP = CertificateSettings(
-    points=1024,
+    points=512,
     replicates=8,
-    trajectories=32,
-    ascents=8,
+    trajectories=8,
+    ascents=4,
     occupation_states=0,
-    tolerance=1e-3,
-    stage=StageSettings(steps=150, rounds=1, batch=128),
+    tolerance=1e-2,
+    stage=StageSettings(steps=100, rounds=1, batch=128),
 )
+UNFITTED = replace(CHEAP, stage=StageSettings(steps=0))
 
 
 def cost_by_itself(u, rho: float = 2.0, starts: int = 500, h: float = 0.01, horizon: float = 7.0) -> float:
@@ -75,16 +77,16 @@ def test_the_true_suboptimality_is_inside_the_printed_interval(name):
 
 
 def test_without_a_value_function_there_is_no_lower_bound():
-    certificate = certify(Circle(), lambda x: 0.0 * x, settings=CHEAP, train_steps=0)
+    certificate = certify(Circle(), lambda x: 0.0 * x, settings=UNFITTED, train_steps=0)
     assert certificate.best_lower is None
     assert certificate.suboptimality["at_most"] is None
     assert any("no lower bound" in w for w in certificate.warnings)
-    assert certificate.perf["given"].value == pytest.approx(1.0 / 12.0, rel=0.02)
+    assert certificate.perf["given"].value == pytest.approx(1.0 / 12.0, rel=0.1)
 
 
 def test_a_value_function_is_trained_where_none_is_given():
     problem = Circle()
-    certificate = certify(problem, lambda x: 0.0 * x, settings=CHEAP, train_steps=40)
+    certificate = certify(problem, lambda x: 0.0 * x, settings=UNFITTED, train_steps=40)
     name, _ = certificate.best_lower
     assert certificate.lower[name].interval(0.999)[0] <= problem.exact_optimum
     assert certificate.run.step == 40
@@ -93,8 +95,10 @@ def test_a_value_function_is_trained_where_none_is_given():
 def test_a_controller_of_ours_and_its_value():
     problem = Manufactured(dim=1)
     saved = controllers("dual")[0]
-    certificate = certify(saved.problem, saved, value=saved, settings=CHEAP)
-    assert certificate.perf["given"].value == pytest.approx(certificate.perf["value"].value, rel=1e-2)
+    quick = replace(UNFITTED, points=128, trajectories=2)
+    certificate = certify(saved.problem, saved, value=saved, settings=quick)
+    given, own = certificate.perf["given"], certificate.perf["value"]
+    assert abs(given.value - own.value) <= given.half_width(0.999) + own.half_width(0.999)
     with pytest.raises(InputError, match="but the problem has d = 3"):
         certify(Manufactured(dim=3), saved, settings=CHEAP)
     with pytest.raises(InputError, match="value gave"):

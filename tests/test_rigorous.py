@@ -105,7 +105,7 @@ def test_derivatives_far_out_are_finite(name):
     assert all(torch.isfinite(s).all() for s in SERIES[ACTIVATIONS[name]](6).series(z, 6))
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(
     dim=st.sampled_from([1, 2]),
     degree=st.integers(1, 5),
@@ -301,18 +301,17 @@ CASES = [(n, options) for n in ("circle rho=4", "manufactured 1-d q=1.5") for op
 @pytest.mark.parametrize(("name", "options"), CASES)
 def test_the_proved_supremum_and_integral_hold_what_a_fine_grid_meets_and_are_tight(name, options):
     problem = zoo.build(name)
-    for seed in (0, 1):
-        V = network(problem.dim, seed, **options)
-        x = grid(1, 40_001)
-        slack, mean = float(slack_function(problem, V)(x).max()), float((V(x) * problem.initial_density(x)).mean())
-        bound = rigorous_lower_bound(problem, V, tolerance=2e-4)
-        size = float(V(x).abs().mean())
-        assert bound.complete
-        assert slack <= bound.slack <= slack + 1e-3 * size
-        assert bound.integral[0] - 1e-9 <= mean <= bound.integral[1] + 1e-9
-        assert bound.integral[1] - bound.integral[0] <= 1e-3 * size
-        assert bound.value <= bound.integral[0] - bound.slack
-        assert bound.value <= problem.exact_optimum
+    V = network(problem.dim, CASES.index((name, options)), **options)
+    x = grid(1, 40_001)
+    slack, mean = float(slack_function(problem, V)(x).max()), float((V(x) * problem.initial_density(x)).mean())
+    bound = rigorous_lower_bound(problem, V, tolerance=2e-4)
+    size = float(V(x).abs().mean())
+    assert bound.complete
+    assert slack <= bound.slack <= slack + 1e-3 * size
+    assert bound.integral[0] - 1e-9 <= mean <= bound.integral[1] + 1e-9
+    assert bound.integral[1] - bound.integral[0] <= 1e-3 * size
+    assert bound.value <= bound.integral[0] - bound.slack
+    assert bound.value <= problem.exact_optimum
 
 
 @pytest.mark.slow
