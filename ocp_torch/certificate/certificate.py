@@ -210,7 +210,7 @@ def table(certificate: dict, searches: list[str] = ()) -> str:
     row("Perf: controller from V", certificate["perf"].get("value"))
     row("Perf: controller w/mu", certificate["perf"].get("density"))
     for name, estimate in certificate.get("perf_lower", {}).items():
-        row(f"Perf, from below: {name}", estimate)
+        row(f"Perf, at least: {name}", estimate)
     row("Perf: this controller", certificate["perf"].get("given"))
     for name, label in (("lagrangian", "Lagrangian"), ("evaluation", "evaluation"), ("G", "G"), ("J", "J")):
         row(f"upper: {label}", certificate["upper"].get(name))
