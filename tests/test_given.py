@@ -57,6 +57,7 @@ LAWS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_the_true_suboptimality_is_inside_the_printed_interval(name):
     problem, (law, truth) = Circle(), LAWS[name]
@@ -92,6 +93,7 @@ def test_a_value_function_is_trained_where_none_is_given():
     assert certificate.run.step == 40
 
 
+@pytest.mark.slow
 def test_a_controller_of_ours_and_its_value():
     problem = Manufactured(dim=1)
     saved = controllers("dual")[0]
