@@ -52,9 +52,9 @@ SMOOTH = {
 }
 SLOW = {
     "2-d slow discount": (partial(Manufactured, discount=0.3, seed=4), 64),
-    "3-d": (partial(Manufactured, dim=3), 27),
-    "3-d m=2": (partial(Manufactured, dim=3, control_dim=2, seed=2), 27),
-    "torus 3-d chain": (partial(Torus, dim=3), 27),
+    "3-d": (partial(Manufactured, dim=3), 18),
+    "3-d m=2": (partial(Manufactured, dim=3, control_dim=2, seed=2), 18),
+    "torus 3-d chain": (partial(Torus, dim=3), 24),
 }
 
 
