@@ -38,7 +38,8 @@ def table(curves: list[Curve], exact: float | None) -> str:
     off = lambda number: 100.0 * (number / optimum - 1.0)
     lines = [
         f"Per cent are relative to {what} = {optimum:.8g}; the gap is that of the full certificate at the end, relative "
-        f"to the lower bound, and `times smaller` holds its median against that of {BASELINE}; seconds are CPU seconds of "
+        f"to the lower bound, and `times smaller` holds its median against that of {BASELINE}; where a certificate uses no "
+        "upper bound (a controller that jumps), (min(J, G) - F_M) / F_M stands in for it, marked *; seconds are CPU seconds of "
         "training, those of the certificate after the sign +.",
         "",
         "| contender | samples | seconds | F_M | J | G | Perf | gap, certified | times smaller "
@@ -64,7 +65,7 @@ def table(curves: list[Curve], exact: float | None) -> str:
             number("J"),
             number("G"),
             spread([off(p.perf) for p in ends if math.isfinite(p.perf)], "+.3g", " %"),
-            spread(certified, ".3g", " %"),
+            spread(certified, ".3g", " %") + ("*" if certified and any(c.certified is None for c in own) else ""),
             f"{ratio:.3g}" if math.isfinite(ratio) else "-",
             spread([float(p.samples) for p in reached], ",.0f", "") + few if reached else "not reached",
             spread([p.seconds for p in reached], ".3g", "") if reached else "-",
@@ -91,8 +92,9 @@ def winners(curves: list[Curve], optimum: float) -> list[str]:
 
 
 def gaps(curves: list[Curve]) -> list[float]:
-    """The certified gaps, in per cent, of those that have both sides."""
-    return [100.0 * c.certified for c in curves if c.certified is not None]
+    """The certified gaps, in per cent; where a certificate has none, that of the bounds themselves, if there is one."""
+    found = [c.certified if c.certified is not None else c.points[-1].gap for c in curves]
+    return [100.0 * gap for gap in found if math.isfinite(gap)]
 
 
 def spread(values: list[float], form: str, unit: str) -> str:
