@@ -39,8 +39,8 @@ def table(curves: list[Curve], exact: float | None) -> str:
     lines = [
         f"Per cent are relative to {what} = {optimum:.8g}; the gap is that of the full certificate at the end, relative "
         f"to the lower bound, and `times smaller` holds its median against that of {BASELINE}; where a certificate uses no "
-        "upper bound (a controller that jumps), (min(J, G) - F_M) / F_M stands in for it, marked *; seconds are CPU seconds of "
-        "training, those of the certificate after the sign +.",
+        "upper bound (a controller that jumps), (min(J, G) - F_M) / F_M stands in for it, marked *; seconds are CPU "
+        "seconds of training, those of the certificate after the sign +.",
         "",
         "| contender | samples | seconds | F_M | J | G | Perf | gap, certified | times smaller "
         "| 1 % on Perf after samples | seconds |",
