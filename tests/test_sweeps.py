@@ -2,11 +2,14 @@
 
 import importlib.util
 import json
+import random
 import time
 
 import pytest
+import torch
 
 from forked import TINY, train
+from ocp_torch.launch import isolated
 from ocp_torch.training.checkpoint import load_checkpoint
 from test_training import differences
 
@@ -27,7 +30,6 @@ class Flat(Problem):
             raise RuntimeError("two\\nlines")
         if self.mood == "messy" and self.calls > 12:
             torch.set_default_dtype(torch.float64)
-            torch.set_num_threads(2)
             torch.manual_seed(int(random.random() * 1e6)); numpy.random.seed(3); random.seed(5)
         return 0.5 + 0.1 * torch.rand(len(x)).to(x)
 """
@@ -42,6 +44,24 @@ def mine(tmp_path):
     name = f"moods_{time.monotonic_ns()}"
     (tmp_path / f"{name}.py").write_text(MODULE)
     return f"problem._target_={name}.Flat"
+
+
+def test_a_job_leaves_threads_precision_and_generators_as_they_were():
+    """In this process: OpenMP must not get more threads in a fork of one that has used them."""
+    torch.manual_seed(3)
+    random.seed(3)
+    expected = torch.rand(1), random.random()
+    torch.manual_seed(3)
+    random.seed(3)
+    threads = torch.get_num_threads()
+    with isolated():
+        torch.set_num_threads(threads + 1)
+        torch.set_default_dtype(torch.float64)
+        torch.manual_seed(5)
+        random.seed(5)
+    assert torch.get_num_threads() == threads
+    assert torch.get_default_dtype() is torch.float32
+    assert (torch.rand(1), random.random()) == expected
 
 
 @pytest.mark.slow
