@@ -70,5 +70,5 @@ def _torchscript(path: Path) -> Callable:
     try:
         return torch.jit.load(str(path), map_location="cpu").eval()
     except Exception as error:  # the loader has no one type for a bad file
-        reason = next(iter(str(error).splitlines()), "")
+        reason = next(iter(str(error).splitlines()), "").split(". ")[0]
         raise InputError(f"{path} is not a TorchScript file ({reason}).") from None
