@@ -8,6 +8,8 @@ Proposition 9 of the paper). The closed forms are Lemmas 2 and 3, written throug
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 
 from ocp_torch.bounds import Bounds
@@ -18,7 +20,7 @@ from ocp_torch.problems.problem import Problem
 Jets = dict[str, np.ndarray]
 
 
-class Rule:
+class Rule(ABC):
     """``fields`` names what moves; calling it with a datum and jets gives the coefficients of the improving step."""
 
     fields: tuple[str, ...]
@@ -28,8 +30,9 @@ class Rule:
         self.rho, self.M, self.C_V, self.q = problem.discount, bounds.M, bounds.C_V, problem.exponent
         self.conjugate = self.q / (self.q - 1.0)
 
+    @abstractmethod
     def __call__(self, datum: Datum, jets: Jets) -> Jets:
-        raise NotImplementedError
+        """The coefficients of the improving step at ``datum``."""
 
     def _toward(self, w: np.ndarray, size: np.ndarray, speed: np.ndarray) -> np.ndarray:
         """`grad R(u) = |u|^{q-1} w / |w|` for `u` along `w` with the given speed; 0 where `w = 0`, ``(R, m)``."""
