@@ -31,8 +31,8 @@ PLAIN, GATED = dict(gated=False, activation="gelu", lr=3e-3), dict(gated=True, a
 
 # Kinks want Fourier modes, affordable in one and two dimensions; many dimensions want products and samples.
 BUDGETS = (
-    Budget(1, modes=6, width=96, **PLAIN, steps=2000, batch=256, good_gap=0.005, stage_steps=500),
-    Budget(2, modes=6, width=96, **PLAIN, steps=2500, batch=256, good_gap=0.002, stage_steps=600),
+    Budget(1, modes=6, width=96, **PLAIN, steps=1500, batch=256, good_gap=0.005, stage_steps=400),
+    Budget(2, modes=6, width=96, **PLAIN, steps=1500, batch=256, good_gap=0.005, stage_steps=600),
     Budget(4, modes=3, width=128, **PLAIN, steps=2500, batch=384, good_gap=0.005, stage_steps=600),
     Budget(8, modes=1, width=128, **GATED, steps=3500, batch=512, good_gap=0.01, stage_steps=600),
     Budget(inf, modes=1, width=128, **GATED, steps=5000, batch=512, good_gap=0.02, stage_steps=800),

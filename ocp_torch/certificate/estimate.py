@@ -44,6 +44,11 @@ class Estimate:
         """The value with its bias and two standard errors on top: what a simulated upper side may claim."""
         return self.value + (self.bias or 0.0) + 2.0 * self.se
 
+    @property
+    def below(self) -> float:
+        """The value less its bias and two standard errors."""
+        return self.value - (self.bias or 0.0) - 2.0 * self.se
+
     def half_width(self, level: float) -> float:
         """Half of the confidence interval at ``level``: Student's t times the standard error, and all of the bias."""
         factor = t_factor(level, self.replicates - 1) if self.replicates > 1 else 0.0

@@ -26,6 +26,8 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.samplers import derive_seed, evaluation_points
 from ocp_torch.samples import Samples
 
+# A kink of V is met at the start of a trajectory or never, and what is late counts little: early steps are shorter.
+GRADING = 2.0
 # Simulation sets come after those of the bounds in the stream of evaluation points.
 SIMULATION_REPLICATE = 1000
 # What is left of the discount when simulation stops, times the rate's supremum, relative to the answer.
@@ -106,7 +108,7 @@ def simulate_performance(
         integrate = lambda rows, count: rate_at(dynamics, x0[rows], rho, times[rows], count)
     else:
         longest = max(math.log(max(largest_rate / (TAIL * size), math.e)), 1.0) / rho
-        integrate = lambda rows, count: discounted_integral(dynamics, x0[rows], rho, longest, count)
+        integrate = lambda rows, count: discounted_integral(dynamics, x0[rows], rho, longest, count, grading=GRADING)
     speed = float(velocity.norm(dim=-1).max())
     steps = max(8, 2 * math.ceil(0.5 * longest * max(rho / 0.4, speed / 0.2)))
     generator = torch.Generator().manual_seed(derive_seed(seed, SIMULATION_REPLICATE))
