@@ -120,12 +120,10 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
     options = {k: v for k, v in model.items() if k != "name"}
     if model["name"] not in MODELS:
         raise InputError(f"{path} names the unknown model {model['name']!r}; known are {', '.join(MODELS)}.")
-    build = lambda: Fields.build(
-        problem, metadata["fields"], lambda **form: MODELS[model["name"]](**form, **options), 0
-    )
+    build = lambda: _blank(problem, metadata["fields"], MODELS[model["name"]], options)
     with torch.device("meta"):
         # Shapes first, without memory: a crafted size must not be allocated before it is refused.
-        shapes = {name: tuple(t.shape) for name, t in _sketch(problem, metadata["fields"], model, options).items()}
+        shapes = {name: tuple(t.shape) for name, t in build().state_dict().items()}
     held = {name: tuple(t.shape) for name, t in tensors.items()}
     if shapes != held:
         raise InputError(
@@ -135,7 +133,8 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
         raise InputError(f"{path} holds weights that are not finite.")
     if metadata["dtype"] not in ("float32", "float64"):
         raise InputError(f"{path} has dtype {metadata['dtype']!r}, but must have float32 or float64.")
-    fields = build().to(dtype=getattr(torch, metadata["dtype"]))
+    with torch.random.fork_rng(devices=[]):
+        fields = build().to(dtype=getattr(torch, metadata["dtype"]))
     fields.load_state_dict(tensors)
     fields = fields.to(device).requires_grad_(False)
     bounds = Bounds(**{**metadata["bounds"], "warnings": tuple(metadata["bounds"]["warnings"])})
@@ -151,11 +150,10 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
     )
 
 
-def _sketch(problem: Problem, names: list[str], model: dict, options: dict) -> dict[str, Tensor]:
-    """The state dict the fields would have, on whatever device is the default."""
-    network = MODELS[model["name"]]
+def _blank(problem: Problem, names: list[str], network: type, options: dict) -> Fields:
+    """Fields to load a state into, on whatever device is the default."""
     outputs = {"value": None, "control_density": problem.control_dim, "log_occupation": None}
-    return Fields({n: network(dim=problem.dim, outputs=outputs[n], **options) for n in names}).state_dict()
+    return Fields({n: network(dim=problem.dim, outputs=outputs[n], **options) for n in names})
 
 
 def _require_plain_run(path: Path, certificate: object, config: object) -> None:

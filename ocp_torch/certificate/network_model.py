@@ -57,15 +57,13 @@ class SmoothModel:
         return TaylorModel(self.P, self.radii[0], self.basis), TaylorModel.stack(slopes)
 
 
-def embed(box: Box, modes: int) -> SmoothModel:
-    """`FourierEmbedding` over ``box``, in its order: all cosines, then all sines, coordinate by coordinate."""
-    d, m = box.centre.shape[1], box.degree
-    k = torch.arange(1.0, modes + 1.0, dtype=box.centre.dtype)
-    waves = (torch.eye(d, dtype=k.dtype).unsqueeze(1) * k[:, None]).reshape(d * modes, d)
-    phases = torch.zeros(d * modes, dtype=k.dtype)
+def embed(box: Box, waves: Tensor) -> SmoothModel:
+    """`FourierEmbedding` with wave vectors ``waves`` ``(J, d)`` over ``box``: all cosines, then all sines."""
+    m = box.degree
+    phases = torch.zeros(len(waves), dtype=waves.dtype)
     # sin = cos of a quarter turn less; the rounding of the phase is below that of the angle, counted twice over.
     both = box.cosine(torch.cat([waves, waves]), torch.cat([phases, phases - 0.5 * math.pi]))
-    reach = 2.0 * math.pi * box.half.unsqueeze(1) * waves  # (N, J, d)
+    reach = 2.0 * math.pi * box.half.unsqueeze(1) * waves.abs()  # (N, J, d)
     total = reach.sum(dim=-1, keepdim=True)
     left_out = total**m / math.factorial(m) + 16.0 * m * ROUNDING * total.exp()
     slope = upward(reach * left_out).permute(2, 0, 1).repeat(1, 1, 2)
@@ -187,7 +185,7 @@ def _majorant(coefficients: list[Tensor], levels: list[Tensor], m: int) -> list[
 
 def network_model(network: PeriodicMLP, box: Box) -> tuple[TaylorModel, TaylorModel]:
     """`V` ``(N,)`` and `grad V` ``(N, d)`` over ``box``, for a scalar float64 `PeriodicMLP`."""
-    model = embed(box, network.embedding.modes)
+    model = embed(box, network.embedding.waves(box.centre.shape[1]))
     for layer in network.body:
         if isinstance(layer, nn.Linear):
             model = affine(model, layer.weight, layer.bias)

@@ -11,18 +11,36 @@ from ocp_torch.errors import require_integer
 
 
 class FourierEmbedding(nn.Module):
-    """`x -> (cos 2 pi k x_i, sin 2 pi k x_i)` for `k = 1..modes` and each coordinate: ``(..., d) -> (..., 2 d modes)``.
+    """`x -> (cos 2 pi k . x, sin 2 pi k . x)`: ``(..., d) -> (..., 2 d modes + 2 waves)``.
 
-    States are wrapped to `[0, 1)` first, so that states far from the unit cell lose no precision.
+    The wave vectors `k` are `1..modes` times each unit vector, then ``waves`` more that `mix` sets and the state dict
+    keeps; until then they are 0. States are wrapped to `[0, 1)` first, so that states far from the unit cell lose no
+    precision.
     """
 
-    def __init__(self, dim: int, modes: int) -> None:
+    def __init__(self, dim: int, modes: int, waves: int = 0) -> None:
         super().__init__()
-        self.modes = require_integer("model.modes", modes, 1, maximum=1024)
-        self.width = 2 * dim * modes
+        modes = require_integer("model.modes", modes, 1, maximum=1024)
+        waves = require_integer("model.waves", waves, 0, maximum=4096)
+        self.width = 2 * (dim * modes + waves)
         # Whole numbers are exact in every precision; multiples of pi would not survive a change of it.
         self.register_buffer("wave_numbers", torch.arange(1.0, modes + 1.0), persistent=False)
+        self.register_buffer("mixed", torch.zeros(waves, dim) if waves else None)
+
+    def mix(self, waves: Tensor) -> None:
+        """Take the wave vectors ``waves`` ``(W, d)``, of which there may be fewer than room is left for."""
+        if self.mixed is not None:
+            self.mixed[: len(waves)] = waves[: len(self.mixed)]
+
+    def waves(self, dim: int) -> Tensor:
+        """All wave vectors, ``(J, d)``, in the order of `forward`."""
+        single = (torch.eye(dim).to(self.wave_numbers).unsqueeze(1) * self.wave_numbers[:, None]).flatten(0, 1)
+        return single if self.mixed is None else torch.cat([single, self.mixed])
 
     def forward(self, x: Tensor) -> Tensor:
-        angles = 2.0 * math.pi * ((x - x.floor()).unsqueeze(-1) * self.wave_numbers).flatten(-2)
+        wrapped = x - x.floor()
+        turns = (wrapped.unsqueeze(-1) * self.wave_numbers).flatten(-2)
+        if self.mixed is not None:
+            turns = torch.cat([turns, wrapped @ self.mixed.T], dim=-1)
+        angles = 2.0 * math.pi * turns
         return torch.cat([angles.cos(), angles.sin()], dim=-1)

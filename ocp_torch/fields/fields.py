@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor, nn
 
 from ocp_torch.errors import InputError
+from ocp_torch.fields.embedding import FourierEmbedding
+from ocp_torch.fields.spectrum import STATES, prominent_waves
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samplers import scrambled_sobol
+from ocp_torch.samples import Samples
 
 VALUE, CONTROL_DENSITY, LOG_OCCUPATION = "value", "control_density", "log_occupation"
 # Builds a network from (dim, outputs, shift, scale); outputs None means a scalar field.
@@ -26,7 +30,10 @@ class Fields(nn.Module):
 
     @classmethod
     def build(cls, problem: Problem, names: Iterable[str], network: NetworkFactory, seed: int) -> Fields:
-        """Fresh networks for ``names`` in the units of ``problem``, initialised from ``seed`` alone."""
+        """Fresh networks for ``names`` in the units of ``problem``, initialised from ``seed`` alone.
+
+        An embedding with room for them gets the problem's `prominent_waves`.
+        """
         cost, control = typical_sizes(problem)
         forms = {
             VALUE: dict(outputs=None, shift=cost[0], scale=cost[1]),
@@ -35,7 +42,12 @@ class Fields(nn.Module):
         }
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            return cls({name: network(dim=problem.dim, **forms[name]) for name in names})
+            fields = cls({name: network(dim=problem.dim, **forms[name]) for name in names})
+        embeddings = [m for m in fields.modules() if isinstance(m, FourierEmbedding) and m.mixed is not None]
+        if embeddings and not embeddings[0].mixed.is_meta:
+            for embedding in embeddings:
+                embedding.mix(_waves(problem, len(embedding.mixed)))
+        return fields
 
     @property
     def value(self) -> nn.Module | None:
@@ -58,6 +70,19 @@ class Fields(nn.Module):
     def parameters_of(self, names: Iterable[str]) -> list[nn.Parameter]:
         """The trainable parameters of the fields ``names``, in a fixed order."""
         return [p for name in names for p in self.networks[name].parameters() if p.requires_grad]
+
+
+# What was found for a problem: the search takes seconds in eight dimensions, and the stage builds networks again.
+_found: WeakKeyDictionary[Problem, dict[int, Tensor]] = WeakKeyDictionary()
+
+
+def _waves(problem: Problem, count: int) -> Tensor:
+    """`prominent_waves` of the problem's data at random states, the same ones always."""
+    known = _found.setdefault(problem, {})
+    if count not in known:
+        x = torch.rand(STATES, problem.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        known[count] = prominent_waves(Samples.of(problem, x, divergences=False), count)
+    return known[count]
 
 
 def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:

@@ -40,6 +40,7 @@ class PeriodicMLP(nn.Module):
         depth: int = 3,
         activation: str = "gelu",
         gated: bool = False,
+        waves: int = 0,
         shift: float = 0.0,
         scale: float = 1.0,
     ) -> None:
@@ -47,7 +48,7 @@ class PeriodicMLP(nn.Module):
         width = require_integer("model.width", width, 1, maximum=2**14)
         depth = require_integer("model.depth", depth, 1, maximum=64)
         activate = ACTIVATIONS[require_choice("model.activation", activation, ACTIVATIONS)]
-        self.embedding = FourierEmbedding(dim, modes)
+        self.embedding = FourierEmbedding(dim, modes, waves)
         sizes = [self.embedding.width] + [width] * depth
         require_flag("model.gated", gated)
         layers: list[nn.Module] = []

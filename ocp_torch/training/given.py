@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 # Branch of the seed tree for the V trained here, beside those of runs, evaluation and the stage.
 JUDGE_STREAM = 4
-MODEL = {"name": "mlp", "modes": None, "width": None, "depth": 3, "activation": None, "gated": None}
+MODEL = {"name": "mlp", "modes": None, "waves": None, "width": None, "depth": 3, "activation": None, "gated": None}
 
 
 def certify(
