@@ -33,8 +33,9 @@ def network(dim: int, seed: int, **options) -> PeriodicMLP:
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         built = PeriodicMLP(
-            dim, **{"modes": 2, "width": 12, "depth": 2, "shift": 0.1, "scale": 0.7, **options}
+            dim, **{"modes": 2, "waves": 2, "width": 12, "depth": 2, "shift": 0.1, "scale": 0.7, **options}
         ).double()
+        built.embedding.mix(torch.tensor([[1.0, -2.0, 0.0], [1.0, 1.0, 1.0]])[:, :dim])
         for module in built.modules():
             if isinstance(module, torch.nn.Linear):
                 torch.nn.init.normal_(module.bias, std=0.5)
@@ -167,7 +168,7 @@ def test_the_embedding_alone_holds(degree):
     for level in (1, 3, 6):
         box = random_box(2, level, degree, 0)
         t = corners_and_inside(box)
-        value, slopes = embed(box, 3).models(box.half)
+        value, slopes = embed(box, embedding.waves(2)).models(box.half)
         gradient = torch.func.vmap(torch.func.jacrev(embedding))
         assert holds(value, flat(embedding, box, t), t)
         assert holds(slopes, flat(gradient, box, t), t)
@@ -194,8 +195,9 @@ def test_rounding_is_enclosed_on_the_smallest_cells(gated):
     box = Box(box.centre, torch.full_like(box.half, 2.0**-32), 3)
     value, gradient = network_model(V, box)
     exact = lambda p: p.numpy().astype(np.longdouble)
-    x, (k,) = exact(box.centre), (np.arange(1, 3, dtype=np.longdouble),)
-    angles = (2 * np.longdouble("3.14159265358979323846264338327950288") * (x[..., None] * k)).reshape(len(x), -1)
+    x = exact(box.centre)
+    waves = np.array([[1, 0], [2, 0], [0, 1], [0, 2], [1, -2], [1, 1]], dtype=np.longdouble)
+    angles = 2 * np.longdouble("3.14159265358979323846264338327950288") * (x @ waves.T)
     h = np.concatenate([np.cos(angles), np.sin(angles)], axis=-1)
     line = lambda layer, h: h @ exact(layer.weight).T + exact(layer.bias)
     for layer in V.body:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ocp_torch import calculus, formulas
 from ocp_torch.calculus import Field
+from ocp_torch.certificate.control_variate import integrals
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.shifted import SlackParts, best_shift, slack_function
 from ocp_torch.control_laws import Density
@@ -44,13 +45,14 @@ class LowerSide:
 
 def lower_side(problem: Problem, value: Field, sets: list[Samples], M: float, ascents: int = 32) -> LowerSide:
     r"""`F_M(V) = E[V mu0 - M max(Q, 0)]` (section 4.1) and the shifted bound (`ocp_torch.certificate.shifted`)."""
-    violation, initial, pieces = [], [], []
+    violation, started, pieces = [], [], []
     for samples in sets:
         v, gradient = chunked_gradient(value, samples.x)
         parts = SlackParts.of(samples, v, gradient, problem.control_cost, problem.discount)
-        initial.append(integral(samples, v * samples.mu0))
+        started.append(v * samples.mu0)
         violation.append(integral(samples, parts.slack(1.0).clamp_min(0.0)))
         pieces.append(parts)
+    initial = integrals([samples.x for samples in sets], started)
     theta, largest = best_shift(problem, value, SlackParts.join(pieces), sum(initial) / len(initial), ascents)
     return LowerSide(M, initial, violation, theta, largest)
 

@@ -29,21 +29,23 @@ def prominent_waves(samples: Samples, count: int) -> Tensor:
     A wave counts only where its coefficient is beyond what sampling noise shows anywhere: none is found in data without
     interaction. Of `k` and `-k` one is given.
     """
-    dim = samples.x.shape[1]
-    if count == 0 or dim == 1:
+    return waves_of(samples.x, _channels(samples), count, entries=2)
+
+
+def waves_of(x: Tensor, functions: list[Tensor], count: int, entries: int = 1) -> Tensor:
+    """The same for ``functions`` ``(N,)`` of mean 0 and variance 1 at random states ``x``: waves of at least ``entries``
+    non-zero entries."""
+    dim = x.shape[1]
+    if count == 0 or dim < entries or not functions:
         return torch.zeros(0, dim)
     left, right = candidate_parts(dim)
-    channels = _channels(samples)
-    if not len(channels):
-        return torch.zeros(0, dim)
     score = torch.zeros(len(left), len(right))
     significant = torch.zeros(score.shape, dtype=torch.bool)
-    x = samples.x.float()
-    E_left, E_right = (torch.polar(torch.ones(()), -2.0 * math.pi * (x @ k.T)) for k in (left, right))
-    bar = math.log(score.numel() * len(channels)) + MARGIN
-    for y in channels:
-        # Under noise alone N |c|^2 is exponential with mean 1, for a channel of variance 1.
-        power = len(x) * ((E_left * y.unsqueeze(-1)).T @ E_right / len(x)).abs().square()
+    E_left, E_right = (torch.polar(torch.ones(()), -2.0 * math.pi * (x.float() @ k.T)) for k in (left, right))
+    bar = math.log(score.numel() * len(functions)) + MARGIN
+    for y in functions:
+        # Under noise alone N |c|^2 is exponential with mean 1.
+        power = len(x) * ((E_left * y.float().unsqueeze(-1)).T @ E_right / len(x)).abs().square()
         score += power
         significant |= power > bar
     order = torch.where(significant, score, 0.0).flatten().argsort(descending=True)[: int(significant.sum())]
@@ -51,7 +53,7 @@ def prominent_waves(samples: Samples, count: int) -> Tensor:
     for i in order.tolist():
         wave = left[i // len(right)] + right[i % len(right)]
         first = next((e for e in wave.tolist() if e), 0.0)
-        if int((wave != 0).sum()) >= 2:
+        if int((wave != 0).sum()) >= entries:
             found.setdefault(tuple((wave * math.copysign(1.0, first)).tolist()))
         if len(found) == count:
             break
@@ -66,7 +68,8 @@ def candidate_parts(dim: int) -> tuple[Tensor, Tensor]:
     half = dim // 2
     for K in range(HIGHEST, 1, -1):
         if (2 * K + 1) ** dim <= MOST_SUMS:
-            grid = lambda n, K=K: torch.cartesian_prod(*[torch.arange(-K, K + 1.0)] * n).reshape(-1, n)
+            axis = torch.arange(-K, K + 1.0)
+            grid = lambda n, axis=axis: torch.cartesian_prod(*[axis] * n).reshape(-1, n) if n else torch.zeros(1, 0)
             pad = lambda waves, before: torch.nn.functional.pad(waves, (before, dim - before - waves.shape[1]))
             return pad(grid(half), 0), pad(grid(dim - half), half)
     zero = torch.zeros(1, dim)
@@ -90,10 +93,12 @@ def _channels(samples: Samples) -> list[Tensor]:
         raw += list((entries.float() @ mix).T)
     channels = []
     for y in raw:
-        y = y.float() * samples.weight.float()
-        size = float(y.abs().mean())
-        centred = y - y.mean()
-        spread = float(centred.std())
-        if spread > 1e-5 * size:
-            channels.append(centred / spread)
+        channels += standardised(y.float() * samples.weight.float())
     return channels
+
+
+def standardised(y: Tensor) -> list[Tensor]:
+    """``y`` with mean 0 and variance 1, as a list; empty where it is constant."""
+    centred = y - y.mean()
+    spread = float(centred.std())
+    return [centred / spread] if spread > 1e-5 * float(y.abs().mean()) else []
