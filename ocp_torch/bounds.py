@@ -44,7 +44,8 @@ def resolve_bounds(
     """Each bound from the configuration if it was set there, else from the problem, else estimated with a warning.
 
     `OPT <= J` needs `C_V >= sup V*`, for which `sup f` will do (Proposition 1); `C_u` is that of Proposition 2 where
-    `a = 0` and an estimate by the same formula with the least-squares `alpha` (`B alpha = a`) otherwise.
+    `a = 0` and an estimate by the same formula with the least-squares `alpha` (`B alpha = a`) otherwise. A limit on the
+    control is a `C_u` that is known.
     """
     chosen: dict[str, float] = {}
     sources: dict[str, str] = {}
@@ -61,9 +62,14 @@ def resolve_bounds(
             room = MARGIN if name == "C_V" else 1.0
             chosen[name], sources[name] = room * float(known[name]), FROM_PROBLEM
         else:
+            if name == "C_u" and problem.control_limit is not None:
+                chosen[name], sources[name] = problem.control_limit, FROM_PROBLEM
+                continue
             chosen[name], why = _ESTIMATES[name](problem)
             sources[name] = ESTIMATED
             notes.append(f"{name} is not known: {chosen[name]:.4g} is {why}; {fields[name]} sets it.")
+    if problem.control_limit is not None:
+        chosen["C_u"] = min(chosen["C_u"], problem.control_limit)
     if sources["M"] == FROM_CONFIGURATION and problem.occupation_bound is not None:
         if chosen["M"] < problem.occupation_bound:
             true = f"{problem.occupation_bound:.4g}" if math.isfinite(problem.occupation_bound) else "infinite"

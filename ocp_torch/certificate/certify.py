@@ -24,7 +24,7 @@ from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.sides import CHUNK, LowerSide, lower_side, upper_side
 from ocp_torch.certificate.stage import fit_closed_loop
 from ocp_torch.certificate.wellposed import WellPosed, check_problem
-from ocp_torch.control_laws import CLOSED, ControlLaw, control_laws, occupation_density, zero_law
+from ocp_torch.control_laws import CLOSED, ControlLaw, admissible_density, control_laws, occupation_density, zero_law
 from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -83,7 +83,7 @@ def certify_fields(
     J = G = None
     if has_density and problem.gives_divergences:
         mu = occupation_density(occupation, problem, fields, bounds)
-        J, G = upper_side(problem, fields.control_density, mu, few, bounds.C_V)
+        J, G = upper_side(problem, admissible_density(occupation, problem, fields, bounds), mu, few, bounds.C_V)
         with torch.no_grad():
             vanishes = any(bool((mu(samples.x[:4096]) <= 0.0).any()) for samples in few)
         if best == "density" and vanishes:

@@ -75,4 +75,5 @@ def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:
     spread = float(f.std())
     mean = float(f.mean())
     spread = spread if spread > 1e-12 * max(abs(mean), 1e-300) else max(abs(mean), 1.0)
-    return (mean, spread), math.pow(problem.exponent * spread, 1.0 / problem.exponent)
+    control = math.pow(problem.exponent * spread, 1.0 / problem.exponent)
+    return (mean, spread), control if problem.control_limit is None else min(control, problem.control_limit)

@@ -34,7 +34,7 @@ class NetworkPrimal(Objective):
     occupation = control_laws.NETWORK
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        w, inflow = formulas.controlled_inflow(samples, fields.control_density, self.rho)
+        w, inflow = formulas.controlled_inflow(samples, self.admissible(fields), self.rho)
         mu, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
         return {
             "density": samples.mean(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch import calculus
-from ocp_torch.control_cost import PowerCost
+from ocp_torch.control_limit import control_cost
 from ocp_torch.enclosure import Enclosure, Lipschitz, lipschitz_enclosure
 from ocp_torch.errors import InputError, require_integer, require_number
 from ocp_torch.taylor import Box
@@ -25,14 +25,22 @@ class Problem:
 
     All methods are batched, take states ``(N, d)``, work in the precision and on the device of their argument, and have
     period 1 in each coordinate. Arguments of `__init__`: ``dim`` is `d`, ``control_dim`` is `m` (default `d`),
-    ``discount`` is `rho > 0` (per unit time), ``exponent`` is `q` in (1, 2]. Raises `InputError` outside these ranges.
+    ``discount`` is `rho > 0` (per unit time), ``exponent`` is `q` in (1, 2], ``control_limit`` is `c > 0` where controls
+    must satisfy `|u| <= c` (Euclidean), else `None`. Raises `InputError` outside these ranges.
 
     Attributes a subclass may set, each `None` where unknown: ``state_cost_bound >= sup f``; ``occupation_bound >= sup
     mu*`` (`math.inf` when known to be unbounded); ``control_bound >= sup |u*|``; ``value_bound >= sup V*``;
     ``exact_optimum``, the number `OPT`; ``lipschitz``, constants of the data (`Lipschitz`).
     """
 
-    def __init__(self, dim: int, control_dim: int | None = None, discount: float = 2.0, exponent: float = 2.0) -> None:
+    def __init__(
+        self,
+        dim: int,
+        control_dim: int | None = None,
+        discount: float = 2.0,
+        exponent: float = 2.0,
+        control_limit: float | None = None,
+    ) -> None:
         self.dim = require_integer("problem.dim", dim, 1, maximum=MOST_COORDINATES)
         self.control_dim = (
             self.dim
@@ -41,7 +49,8 @@ class Problem:
         )
         self.discount = require_number("problem.discount", discount, above=0.0, at_least=1e-6, at_most=1e6)
         self.exponent = require_number("problem.exponent", exponent, above=1.0, at_most=2.0)
-        self.control_cost = PowerCost(self.exponent)
+        self.control_cost = control_cost(self.exponent, control_limit)
+        self.control_limit = None if control_limit is None else float(control_limit)
         self.state_cost_bound: float | None = None
         self.occupation_bound: float | None = None
         self.control_bound: float | None = None

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from ocp_torch import calculus, formulas
 from ocp_torch.certificate import Certificate
-from ocp_torch.control_laws import occupation_density
+from ocp_torch.control_laws import admissible_density, occupation_density
 from ocp_torch.samples import Samples
 from ocp_torch.steppers import StepReport
 
@@ -28,8 +28,9 @@ def liouville_residual(trainer, batch: Samples) -> dict[str, Tensor]:
     samples = Samples.of(problem, batch.x)
     if samples.div_a is None or samples.div_B is None:
         return {}
-    _, inflow = formulas.controlled_inflow(samples, fields.control_density, rho)
-    density = occupation_density(trainer.objective.occupation, problem, fields, trainer.bounds)
+    form = (trainer.objective.occupation, problem, fields, trainer.bounds)
+    _, inflow = formulas.controlled_inflow(samples, admissible_density(*form), rho)
+    density = occupation_density(*form)
     if problem.driftless:
         loss = density(samples.x)
     else:
