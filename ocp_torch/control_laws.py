@@ -86,7 +86,8 @@ def control_laws(kind: str | None, problem: Problem, fields: Fields, bounds: Bou
     laws = {}
     if fields.value is not None:
         laws["value"] = ValueLaw(problem, fields.value)
-    if fields.control_density is not None:
+    # Lemmas 2 and 3 give mu from the cost at the state itself.
+    if fields.control_density is not None and (kind == NETWORK or problem.evaluable):
         mu = occupation_density(kind, problem, fields, bounds)
         laws["density"] = density_law(fields.control_density, mu, problem.control_cost)
     return laws

@@ -6,11 +6,10 @@ import math
 from collections.abc import Callable, Iterable
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from ocp_torch.errors import InputError
 from ocp_torch.problems.problem import Problem
-from ocp_torch.samplers import scrambled_sobol
 
 VALUE, CONTROL_DENSITY, LOG_OCCUPATION = "value", "control_density", "log_occupation"
 # Builds a network from (dim, outputs, shift, scale); outputs None means a scalar field.
@@ -65,8 +64,8 @@ def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:
 
     Raises `InputError` when the state cost is not finite at some sampled state.
     """
-    x = scrambled_sobol(1024, problem.dim, 0, torch.float64)
-    f: Tensor = problem.state_cost(x)
+    met = problem.survey(1024, 0)
+    x, f = met.x, met.f
     if f.shape != (len(x),):
         raise InputError(f"state_cost gave shape {tuple(f.shape)} for states {tuple(x.shape)}; it must give (N,).")
     if not torch.isfinite(f).all():

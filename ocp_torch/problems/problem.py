@@ -14,10 +14,14 @@ from ocp_torch import calculus
 from ocp_torch.control_limit import control_cost
 from ocp_torch.enclosure import Enclosure, Lipschitz, lipschitz_enclosure
 from ocp_torch.errors import InputError, require_integer, require_number
+from ocp_torch.samplers import scrambled_sobol
+from ocp_torch.samples import Samples
 from ocp_torch.taylor import Box
 
 # Beyond this, B alone would fill the memory.
 MOST_COORDINATES = 1024
+# Head-room on a sampled supremum that is going to be used as a bound.
+MARGIN = 1.05
 
 
 class Problem:
@@ -32,6 +36,11 @@ class Problem:
     mu*`` (`math.inf` when known to be unbounded); ``control_bound >= sup |u*|``; ``value_bound >= sup V*``;
     ``exact_optimum``, the number `OPT`; ``lipschitz``, constants of the data (`Lipschitz`).
     """
+
+    # Whether the functions can be called at any state; a data set knows them at its own only (see `samples`).
+    evaluable: bool = True
+    # Whether the control matrix can, which the controller from V needs.
+    knows_control_matrix: bool = True
 
     def __init__(
         self,
@@ -122,6 +131,19 @@ class Problem:
     def exact_occupation(self, x: Tensor) -> Tensor | None:
         """`mu*(x)`, ``(N,)``."""
         return None
+
+    def samples(self, places: Tensor, divergences: bool = True) -> Samples:
+        """The data at the ``places`` a sampler drew: states ``(N, d)``, unless the problem has a sampler of its own kind."""
+        return Samples.of(self, places, divergences=divergences)
+
+    def survey(self, count: int, branch: int) -> Samples:
+        """Data spread over the torus, in float64, at most ``count``: what sizes and bounds are estimated from."""
+        return Samples.of(self, scrambled_sobol(count, self.dim, branch, torch.float64), divergences=False)
+
+    @property
+    def rehearsal(self) -> Problem:
+        """The problem as looks by which choices are made see it: itself, where fresh states cost nothing."""
+        return self
 
     def velocity(self, x: Tensor, u: Tensor) -> Tensor:
         """`a(x) + B(x) u`, ``(N, d)``."""

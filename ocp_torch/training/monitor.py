@@ -25,7 +25,7 @@ def liouville_residual(trainer, batch: Samples) -> dict[str, Tensor]:
     """`mean |mu0 - mu - div(a mu + B w) / rho|` on ``batch``, whatever gives `mu`: also where the loss needs no divergences
     (a player that rests, the plain saddle) or `mu` is in closed form. Nothing where the problem gives no divergences."""
     problem, fields, rho = trainer.problem, trainer.fields, trainer.problem.discount
-    samples = Samples.of(problem, batch.x)
+    samples = Samples.of(problem, batch.x) if problem.evaluable else batch
     if samples.div_a is None or samples.div_B is None:
         return {}
     form = (trainer.objective.occupation, problem, fields, trainer.bounds)
