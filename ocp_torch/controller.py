@@ -108,8 +108,8 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
     if problem is None:
         if saved["name"] not in PROBLEMS:
             raise InputError(
-                f"{path} belongs to the problem {saved['name']!r}, which is not part of ocp_torch; "
-                "pass it: load_controller(path, problem=MyProblem())."
+                f"{path} belongs to the problem {str(saved['name'])[:80]!r}, which is not part of ocp_torch, or calls a "
+                "function of yours; pass it: load_controller(path, problem=MyProblem())."
             )
         _require_reasonable(path, saved["parameters"])
         problem = PROBLEMS[saved["name"]](**saved["parameters"])
@@ -120,12 +120,11 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
     options = {k: v for k, v in model.items() if k != "name"}
     if model["name"] not in MODELS:
         raise InputError(f"{path} names the unknown model {model['name']!r}; known are {', '.join(MODELS)}.")
-    build = lambda: Fields.build(
-        problem, metadata["fields"], lambda **form: MODELS[model["name"]](**form, **options), 0
-    )
     with torch.device("meta"):
         # Shapes first, without memory: a crafted size must not be allocated before it is refused.
-        shapes = {name: tuple(t.shape) for name, t in _sketch(problem, metadata["fields"], model, options).items()}
+        shapes = {
+            name: tuple(t.shape) for name, t in _blank(problem, metadata["fields"], model, options).state_dict().items()
+        }
     held = {name: tuple(t.shape) for name, t in tensors.items()}
     if shapes != held:
         raise InputError(
@@ -135,7 +134,9 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
         raise InputError(f"{path} holds weights that are not finite.")
     if metadata["dtype"] not in ("float32", "float64"):
         raise InputError(f"{path} has dtype {metadata['dtype']!r}, but must have float32 or float64.")
-    fields = build().to(dtype=getattr(torch, metadata["dtype"]))
+    with torch.random.fork_rng(devices=[]):
+        blank = _blank(problem, metadata["fields"], model, options)
+    fields = blank.to(dtype=getattr(torch, metadata["dtype"]))
     fields.load_state_dict(tensors)
     fields = fields.to(device).requires_grad_(False)
     bounds = Bounds(**{**metadata["bounds"], "warnings": tuple(metadata["bounds"]["warnings"])})
@@ -151,11 +152,11 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
     )
 
 
-def _sketch(problem: Problem, names: list[str], model: dict, options: dict) -> dict[str, Tensor]:
-    """The state dict the fields would have, on whatever device is the default."""
+def _blank(problem: Problem, names: list[str], model: dict, options: dict) -> Fields:
+    """Fields of that form, to be filled, on whatever device is the default; units are part of what fills them."""
     network = MODELS[model["name"]]
     outputs = {"value": None, "control_density": problem.control_dim, "log_occupation": None}
-    return Fields({n: network(dim=problem.dim, outputs=outputs[n], **options) for n in names}).state_dict()
+    return Fields({n: network(dim=problem.dim, outputs=outputs[n], **options) for n in names})
 
 
 def _require_plain_run(path: Path, certificate: object, config: object) -> None:

@@ -68,7 +68,7 @@ def certify_recorded(problem: Dataset, trained, bounds: Bounds, settings: Certif
             warnings.append(f"the certification stage failed: {error}")
     met = Met(
         sup_occupation=sup_occupation,
-        sup_control=None if law is None else max(float(law(s.x).norm(dim=-1).max()) for s in sets),
+        sup_control=None if law is None else largest_control(law, sets),
         jump=None if law is None else largest_jump(law, problem.dim),
         problem=posed(problem),
     )
@@ -82,11 +82,13 @@ def certify_recorded(problem: Dataset, trained, bounds: Bounds, settings: Certif
         warnings.append(
             f"J is above the controller's performance if C_V = {C_V:.4g}, by the samples met, bounds its value."
         )
+    if settings.rigorous:
+        warnings.append("no rigorous lower bound: samples say nothing about the states between them.")
     assumptions, notes = check_assumptions(problem, bounds, met, uses=(F_M is not None, J is not None))
     certificate = Certificate(
         run=run,
         exact=None,
-        lower={"F_M": F_M, "shifted": None},
+        lower={"F_M": F_M, "shifted": None, **({"rigorous": None} if settings.rigorous else {})},
         upper={"J": J if assumptions.regular_holds else None, "G": None, "lagrangian": None},
         perf={"value": None, "density": None},
         baseline={"zero": None},
@@ -96,6 +98,12 @@ def certify_recorded(problem: Dataset, trained, bounds: Bounds, settings: Certif
         subject=kind,
     )
     return certificate.without_contradictions()
+
+
+@torch.no_grad()
+def largest_control(law: ControlLaw, sets: list[Samples]) -> float:
+    """`sup |u|` over the samples."""
+    return max(float(law(s.x).norm(dim=-1).max()) for s in sets)
 
 
 def groups(samples: Samples) -> list[Samples]:

@@ -55,6 +55,10 @@ def certify(
     there is no lower bound). Raises `InputError` where the controller or the value fails.
     """
     require_integer("seed", seed, 0)
+    if not problem.evaluable:
+        raise InputError(
+            "problem is a data set, on which no given controller can be certified: nothing can be simulated."
+        )
     defaults = fill({"model": dict(MODEL), "trainer": {}, "optimizer": {}, "certificate": {}}, problem)
     settings = settings or build_certificate_settings(defaults)
     bounds = resolve_bounds(problem)
