@@ -177,7 +177,7 @@ def test_an_exception_met_later_is_traced_to_its_state(limit):
     oracle = raises_beyond(2.0)
     box = Callable(lambda x: oracle(x), dim=2, control_dim=1)
     oracle = raises_beyond(limit)
-    x = torch.cat([torch.rand(40, 2, dtype=torch.float64) * limit, torch.tensor([[0.9995, 0.25]])])
+    x = torch.cat([torch.rand(40, 2, dtype=torch.float64) * limit, torch.tensor([[0.9995, 0.25]], dtype=torch.float64)])
     with pytest.raises(InputError, match=r"x = \[0\.9995, 0\.25\]: no mass"):
         box.state_cost(x[torch.randperm(41)])
 

@@ -174,19 +174,9 @@ class Callable(Problem):
     def _understand(self) -> None:
         """Whether it takes batches or single states, and whether its answers depend on the state alone."""
         x = scrambled_sobol(self.dim + 3, self.dim, 0, torch.float64)
-        complaints = []
-        for self._one_by_one in (False, True):
-            try:
-                raw = asked(self._function, x.numpy(), self._one_by_one)
-                found = self._shaped(raw, x.numpy())
-            except Exception as error:  # whatever a stranger's code may raise
-                complaints.append(error)
-                continue
-            break
-        else:
-            # A function of single states is not to be told that it cannot take a batch, nor the other way round.
-            shown = next((e for e in complaints if isinstance(e, InputError)), None)
-            raise shown or InputError(self._failure(x.numpy(), complaints[-1])) from None
+        self._one_by_one = self._form(x.numpy())
+        found = self._checked(x)
+        raw = asked(self._function, x[:1].numpy(), self._one_by_one)
         self._no_drift, self._has_mu0 = raw[1] is None, len(raw) == 4
         if np.asarray(raw[0]).dtype == np.float32:
             self._step = STEPS["float32"]
@@ -202,6 +192,22 @@ class Callable(Problem):
                     f"the oracle's {name} at x = {x[2].tolist()} depends on the other states of the batch."
                 )
 
+    def _form(self, x: np.ndarray) -> bool:
+        """Whether it takes states one by one: what gives an answer of the right shape at any of the states ``x``."""
+        complaints = []
+        for one_by_one in (False, True):
+            # As many copies of a state as no coordinate has: a batch that cannot be taken for anything else.
+            for batch in (x, *(np.repeat(state[None], len(x), axis=0) for state in x)):
+                try:
+                    self._shaped(asked(self._function, batch, one_by_one), batch)
+                    return one_by_one
+                except Exception as error:  # whatever a stranger's code may raise
+                    complaints.append(error)
+        # A function of batches is not to be told that it cannot take single states, nor the other way round.
+        raise next((e for e in complaints if isinstance(e, InputError)), None) or InputError(
+            self._failure(x, complaints[0])
+        ) from None
+
     def _look_at_the_seam(self) -> None:
         for i in range(min(self.dim, MOST_SEAMS)):
             after = scrambled_sobol(SEAM_PROBES, self.dim, 1 + i, torch.float64)
@@ -214,8 +220,8 @@ class Callable(Problem):
                 worst = int(change.argmax())
                 if float(change[worst]) > SEAM_JUMP * size:
                     raise InputError(
-                        f"the oracle's {name} jumps by {float(change[worst]):.3g} where coordinate {i} passes from 1 to 0, at "
-                        f"x = {after[worst].tolist()}, but it must have period 1 in each coordinate."
+                        f"the oracle's {name} jumps by {float(change[worst]):.3g} where coordinate {i} passes from 1 to 0, "
+                        f"at x = {after[worst].tolist()}, but it must have period 1 in each coordinate."
                     )
 
 
@@ -227,7 +233,8 @@ def asked(function: abc.Callable, x: np.ndarray, one_by_one: bool):
     if not all(isinstance(row, tuple | list) for row in rows):
         return rows[0]
     return tuple(
-        None if any(p is None for p in parts) else np.stack([np.asarray(p) for p in parts]) for parts in zip(*rows)
+        None if any(p is None for p in parts) else np.stack([np.asarray(p) for p in parts])
+        for parts in zip(*rows, strict=True)
     )
 
 
@@ -258,7 +265,7 @@ def resolved(target: str) -> abc.Callable:
 
 
 class _Ask(torch.autograd.Function):
-    """One part of the oracle's answer: values by calling, derivatives by central differences, batches of batches flattened."""
+    """One part of the oracle's answer: values by calling, derivatives by central differences; stacks flattened."""
 
     @staticmethod
     def forward(x: Tensor, problem: Callable, name: str) -> Tensor:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -149,6 +150,19 @@ class Problem:
         """`a(x) + B(x) u`, ``(N, d)``."""
         pushed = torch.einsum("ndm,nm->nd", self.control_matrix(x), u)
         return pushed if self.driftless else self.drift(x) + pushed
+
+    def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
+        """The state ``(d,)`` that an observation of the Gymnasium environment ``env`` shows. Override it, with `to_action`,
+        for the environments the problem is a model of; ours need neither."""
+        raise InputError(
+            f"{type(self).__name__} does not know the environment {env}: it must define from_observation and to_action."
+        )
+
+    def to_action(self, env: str, control: np.ndarray) -> np.ndarray:
+        """The action of ``env`` that applies ``control`` ``(m,)``."""
+        raise InputError(
+            f"{type(self).__name__} does not know the environment {env}: it must define from_observation and to_action."
+        )
 
     @property
     def parameters(self) -> dict:
