@@ -9,13 +9,12 @@ import torch
 
 from ocp_torch.errors import require_number
 from ocp_torch.extremum import supremum
-from ocp_torch.problems.problem import Problem
-from ocp_torch.samplers import scrambled_sobol
+from ocp_torch.problems.problem import MARGIN, Problem
 
-# Head-room on a sampled supremum that is going to be used as a bound.
-MARGIN = 1.05
 # Without any knowledge of mu*, M starts at this multiple of sup mu0 and the certificate judges it afterwards.
 OCCUPATION_GUESS = 4.0
+# States a problem is searched at for what it does not say.
+SEARCHED = 2**13
 
 FROM_CONFIGURATION, FROM_PROBLEM, ESTIMATED = "configuration", "problem", "estimated"
 
@@ -44,7 +43,8 @@ def resolve_bounds(
     """Each bound from the configuration if it was set there, else from the problem, else estimated with a warning.
 
     `OPT <= J` needs `C_V >= sup V*`, for which `sup f` will do (Proposition 1); `C_u` is that of Proposition 2 where
-    `a = 0` and an estimate by the same formula with the least-squares `alpha` (`B alpha = a`) otherwise.
+    `a = 0` and an estimate by the same formula with the least-squares `alpha` (`B alpha = a`) otherwise. A limit on the
+    control is a `C_u` that is known.
     """
     chosen: dict[str, float] = {}
     sources: dict[str, str] = {}
@@ -61,9 +61,14 @@ def resolve_bounds(
             room = MARGIN if name == "C_V" else 1.0
             chosen[name], sources[name] = room * float(known[name]), FROM_PROBLEM
         else:
+            if name == "C_u" and problem.control_limit is not None:
+                chosen[name], sources[name] = problem.control_limit, FROM_PROBLEM
+                continue
             chosen[name], why = _ESTIMATES[name](problem)
             sources[name] = ESTIMATED
             notes.append(f"{name} is not known: {chosen[name]:.4g} is {why}; {fields[name]} sets it.")
+    if problem.control_limit is not None:
+        chosen["C_u"] = min(chosen["C_u"], problem.control_limit)
     if sources["M"] == FROM_CONFIGURATION and problem.occupation_bound is not None:
         if chosen["M"] < problem.occupation_bound:
             true = f"{problem.occupation_bound:.4g}" if math.isfinite(problem.occupation_bound) else "infinite"
@@ -73,15 +78,11 @@ def resolve_bounds(
     return Bounds(**chosen, sources=sources, warnings=tuple(notes))
 
 
-def _search_points(problem: Problem):
-    return scrambled_sobol(2**13, problem.dim, 1, torch.float64)
-
-
 def state_cost_supremum(problem: Problem) -> float:
     """`sup f`: the problem's own bound, or a sampled and climbed estimate with head-room."""
     if problem.state_cost_bound is not None:
         return problem.state_cost_bound
-    return MARGIN * supremum(problem.state_cost, _search_points(problem), differentiable=False).value
+    return MARGIN * supremum(problem.state_cost, problem.survey(SEARCHED, 1).x, differentiable=False).value
 
 
 def _estimate_value_bound(problem: Problem) -> tuple[float, str]:
@@ -93,14 +94,14 @@ def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
     total = 2.0 * conjugate * state_cost_supremum(problem)
     if problem.driftless:
         return total ** (1.0 / q), "Proposition 2 of the paper with a sampled sup f"
-    x = _search_points(problem)[:2048]
-    alpha = torch.linalg.pinv(problem.control_matrix(x)) @ problem.drift(x).unsqueeze(-1)
+    met = problem.survey(SEARCHED, 1).take(slice(2048))
+    alpha = torch.linalg.pinv(met.B) @ met.a.unsqueeze(-1)
     largest = float(alpha.squeeze(-1).norm(dim=-1).max())
     return (total + 2.0**q * (conjugate - 1.0) * largest) ** (1.0 / q), "Proposition 2 with a least-squares alpha"
 
 
 def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
-    largest = float(problem.initial_density(_search_points(problem)).max())
+    largest = float(problem.survey(SEARCHED, 1).mu0.max())
     return OCCUPATION_GUESS * largest, f"a guess to train with, {OCCUPATION_GUESS:g} times sup mu0"
 
 

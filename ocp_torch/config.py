@@ -26,7 +26,7 @@ from ocp_torch.fields import MODELS, VALUE, Fields
 from ocp_torch.objectives import METHODS, Objective
 from ocp_torch.problems import Problem
 from ocp_torch.process import prepare
-from ocp_torch.samplers import SAMPLERS, derive_seed
+from ocp_torch.samplers import SAMPLERS, RowSampler, derive_seed
 from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.trainer import Trainer
@@ -82,7 +82,10 @@ def build_trainer(config: dict) -> Trainer:
     sampler_section = require_section("sampler", config["sampler"])
     sampler_name = require_choice("sampler.name", sampler_section.pop("name", None), SAMPLERS)
     given = {"dim": problem.dim, "seed": seed, "dtype": settings.torch_dtype}
-    sampler = call(SAMPLERS[sampler_name], "sampler", sampler_section, **given)
+    if problem.evaluable:
+        sampler = call(SAMPLERS[sampler_name], "sampler", sampler_section, **given)
+    else:
+        sampler = RowSampler(problem.rows, seed, problem.recording.digest)
     names = (problem_name(problem), name)
     return Trainer(
         problem, fields, objective, bounds, stepper, average, sampler, settings, network, seed, names, config

@@ -12,6 +12,7 @@ import math
 import torch
 from torch import Tensor
 
+from ocp_torch.calculus import Field
 from ocp_torch.errors import require_number
 from ocp_torch.taylor import TaylorModel
 
@@ -80,6 +81,14 @@ class PowerCost:
         inside = safe * self.cost(w / safe.unsqueeze(-1))
         outside = torch.where((w != 0).any(dim=-1), math.inf, 0.0).to(mu)
         return torch.where(positive, inside, outside)
+
+    def within(self, w: Tensor, mu: Tensor | float) -> Tensor:
+        """``w`` ``(N, m)``, shortened to what `mu` ``(N,)`` allows; without a limit on `u` as it is."""
+        return w
+
+    def admissible(self, control_density: Field, occupation: Field) -> Field:
+        """The field ``control_density`` as far as the field ``occupation`` allows it; without a limit as it is."""
+        return control_density
 
     def primal_occupation(self, w: Tensor, f: Tensor, value_bound: float, residual: Tensor) -> Tensor:
         r"""The minimiser of `primal_minimum` over `mu >= 0` (Lemma 2); infinite where `f = 0` and `w != 0`.

@@ -10,6 +10,7 @@ from torch import Tensor
 from ocp_torch import calculus, formulas
 from ocp_torch.bounds import Bounds
 from ocp_torch.calculus import Field
+from ocp_torch.control_cost import PowerCost
 from ocp_torch.fields.fields import Fields
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
@@ -38,13 +39,22 @@ class ValueLaw:
         return self.problem.control_cost.argmax(-pull / self.problem.discount)
 
 
-def density_law(control_density: Field, occupation: Density) -> ControlLaw:
-    """`u = w / mu`, and 0 where `mu` is 0 (no state is ever there) or infinite (mass stands still)."""
+def admissible_density(kind: str, problem: Problem, fields: Fields, bounds: Bounds) -> Field:
+    """`w` of trained fields, within what a limit on the control allows: `mu` of Lemma 2 leaves room for any `w` already."""
+    w = fields.control_density
+    return (
+        w if kind == CLOSED else problem.control_cost.admissible(w, occupation_density(kind, problem, fields, bounds))
+    )
+
+
+def density_law(control_density: Field, occupation: Density, cost: PowerCost) -> ControlLaw:
+    """`u = w / mu`, within the limit of ``cost``; 0 where `mu` is 0 (nobody is there) or infinite (mass stands still)."""
 
     def law(x: Tensor) -> Tensor:
         mu = occupation(x)
         usable = (mu > 0) & torch.isfinite(mu)
-        return torch.where(usable.unsqueeze(-1), control_density(x) / torch.where(usable, mu, 1.0).unsqueeze(-1), 0.0)
+        mu = torch.where(usable, mu, 1.0)
+        return torch.where(usable.unsqueeze(-1), cost.within(control_density(x), mu) / mu.unsqueeze(-1), 0.0)
 
     return law
 
@@ -76,6 +86,8 @@ def control_laws(kind: str | None, problem: Problem, fields: Fields, bounds: Bou
     laws = {}
     if fields.value is not None:
         laws["value"] = ValueLaw(problem, fields.value)
-    if fields.control_density is not None:
-        laws["density"] = density_law(fields.control_density, occupation_density(kind, problem, fields, bounds))
+    # Lemmas 2 and 3 give mu from the cost at the state itself.
+    if fields.control_density is not None and (kind == NETWORK or problem.evaluable):
+        mu = occupation_density(kind, problem, fields, bounds)
+        laws["density"] = density_law(fields.control_density, mu, problem.control_cost)
     return laws

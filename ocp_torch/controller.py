@@ -108,8 +108,8 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
     if problem is None:
         if saved["name"] not in PROBLEMS:
             raise InputError(
-                f"{path} belongs to the problem {saved['name']!r}, which is not part of ocp_torch; "
-                "pass it: load_controller(path, problem=MyProblem())."
+                f"{path} belongs to the problem {str(saved['name'])[:80]!r}, which is not part of ocp_torch, or calls a "
+                "function of yours; pass it: load_controller(path, problem=MyProblem())."
             )
         _require_reasonable(path, saved["parameters"])
         problem = PROBLEMS[saved["name"]](**saved["parameters"])

@@ -159,7 +159,9 @@ def settled(folder: Path, data: dict, make: bool) -> Path:
 
 def again(hydra: DictConfig, folder: Path, sweeping: bool) -> str:
     """The command that goes on with what was stopped."""
-    own = [o for o in hydra.overrides.task if o.lstrip("+").startswith("problem._target_=")]
+    # What only the command line may name.
+    mine = "problem." if "problem=callable" in hydra.overrides.task else "problem._target_="
+    own = [o for o in hydra.overrides.task if o == "problem=callable" or o.lstrip("+").startswith(mine)]
     if not sweeping:
         path = str(folder) if re.fullmatch(r"[\w./+-]+", str(folder)) else quoted(folder)
         return shlex.join(["python", sys.argv[0], f"resume={path}", *own])

@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
+from ocp_torch.errors import InputError
+
 # A fresh scrambling after so many points: keeps the stream endless and fast-forwarding cheap.
 SOBOL_BLOCK = 2**18
 # Evaluation draws come from another branch of the seed tree than training draws.
@@ -99,6 +101,26 @@ class SobolSampler:
 
     def load_state_dict(self, state: dict) -> None:
         self.count, self._start = state["count"], -1
+
+
+class RowSampler:
+    """Rows of a recording, drawn independently and with replacement; ``digest`` is that of the recording."""
+
+    def __init__(self, rows: int, seed: int, digest: str) -> None:
+        self.rows, self.digest = rows, digest
+        self.generator = torch.Generator().manual_seed(derive_seed(seed, TRAINING_STREAM))
+
+    def draw(self, count: int) -> Tensor:
+        """The next ``count`` rows, ``(count,)``."""
+        return torch.randint(self.rows, (count,), generator=self.generator)
+
+    def state_dict(self) -> dict:
+        return {"generator": self.generator.get_state(), "digest": self.digest}
+
+    def load_state_dict(self, state: dict) -> None:
+        if state["digest"] != self.digest:
+            raise InputError("the data set is not the one this run was trained on: its contents have changed.")
+        self.generator.set_state(state["generator"])
 
 
 SAMPLERS = {"uniform": UniformSampler, "sobol": SobolSampler}

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError
-from ocp_torch.problems.problem import Problem
+
+if TYPE_CHECKING:
+    from ocp_torch.problems.problem import Problem
 
 
 @dataclass(frozen=True)

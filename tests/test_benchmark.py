@@ -12,12 +12,13 @@ from ocp_torch import control_laws, formulas
 from ocp_torch.benchmark import measure
 from ocp_torch.benchmark.contest import build, contest
 from ocp_torch.benchmark.curve import Curve, Point, due, median_and_spread
-from ocp_torch.benchmark.environment import make_environment, observe, require_rl
 from ocp_torch.benchmark.kernels import KernelContender
 from ocp_torch.benchmark.measure import Judge, relative, tabulated
 from ocp_torch.benchmark.networks import NetworkContender
 from ocp_torch.benchmark.report import load, reference, save, table
+from ocp_torch.benchmark.require import require_rl
 from ocp_torch.bounds import resolve_bounds
+from ocp_torch.environment import make_environment, observe
 from ocp_torch.errors import InputError
 from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields, SobolevField
 from ocp_torch.launch import composed

@@ -10,6 +10,8 @@ from omegaconf import OmegaConf
 from ocp_torch.config import build_certificate_settings, build_trainer
 from ocp_torch.errors import InputError
 from ocp_torch.launch import CONFIGS, composed, known_fields, register_resolvers
+from ocp_torch.problems import Circle
+from ocp_torch.record import Recorder
 from ocp_torch.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("quick_composition")
@@ -32,13 +34,18 @@ def outcome(*overrides: str) -> Trainer | str:
         return str(error)
 
 
+# What a choice needs beside itself: nothing stands for a user's own file or function.
+NEEDS = {"problem=dataset": ("problem.path={recording}",), "problem=callable": ("problem.target=composing:oracle",)}
 CHOICES = sorted(f"{path.parent.name}={path.stem}" for path in CONFIGS.glob("*/*.yaml"))
 
 
 @pytest.mark.parametrize("choice", CHOICES)
-def test_every_choice_of_every_group_composes_and_builds_a_trainer(choice):
+def test_every_choice_of_every_group_composes_and_builds_a_trainer(choice, tmp_path):
     group, name = choice.split("=")
-    config = configured(choice)
+    file = tmp_path / "recording.npz"
+    if choice == "problem=dataset":
+        Recorder(Circle(), 200, file, seed=0, divergences=True, contrast=0.0).run()
+    config = configured(choice, *(need.format(recording=file) for need in NEEDS.get(choice, ())))
     assert isinstance(build_trainer(config), Trainer)
     assert config.get(group, {}).get("name", name) == name
 

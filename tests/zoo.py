@@ -53,10 +53,20 @@ _SMOOTH = {
     "manufactured 3-d interaction=1": partial(Manufactured, dim=3, interaction=1, initial_contrast=0.4),
     "manufactured 3-d interaction=3": partial(Manufactured, dim=3, interaction=3, drift=1.0),
 }
-_CASES = {**_KINKED, **_SMOOTH, "swing": Swing}
+# Exact truth with a control limit that is reached on a part of the torus: u* has kinks there.
+_LIMITED = {
+    "limited 1-d": partial(Manufactured, dim=1, control_limit=0.6),
+    "limited 2-d": partial(Manufactured, control_limit=0.5, seed=2),
+    "limited 2-d q=1.5 B(x)": partial(
+        Manufactured, exponent=1.5, control_limit=0.4, state_dependent_control=True, initial_contrast=0.5
+    ),
+    "limited 3-d m=2 q=1.2": partial(Manufactured, dim=3, control_dim=2, exponent=1.2, control_limit=0.5),
+}
+_CASES = {**_KINKED, **_SMOOTH, **_LIMITED, "swing": Swing}
 
 # Names by what is known: V* with kinks and no drift; V* smooth, with drift; both of them; and every problem there is.
-KINKED, SMOOTH, EXACT, ALL = tuple(_KINKED), tuple(_SMOOTH), (*_KINKED, *_SMOOTH), tuple(_CASES)
+KINKED, SMOOTH, EXACT = tuple(_KINKED), tuple(_SMOOTH), (*_KINKED, *_SMOOTH)
+ALL, LIMITED = (*EXACT, "swing"), tuple(_LIMITED)
 # A few that together show every feature, for tests that cost more.
 FEW_SMOOTH = ("manufactured 1-d q=2", "manufactured 2-d mu0", "manufactured 3-d m=2 B(x) q=1.5")
 FEW = ("circle rho=2", "torus 2-d chain", "torus 3-d random", *FEW_SMOOTH)

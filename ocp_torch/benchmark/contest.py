@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,11 +11,11 @@ import torch
 from tqdm import tqdm
 
 from ocp_torch.benchmark.curve import Curve
-from ocp_torch.benchmark.environment import require_rl
 from ocp_torch.benchmark.kernels import KernelContender
 from ocp_torch.benchmark.measure import Judge
 from ocp_torch.benchmark.networks import NetworkContender
 from ocp_torch.benchmark.report import plot, save
+from ocp_torch.benchmark.require import require_rl
 from ocp_torch.benchmark.rl import RLContender
 from ocp_torch.bounds import Bounds, resolve_bounds
 from ocp_torch.budgets import fill
@@ -51,7 +52,13 @@ def contender(name: str, config: dict, problem: Problem, bounds: Bounds):
     options = require_section("rl", config["rl"])
     steps = require_section("rl.steps", options.pop("steps", None))
     bound = problem.control_bound if problem.control_bound is not None else bounds.C_u
-    given = dict(algorithm=name, problem=problem, control_bound=1.2 * bound, steps=steps.get(name))
+    reach = min(1.2 * bound, problem.control_limit or math.inf)
+    given = dict(
+        algorithm=name,
+        problem=problem,
+        control_bound=reach,
+        steps=steps.get(name),
+    )
     return call(RLContender, "rl", options, **given)
 
 

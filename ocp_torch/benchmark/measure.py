@@ -11,7 +11,7 @@ from ocp_torch.certificate.certify import in_float64
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.performance import simulate_performance
 from ocp_torch.certificate.sides import lower_side, upper_side
-from ocp_torch.control_laws import ControlLaw, control_laws, occupation_density
+from ocp_torch.control_laws import ControlLaw, admissible_density, control_laws, occupation_density
 from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
 from ocp_torch.problems.problem import Problem
@@ -48,7 +48,8 @@ class Judge:
             numbers |= {"F_M": lower.F_M.value, "shifted": lower.shifted.value}
         if fields.control_density is not None and problem.gives_divergences:
             mu = occupation_density(occupation, problem, fields, bounds)
-            J, G = upper_side(problem, fields.control_density, mu, self.sets, bounds.C_V)
+            w = admissible_density(occupation, problem, fields, bounds)
+            J, G = upper_side(problem, w, mu, self.sets, bounds.C_V)
             numbers |= {"J": J.value} | ({"G": G.value} if G is not None else {})
         if perf:
             for name, law in control_laws(occupation, problem, fields, bounds).items():

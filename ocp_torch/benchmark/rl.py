@@ -10,9 +10,10 @@ import numpy as np
 import torch
 
 from ocp_torch.benchmark.curve import Curve, Point, due
-from ocp_torch.benchmark.environment import make_environment, observe, require_rl
 from ocp_torch.benchmark.measure import Judge
+from ocp_torch.benchmark.require import require_rl
 from ocp_torch.certificate import CertificateSettings
+from ocp_torch.environment import make_environment, observe
 from ocp_torch.errors import require_integer
 from ocp_torch.problems import Problem
 
@@ -59,6 +60,7 @@ class RLContender:
         def control(x: torch.Tensor) -> torch.Tensor:
             observations = np.atleast_2d(observe(x))
             actions, _ = model.predict(observations, deterministic=True)
-            return self.control_bound * torch.from_numpy(np.asarray(actions)).to(x)
+            u = self.control_bound * torch.from_numpy(np.asarray(actions)).to(x)
+            return self.problem.control_cost.within(u, torch.ones_like(x[:, 0]))
 
         return control

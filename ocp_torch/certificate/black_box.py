@@ -18,6 +18,8 @@ PROBES = 7
 STEPS = {torch.float64: 1e-5, torch.float32: 2e-3}
 # Two calls may differ by so much, relative to the control, and still be a function of the state.
 SAME = 1e-4
+# A control may be longer than the limit by so much, relative to it: it was clipped in single precision. It is cut back.
+BEYOND = 1e-5
 
 
 class BlackBox:
@@ -25,13 +27,14 @@ class BlackBox:
 
     It is asked on `[0, 1)^d` only. Central differences stand in for its derivatives, so that it may be NumPy, a runtime's
     session or anything else; ``precision`` is what it computes in. Raises `InputError` where it fails, gives another
-    shape or a number that is not finite, or depends on more than the state.
+    shape or a number that is not finite, breaks the problem's limit on the control, or depends on more than the state.
     """
 
     def __init__(self, function: Callable, problem: Problem) -> None:
         if not callable(function):
             raise InputError(f"controller is {function!r}, but must be a function of states (N, {problem.dim}).")
         self.function, self.dim, self.control_dim = function, problem.dim, problem.control_dim
+        self.limit, self.cost = problem.control_limit, problem.control_cost
         self._convert, self.precision = self._understood(scrambled_sobol(PROBES, problem.dim, 0, torch.float64))
 
     def __call__(self, x: Tensor) -> Tensor:
@@ -53,7 +56,9 @@ class BlackBox:
         bad = ~torch.isfinite(out).all(dim=-1)
         if bool(bad.any()):
             raise InputError(f"the controller is not finite at x = {wrapped[bad][0].tolist()}.")
-        return out.to(x)
+        out = out.to(x)
+        require_limit(out, wrapped, self.limit)
+        return self.cost.within(out, torch.ones_like(out[:, 0]))
 
     def _ask(self, convert: Callable[[Tensor], object], x: Tensor) -> Tensor:
         with torch.no_grad():
@@ -95,6 +100,19 @@ class BlackBox:
         if isinstance(shown, InputError):
             raise shown
         raise InputError(f"the controller raised {type(shown).__name__}: {_first_line(shown)}.") from None
+
+
+def require_limit(u: Tensor, x: Tensor, limit: float | None) -> None:
+    """Raise `InputError` where a control ``(N, m)`` at one of the states ``x`` is longer than ``limit``, beyond rounding."""
+    if limit is None:
+        return
+    size = u.norm(dim=-1)
+    worst = int(size.argmax())
+    if float(size[worst]) > limit * (1.0 + BEYOND):
+        raise InputError(
+            f"the controller gives a control of size {float(size[worst]):.6g} at x = {x[worst].tolist()}, "
+            f"but problem.control_limit is {limit:g}; clip it."
+        )
 
 
 class _WantsArrays(Exception):

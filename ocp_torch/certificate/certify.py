@@ -11,20 +11,22 @@ from functools import partial
 import torch
 from torch import nn
 
-from ocp_torch.bounds import ESTIMATED, Bounds
+from ocp_torch.bounds import Bounds
 from ocp_torch.certificate.assumptions import Met, check_assumptions
 from ocp_torch.certificate.certificate import Certificate, Run
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.occupation import a_priori_sup_occupation, estimated_sup_occupation
 from ocp_torch.certificate.performance import Simulated, simulate_performance
+from ocp_torch.certificate.raising import raised
+from ocp_torch.certificate.recorded import certify_recorded
 from ocp_torch.certificate.regularity import largest_jump
 from ocp_torch.certificate.rigorous import RigorousBound, proved_lower
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.sides import CHUNK, LowerSide, lower_side, upper_side
 from ocp_torch.certificate.stage import fit_closed_loop
 from ocp_torch.certificate.wellposed import WellPosed, check_problem
-from ocp_torch.control_laws import CLOSED, ControlLaw, control_laws, occupation_density, zero_law
+from ocp_torch.control_laws import CLOSED, ControlLaw, admissible_density, control_laws, occupation_density, zero_law
 from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -37,8 +39,6 @@ BASELINE_PART = 4
 # What costs `m` tangents through a network at each state, upper sides and residuals, is done on one state in
 # eight, and beyond sixteen dimensions on one in `d / 2`.
 TANGENT_PART = 8
-# Head-room of an M that is estimated from the learned controller's occupation density.
-OCCUPATION_ROOM = 1.25
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,10 @@ class Trained:
     fields: Fields
     occupation: str | None
     network: Callable[..., nn.Module]
+
+    def in_float64(self) -> Fields:
+        """The fields as every bound is computed with them."""
+        return in_float64(self.fields)
 
 
 def in_float64(fields: Fields) -> Fields:
@@ -64,6 +68,8 @@ def certify_fields(
     Both controllers are simulated; the better one is handed out, and the certification stage speaks of that one.
     """
     require_finite(trained.fields)
+    if not problem.evaluable:
+        return certify_recorded(problem, trained, bounds, settings, run)
     fields, occupation = in_float64(trained.fields), trained.occupation
     seed, count = run.seed, settings.replicates
     has_value, has_density = fields.value is not None, fields.control_density is not None
@@ -84,7 +90,7 @@ def certify_fields(
     J = G = None
     if has_density and problem.gives_divergences:
         mu = occupation_density(occupation, problem, fields, bounds)
-        J, G = upper_side(problem, fields.control_density, mu, few, bounds.C_V)
+        J, G = upper_side(problem, admissible_density(occupation, problem, fields, bounds), mu, few, bounds.C_V)
         with torch.no_grad():
             vanishes = any(bool((mu(samples.x[:4096]) <= 0.0).any()) for samples in few)
         if best == "density" and vanishes:
@@ -191,17 +197,6 @@ def measured(
         a_priori = a_priori_sup_occupation(problem, law, sets[0].x[:4096])
     largest_value = simulated.largest_value if simulated is not None else None
     return Met(occupation, a_priori, sup_control, largest_value, jump, posed)
-
-
-def raised(bounds: Bounds, sup_occupation: float | None) -> Bounds:
-    """``bounds`` with an `M` that nobody gave raised above the occupation density met under the learned controller."""
-    if bounds.sources["M"] != ESTIMATED or sup_occupation is None or not math.isfinite(sup_occupation):
-        return bounds
-    M = OCCUPATION_ROOM * sup_occupation
-    if M <= bounds.M:
-        return bounds
-    note = f"F_M uses M = {M:.4g}, {OCCUPATION_ROOM:g} times the occupation density met under the learned controller."
-    return replace(bounds, M=M, warnings=(*bounds.warnings, note))
 
 
 def certification_stage(

@@ -64,11 +64,13 @@ def fit_closed_loop(
     bounds: Bounds,
     settings: StageSettings,
     seed: int,
+    pool: Pool | None = None,
 ) -> Fields:
     """Fields with `log mu^u`, and with `V^u` where ``fields`` hold no `V`, of the closed loop of ``law``.
 
     ``fields`` are the trained ones, ``law`` one of theirs in their precision; their `log mu`, if any, is the start. With no
-    ``fields`` the law is somebody's own, in float64, and both `mu` and `V` are fitted in float32.
+    ``fields`` the law is somebody's own, in float64, and both `mu` and `V` are fitted in float32. ``pool``
+    is where samples of the closed loop come from, by default from evaluations at uniform states.
     """
     like = torch.zeros(()) if fields is None else next(fields.parameters())
     loop = ClosedLoop(problem, law)
@@ -77,7 +79,7 @@ def fit_closed_loop(
     fitted = Fields.build(problem, names, network, derive_seed(seed, STAGE_STREAM, 0)).to(like)
     if fields is not None and fields.log_occupation is not None:
         fitted.log_occupation.load_state_dict(fields.log_occupation.state_dict())
-    pool = Pool(
+    pool = pool or Pool(
         loop, derive_seed(seed, STAGE_STREAM, 1), derive_seed(seed, STAGE_STREAM, 2), like, double=fields is None
     )
     draw = lambda: pool.draw(settings.batch)

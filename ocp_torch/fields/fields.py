@@ -13,8 +13,6 @@ from ocp_torch.errors import InputError
 from ocp_torch.fields.embedding import FourierEmbedding
 from ocp_torch.fields.spectrum import STATES, prominent_waves
 from ocp_torch.problems.problem import Problem
-from ocp_torch.samplers import scrambled_sobol
-from ocp_torch.samples import Samples
 
 VALUE, CONTROL_DENSITY, LOG_OCCUPATION = "value", "control_density", "log_occupation"
 # Builds a network from (dim, outputs, shift, scale); outputs None means a scalar field.
@@ -77,11 +75,10 @@ _found: WeakKeyDictionary[Problem, dict[int, Tensor]] = WeakKeyDictionary()
 
 
 def _waves(problem: Problem, count: int) -> Tensor:
-    """`prominent_waves` of the problem's data at random states, the same ones always."""
+    """`prominent_waves` of the problem's data, from the same states always."""
     known = _found.setdefault(problem, {})
     if count not in known:
-        x = torch.rand(STATES, problem.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-        known[count] = prominent_waves(Samples.of(problem, x, divergences=False), count)
+        known[count] = prominent_waves(problem.survey(STATES, 0, independent=True), count)
     return known[count]
 
 
@@ -90,8 +87,8 @@ def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:
 
     Raises `InputError` when the state cost is not finite at some sampled state.
     """
-    x = scrambled_sobol(1024, problem.dim, 0, torch.float64)
-    f: Tensor = problem.state_cost(x)
+    met = problem.survey(1024, 0)
+    x, f = met.x, met.f
     if f.shape != (len(x),):
         raise InputError(f"state_cost gave shape {tuple(f.shape)} for states {tuple(x.shape)}; it must give (N,).")
     if not torch.isfinite(f).all():
@@ -100,4 +97,5 @@ def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:
     spread = float(f.std())
     mean = float(f.mean())
     spread = spread if spread > 1e-12 * max(abs(mean), 1e-300) else max(abs(mean), 1.0)
-    return (mean, spread), math.pow(problem.exponent * spread, 1.0 / problem.exponent)
+    control = math.pow(problem.exponent * spread, 1.0 / problem.exponent)
+    return (mean, spread), control if problem.control_limit is None else min(control, problem.control_limit)

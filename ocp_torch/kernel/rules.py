@@ -13,6 +13,7 @@ from abc import ABC, abstractmethod
 import numpy as np
 
 from ocp_torch.bounds import Bounds
+from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import CONTROL_DENSITY, VALUE
 from ocp_torch.kernel.stream import Datum
 from ocp_torch.problems.problem import Problem
@@ -27,6 +28,10 @@ class Rule(ABC):
     needs_divergences = False
 
     def __init__(self, problem: Problem, bounds: Bounds) -> None:
+        if problem.control_limit is not None:
+            raise InputError(
+                f"problem.control_limit is {problem.control_limit:g}, but the kernel methods know no limit; use networks."
+            )
         self.rho, self.M, self.C_V, self.q = problem.discount, bounds.M, bounds.C_V, problem.exponent
         self.conjugate = self.q / (self.q - 1.0)
 

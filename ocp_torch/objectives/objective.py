@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ocp_torch import calculus, formulas
 from ocp_torch.bounds import Bounds
+from ocp_torch.calculus import Field
 from ocp_torch.fields.fields import Fields
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
@@ -37,6 +38,10 @@ class Objective(ABC):
         """All fields the method trains."""
         return tuple(name for names in self.players.values() for name in names)
 
+    def admissible(self, fields: Fields) -> Field:
+        """`w` within what a limit on the control and the network for `mu` allow."""
+        return self.cost.admissible(fields.control_density, lambda x: fields.log_occupation(x).exp())
+
     @abstractmethod
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         """One scalar loss per player, each a mean over ``samples``; a player without one rests."""
@@ -51,7 +56,7 @@ class Objective(ABC):
             shown |= {"slack_mean_positive": samples.mean(slack), "slack_maximum": slack.max()}
         given = samples.div_a is not None and samples.div_B is not None
         if given and fields.control_density is not None and fields.log_occupation is not None:
-            _, inflow = formulas.controlled_inflow(samples, fields.control_density, self.rho)
+            _, inflow = formulas.controlled_inflow(samples, self.admissible(fields), self.rho)
             _, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
             shown["residual_mean_absolute"] = samples.mean((inflow - loss).abs())
         return shown

@@ -34,7 +34,7 @@ class NetworkPrimal(Objective):
     occupation = control_laws.NETWORK
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        w, inflow = formulas.controlled_inflow(samples, fields.control_density, self.rho)
+        w, inflow = formulas.controlled_inflow(samples, self.admissible(fields), self.rho)
         mu, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
         return {
             "density": samples.mean(
@@ -54,9 +54,11 @@ def primal(problem: Problem, bounds: Bounds, occupation: str = "auto") -> Object
             "method.occupation is 'closed', but this problem has drift, for which mu has no closed form; "
             "use method.occupation=network or auto."
         )
+    if occupation == "closed" and not problem.evaluable:
+        raise InputError("method.occupation is 'closed', but mu at a new state needs f there, which no data set gives.")
     if not problem.gives_divergences:
         objective = Saddle(problem, bounds, augmentation=1.0)
         objective.notes = ("this problem gives no divergences of a and B: primal falls back to the saddle, without J.",)
         return objective
-    closed = problem.driftless and occupation != "network"
+    closed = problem.driftless and problem.evaluable and occupation != "network"
     return (ClosedPrimal if closed else NetworkPrimal)(problem, bounds)

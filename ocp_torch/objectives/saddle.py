@@ -20,7 +20,8 @@ from ocp_torch.samples import Samples
 class Saddle(Objective):
     r"""`sup_V inf_w Psi`, `Psi = E[V mu0 + grad V . B w / rho + S_M(w, f - V + grad V . a / rho)]`, `S_M` of Lemma 3.
 
-    Convex in `w`, concave in `V`, and needs no divergence of the problem. With ``augmentation`` `k > 0` the value player
+    Convex in `w`, concave in `V`, and needs no divergence of the problem. (With a limit `c` on the control, `S_M` is finite
+    for `|w| <= c M` only, and `w` is shrunk to that ball first.) With ``augmentation`` `k > 0` the value player
     minimises `-(Psi + k F_M)`, which `V*` does as well.
     """
 
@@ -33,7 +34,7 @@ class Saddle(Objective):
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         value, gradient = calculus.value_and_gradient(fields.value, samples.x)
-        w = fields.control_density(samples.x)
+        w = self.cost.within(fields.control_density(samples.x), self.bounds.M)
         pushed = (formulas.pull_back(samples, gradient) * w).sum(dim=-1) / self.rho
         beta = samples.f - value + formulas.along(samples, gradient) / self.rho
         psi = samples.mean(value * samples.mu0 + pushed + self.cost.saddle_minimum(w, beta, self.bounds.M))
@@ -89,7 +90,7 @@ class AugmentedSaddle(Objective):
         of_value = k * dual_integrand(fields, samples, value, slack, M, self.residual)
         if not self.needs_divergences:
             return {"value": -samples.mean(of_value)}
-        w, inflow = formulas.controlled_inflow(samples, fields.control_density, self.rho)
+        w, inflow = formulas.controlled_inflow(samples, self.admissible(fields), self.rho)
         mu, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
         running = samples.f * mu + self.cost.perspective(w, mu)
         hinged = running + C_V * (inflow - loss).clamp_min(0.0)

@@ -8,8 +8,9 @@ from ocp_torch.problems.torus import Torus
 class Circle(Torus):
     r"""`V* = alpha (x - 1/2)^2` with `alpha = (sqrt(1 + 8/rho^2) - 1) rho^2 / 4` and `OPT = alpha / 12`.
 
-    `mu*` is bounded exactly when `rho > 1`; then its supremum is `rho / (rho - 2 alpha / rho)`.
+    `mu*` is bounded exactly when `rho > 1`; then its supremum is `rho / (rho - 2 alpha / rho)`. With a ``control_limit``
+    below `alpha / rho` none of this is exact any more, and none of it is claimed.
     """
 
-    def __init__(self, discount: float = 2.0) -> None:
-        super().__init__(dim=1, shear="none", discount=discount)
+    def __init__(self, discount: float = 2.0, control_limit: float | None = None) -> None:
+        super().__init__(dim=1, shear="none", discount=discount, control_limit=control_limit)

@@ -30,7 +30,9 @@ class Manufactured(Problem):
     ``control_dim <= dim`` (default ``dim``); ``drift_size`` is the amplitude of the divergence-free part of the flux (on
     the command line ``problem.drift``); ``control_size`` the largest `|u*|`; ``contrast`` in [0, 1) that of `mu*`, and
     ``initial_contrast`` that of `mu0`; with ``state_dependent_control`` each entry of `B` varies with one coordinate;
-    ``interaction`` is how many coordinates one trigonometric term couples; ``seed`` draws all coefficients.
+    ``interaction`` is how many coordinates one trigonometric term couples; ``seed`` draws all coefficients. With a
+    ``control_limit`` below ``control_size``, which is then the largest control an unlimited optimum would use, `u*` stays
+    at the limit on a part of the torus, and everything is as exact as before.
     """
 
     def __init__(
@@ -46,8 +48,11 @@ class Manufactured(Problem):
         state_dependent_control: bool = False,
         interaction: int = 2,
         seed: int = 0,
+        control_limit: float | None = None,
     ) -> None:
-        super().__init__(dim=dim, control_dim=control_dim, discount=discount, exponent=exponent)
+        super().__init__(
+            dim=dim, control_dim=control_dim, discount=discount, exponent=exponent, control_limit=control_limit
+        )
         if self.control_dim > self.dim:
             raise InputError(f"problem.control_dim is {control_dim}, but must be at most problem.dim = {dim}.")
         self.drift_size = require_number("problem.drift", drift, at_least=0.0)
@@ -67,6 +72,11 @@ class Manufactured(Problem):
     @property
     def driftless(self) -> bool:
         return False
+
+    @property
+    def limited(self) -> bool:
+        """Whether `u*` is at the limit anywhere."""
+        return self.control_limit is not None and self.control_limit < self.control_size
 
     def _prescribe(self, generator: torch.Generator) -> None:
         """Draw `V0`, `mu*`, `mu0`, `h` and `B`."""
@@ -112,7 +122,7 @@ class Manufactured(Problem):
         self._c = supremum(lambda x: -self.state_cost(x), points, ascents=64, steps=100).value
         self.state_cost_bound = supremum(self.state_cost, points, ascents=64, steps=100).value
         self.value_bound = self._c + float(self._V0.amplitudes.abs().sum())
-        self.control_bound = self.control_size
+        self.control_bound = self.control_limit if self.limited else self.control_size
         self.occupation_bound = 1.0 + self.contrast
         # Both V0 and mu0 are trigonometric polynomials: their product integrates mode against mode.
         self.exact_optimum = self._c + _integral_of_product(self._V0, self._mu0)
@@ -149,11 +159,18 @@ class Manufactured(Problem):
         moving = dB * self._V0.gradient(x).unsqueeze(-1)
         hot = torch.nn.functional.one_hot(self._B_coordinate.to(x.device), self.dim).to(x)
         jacobian = -(jacobian + torch.einsum("nik,ikj->nkj", moving, hot)) / self.discount
-        # D grad R*(p) = |p|^{q'-2} (I + (q'-2) n n^T) with n = p / |p|.
+        # D grad R*(p) = |p|^{q'-2} (I + (q'-2) n n^T) with n = p / |p|; at the limit c it is (c / |p|) (I - n n^T).
         power = self.control_cost.conjugate_exponent - 2.0
         direction = torch.nn.functional.normalize(p, dim=-1, eps=1e-30)
-        bent = jacobian + power * direction.unsqueeze(-1) * torch.einsum("nk,nkj->nj", direction, jacobian).unsqueeze(1)
         scale = norm_power(p, power) if power > 0.0 else torch.ones_like(p[:, 0])
+        radial = torch.full_like(scale, power)
+        if self.limited:
+            size = p.norm(dim=-1)
+            at_limit = size > self.control_limit ** (self.exponent - 1.0)
+            scale = torch.where(at_limit, self.control_limit / size.clamp_min(1e-30), scale)
+            radial = torch.where(at_limit, -1.0, radial)
+        along = torch.einsum("nk,nkj->nj", direction, jacobian).unsqueeze(1)
+        bent = jacobian + radial[:, None, None] * direction.unsqueeze(-1) * along
         return (self.control_divergence(x) * u).sum(dim=-1) + scale * torch.einsum("njk,nkj->n", B, bent)
 
     def control_matrix(self, x: Tensor) -> Tensor:
@@ -178,8 +195,13 @@ class Manufactured(Problem):
     def initial_density(self, x: Tensor) -> Tensor:
         return self._mu0(x)
 
-    def enclosure(self, box: Box) -> Enclosure:
-        """The formulas of `state_cost` and `drift` in Taylor models; the optimal control near its zeros by its size alone."""
+    def enclosure(self, box: Box) -> Enclosure | None:
+        """The formulas of `state_cost` and `drift` in Taylor models; the optimal control near its zeros by its size alone.
+
+        `None` where `u*` is clipped: there are no models of its kinks yet.
+        """
+        if self.limited:
+            return None
         rho, q, conjugate = self.discount, self.exponent, self.control_cost.conjugate_exponent
         V0, slope = self._V0.model(box), self._V0.gradient_model(box)
         mu, mu0 = self._mu.model(box), self._mu0.model(box)

@@ -7,17 +7,22 @@ from __future__ import annotations
 
 import inspect
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ocp_torch import calculus
-from ocp_torch.control_cost import PowerCost
+from ocp_torch.control_limit import control_cost
 from ocp_torch.enclosure import Enclosure, Lipschitz, lipschitz_enclosure
 from ocp_torch.errors import InputError, require_integer, require_number
+from ocp_torch.samplers import scrambled_sobol
+from ocp_torch.samples import Samples
 from ocp_torch.taylor import Box
 
 # Beyond this, B alone would fill the memory.
 MOST_COORDINATES = 1024
+# Head-room on a sampled supremum that is going to be used as a bound.
+MARGIN = 1.05
 
 
 class Problem:
@@ -25,14 +30,27 @@ class Problem:
 
     All methods are batched, take states ``(N, d)``, work in the precision and on the device of their argument, and have
     period 1 in each coordinate. Arguments of `__init__`: ``dim`` is `d`, ``control_dim`` is `m` (default `d`),
-    ``discount`` is `rho > 0` (per unit time), ``exponent`` is `q` in (1, 2]. Raises `InputError` outside these ranges.
+    ``discount`` is `rho > 0` (per unit time), ``exponent`` is `q` in (1, 2], ``control_limit`` is `c > 0` where controls
+    must satisfy `|u| <= c` (Euclidean), else `None`. Raises `InputError` outside these ranges.
 
     Attributes a subclass may set, each `None` where unknown: ``state_cost_bound >= sup f``; ``occupation_bound >= sup
     mu*`` (`math.inf` when known to be unbounded); ``control_bound >= sup |u*|``; ``value_bound >= sup V*``;
     ``exact_optimum``, the number `OPT`; ``lipschitz``, constants of the data (`Lipschitz`).
     """
 
-    def __init__(self, dim: int, control_dim: int | None = None, discount: float = 2.0, exponent: float = 2.0) -> None:
+    # Whether the functions can be called at any state; a data set knows them at its own only (see `samples`).
+    evaluable: bool = True
+    # Whether the control matrix can, which the controller from V needs.
+    knows_control_matrix: bool = True
+
+    def __init__(
+        self,
+        dim: int,
+        control_dim: int | None = None,
+        discount: float = 2.0,
+        exponent: float = 2.0,
+        control_limit: float | None = None,
+    ) -> None:
         self.dim = require_integer("problem.dim", dim, 1, maximum=MOST_COORDINATES)
         self.control_dim = (
             self.dim
@@ -41,7 +59,8 @@ class Problem:
         )
         self.discount = require_number("problem.discount", discount, above=0.0, at_least=1e-6, at_most=1e6)
         self.exponent = require_number("problem.exponent", exponent, above=1.0, at_most=2.0)
-        self.control_cost = PowerCost(self.exponent)
+        self.control_cost = control_cost(self.exponent, control_limit)
+        self.control_limit = None if control_limit is None else float(control_limit)
         self.state_cost_bound: float | None = None
         self.occupation_bound: float | None = None
         self.control_bound: float | None = None
@@ -114,10 +133,43 @@ class Problem:
         """`mu*(x)`, ``(N,)``."""
         return None
 
+    def samples(self, places: Tensor, divergences: bool = True) -> Samples:
+        """The data at the ``places`` a sampler drew: states ``(N, d)``, unless the problem has a sampler of its own kind."""
+        return Samples.of(self, places, divergences=divergences)
+
+    def survey(self, count: int, branch: int, independent: bool = False) -> Samples:
+        """Data spread over the torus, in float64, at most ``count``: what sizes and bounds are estimated from.
+
+        With ``independent`` the states are random draws: evenly spread ones show waves that are not there.
+        """
+        if independent:
+            x = torch.rand(count, self.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(branch))
+        else:
+            x = scrambled_sobol(count, self.dim, branch, torch.float64)
+        return Samples.of(self, x, divergences=False)
+
+    @property
+    def rehearsal(self) -> Problem:
+        """The problem as looks by which choices are made see it: itself, where fresh states cost nothing."""
+        return self
+
     def velocity(self, x: Tensor, u: Tensor) -> Tensor:
         """`a(x) + B(x) u`, ``(N, d)``."""
         pushed = torch.einsum("ndm,nm->nd", self.control_matrix(x), u)
         return pushed if self.driftless else self.drift(x) + pushed
+
+    def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
+        """The state ``(d,)`` that an observation of the Gymnasium environment ``env`` shows. Override it, with `to_action`,
+        for the environments the problem is a model of; ours need neither."""
+        raise InputError(
+            f"{type(self).__name__} does not know the environment {env}: it must define from_observation and to_action."
+        )
+
+    def to_action(self, env: str, control: np.ndarray) -> np.ndarray:
+        """The action of ``env`` that applies ``control`` ``(m,)``."""
+        raise InputError(
+            f"{type(self).__name__} does not know the environment {env}: it must define from_observation and to_action."
+        )
 
     @property
     def parameters(self) -> dict:

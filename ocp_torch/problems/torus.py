@@ -36,11 +36,19 @@ class Torus(Problem):
     `OPT = d alpha / 12`. The flow contracts at rate `k = 2 alpha / rho`, so
     `mu* = rho/(rho - d k) (1 - (2 max_i |y_i - 1/2|)^{(rho - d k)/k})`, bounded exactly when `rho > d k`.
 
-    ``shear`` chooses the integer matrix `A`: none, chain, or random by ``seed``.
+    ``shear`` chooses the integer matrix `A`: none, chain, or random by ``seed``. Where a ``control_limit`` is below
+    `sup |u*| = sqrt(d) alpha / rho`, that optimum is out of reach, and the exact truth is not given.
     """
 
-    def __init__(self, dim: int = 2, shear: str = "chain", discount: float = 2.0, seed: int = 0) -> None:
-        super().__init__(dim=dim, discount=discount)
+    def __init__(
+        self,
+        dim: int = 2,
+        shear: str = "chain",
+        discount: float = 2.0,
+        seed: int = 0,
+        control_limit: float | None = None,
+    ) -> None:
+        super().__init__(dim=dim, discount=discount, control_limit=control_limit)
         self.shear = require_choice("problem.shear", shear, SHEARS)
         self.seed = require_integer("problem.seed", seed, 0)
         self._A = shear_matrix(self.dim, self.shear, self.seed)
@@ -54,6 +62,11 @@ class Torus(Problem):
         self.control_bound = math.sqrt(d) * self._alpha / rho
         self.occupation_bound = rho / excess if excess > 1e-9 * rho else math.inf
         self.exact_optimum = d * self._alpha / 12.0
+        self._exact = control_limit is None or self.control_bound <= self.control_limit
+        if not self._exact:
+            # Another problem: only what bounds every problem with this cost is still known.
+            self.value_bound = self.occupation_bound = self.exact_optimum = None
+            self.control_bound = self.control_limit
 
     def _offset(self, x: Tensor) -> Tensor:
         """`y - 1/2` in `[-1/2, 1/2)`, ``(N, d)``."""
@@ -79,13 +92,15 @@ class Torus(Problem):
         B = box.constant(self._B.to(box.centre).expand(len(box), self.dim, self.dim))
         return Enclosure(parts.sum() * (1.0 / self.dim), None, B, box.constant(1.0))
 
-    def exact_value(self, x: Tensor) -> Tensor:
-        return self._alpha * self._offset(x).square().sum(dim=-1)
+    def exact_value(self, x: Tensor) -> Tensor | None:
+        return None if not self._exact else self._alpha * self._offset(x).square().sum(dim=-1)
 
-    def exact_control(self, x: Tensor) -> Tensor:
-        return -self._rate * self._offset(x)
+    def exact_control(self, x: Tensor) -> Tensor | None:
+        return None if not self._exact else -self._rate * self._offset(x)
 
-    def exact_occupation(self, x: Tensor) -> Tensor:
+    def exact_occupation(self, x: Tensor) -> Tensor | None:
+        if not self._exact:
+            return None
         reach = 2.0 * self._offset(x).abs().amax(dim=-1)
         excess = self.discount - self.dim * self._rate
         # log(1/reach)/k is when a start on the cube's face arrives: mu* integrates rho e^{-excess t} up to then.

@@ -96,7 +96,7 @@ def _speed(problem: Problem, coarsest: int) -> tuple[GridSolution, float]:
     scheme = SemiLagrangian(problem, grid, longest)
     # Without drift the equation itself gives |u|^q / q' = R*(s) = f - V <= osc f.
     q = problem.exponent
-    thrust = (q / (q - 1.0) * scheme.scale) ** (1.0 / q)
+    thrust = min((q / (q - 1.0) * scheme.scale) ** (1.0 / q), problem.control_limit or math.inf)
     fastest = float(scheme.a.abs().max()) + float(scheme.B.flatten(1).norm(dim=-1).max()) * thrust
     step = min(longest, CELLS * grid.spacing / max(fastest, 1e-300))
     value, control = scheme.f.clone(), scheme.f.new_zeros(grid.count, problem.control_dim)
@@ -134,4 +134,4 @@ def _interpolated(problem: Problem, solution: GridSolution, x: Tensor) -> tuple[
     value = (stencil.linear * V[stencil.index]).sum(dim=-1) + extra.clamp(-clip, clip)
     gradient = (stencil.linear.unsqueeze(-1) * grid.gradient(V)[stencil.index]).sum(dim=1)
     pull = torch.einsum("ndm,nd->nm", problem.control_matrix(x), gradient)
-    return value, minimiser(-pull / problem.discount, problem.exponent)
+    return value, minimiser(-pull / problem.discount, problem.exponent, problem.control_limit)

@@ -11,7 +11,8 @@ monotone, so that it converges to the viscosity solution; what is clipped stays 
 proportional to `h` the error is `O(tau^2)`.
 
 The minimum over `u` is taken over finitely many candidates, each judged by the whole right side: the control now held, the
-closed-form minimiser `u = |s|^{q'-2} s`, `s = -B^T grad V / rho`, at the midpoint of its path, and the same from the
+closed-form minimiser `u = |s|^{q'-2} s`, `s = -B^T grad V / rho` (cut to the limit on the control, if there is one: mixtures
+of controls within a ball stay in it), at the midpoint of its path, and the same from the
 controls of neighbouring nodes, which carries a better branch across a kink.
 """
 
@@ -59,9 +60,13 @@ def running_cost(u: Tensor, q: float) -> Tensor:
     return u.norm(dim=-1) ** q / q
 
 
-def minimiser(s: Tensor, q: float) -> Tensor:
-    """The `u` that maximises `s . u - |u|^q / q`: `|s|^{q'-2} s` with `1/q + 1/q' = 1`, ``(N, m)``."""
-    return s.norm(dim=-1, keepdim=True) ** ((2.0 - q) / (q - 1.0)) * s
+def minimiser(s: Tensor, q: float, limit: float | None = None) -> Tensor:
+    """The `u` that maximises `s . u - |u|^q / q`: along `s`, of size `|s|^{q'-1}`, at most ``limit``; ``(N, m)``."""
+    size = s.norm(dim=-1, keepdim=True)
+    u = size ** ((2.0 - q) / (q - 1.0)) * s
+    if limit is None:
+        return u
+    return torch.where(size ** (1.0 / (q - 1.0)) <= limit, u, limit * s / size.clamp_min(1e-300))
 
 
 def discounted_weights(rho: float, tau: float) -> list[float]:
@@ -78,7 +83,7 @@ class SemiLagrangian:
 
     def __init__(self, problem: Problem, grid: Grid, step: float, rise: float = 0.0) -> None:
         self.problem, self.grid, self.step = problem, grid, step
-        self.rho, self.q = problem.discount, problem.exponent
+        self.rho, self.q, self.limit = problem.discount, problem.exponent, problem.control_limit
         self.weights = discounted_weights(self.rho, step)
         self.gain = sum(self.weights)
         self.beta = 1.0 - self.gain
@@ -126,7 +131,7 @@ class SemiLagrangian:
 
     def _closed_form(self, slope: Tensor, part: slice | Tensor, u: Tensor) -> Tensor:
         """The minimiser that `grad V` gives midway along the path under ``u``."""
-        return minimiser(self._pull(slope, part, u), self.q)
+        return minimiser(self._pull(slope, part, u), self.q, self.limit)
 
     def _pull(self, slope: Tensor, part: slice | Tensor, u: Tensor) -> Tensor:
         """`-B^T grad V / rho`, ``(N, m)``, midway along the path under ``u``; ``slope`` is `grad V` at the nodes."""
@@ -191,7 +196,8 @@ class SemiLagrangian:
         for first in range(0, self.grid.count, PIECE):
             part = slice(first, first + PIECE)
             s, u = self._pull(slope, part, control[part]), control[part]
-            dual = s.norm(dim=-1) ** (self.q / (self.q - 1.0)) * (self.q - 1.0) / self.q
+            best = minimiser(s, self.q, self.limit)
+            dual = (s * best).sum(dim=-1) - running_cost(best, self.q)
             gaps.append(running_cost(u, self.q) + dual - (s * u).sum(dim=-1))
         return max(float(torch.cat(gaps).median()), 0.0)
 

@@ -14,7 +14,7 @@ from ocp_torch.bounds import Bounds
 from ocp_torch.certificate.certify import in_float64
 from ocp_torch.certificate.sides import slack_function
 from ocp_torch.certificate.simulation import rate_at
-from ocp_torch.control_laws import control_laws, occupation_density
+from ocp_torch.control_laws import NETWORK, control_laws, occupation_density
 from ocp_torch.extremum import batched
 from ocp_torch.fields import Fields
 from ocp_torch.problems import Problem
@@ -39,12 +39,14 @@ def quantities(problem: Problem, fields: Fields, bounds: Bounds, occupation: str
     drawn: dict[str, tuple] = {}
     if fields.value is not None:
         drawn["value"] = (fields.value, problem.exact_value)
-        drawn["slack"] = (slack_function(problem, fields.value), None)
+        if problem.evaluable:
+            drawn["slack"] = (slack_function(problem, fields.value), None)
     for kind, law in laws.items():
-        drawn[f"control_{kind}"] = (law, problem.exact_control)
-    if occupation is not None:
+        if kind != "value" or problem.knows_control_matrix:
+            drawn[f"control_{kind}"] = (law, problem.exact_control)
+    if occupation is not None and (problem.evaluable or occupation == NETWORK):
         drawn["occupation"] = (occupation_density(occupation, problem, fields, bounds), problem.exact_occupation)
-    if problem.dim in BINS:
+    if problem.dim in BINS and problem.evaluable:
         learned, exact = drawn.get("occupation", (None, problem.exact_occupation))
         drawn["occupation"] = (learned, exact, simulated_occupation(problem, next(iter(laws.values()))))
     return drawn

@@ -13,17 +13,18 @@ from ocp_torch.bounds import Bounds, resolve_bounds
 from ocp_torch.budgets import fill
 from ocp_torch.calculus import Field
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, certify_policy, in_float64, table
-from ocp_torch.certificate.black_box import BlackBox
+from ocp_torch.certificate.black_box import BlackBox, require_limit
 from ocp_torch.config import build_certificate_settings, build_network, build_problem
 from ocp_torch.control_laws import ControlLaw, control_laws
 from ocp_torch.controller import Controller, problem_name
 from ocp_torch.errors import InputError, require_flag, require_integer
+from ocp_torch.extremum import batched
 from ocp_torch.fields import Fields
 from ocp_torch.fields.fields import VALUE
 from ocp_torch.objectives import Dual
 from ocp_torch.problems import Problem
 from ocp_torch.process import prepare
-from ocp_torch.samplers import UniformSampler, derive_seed
+from ocp_torch.samplers import UniformSampler, derive_seed, scrambled_sobol
 from ocp_torch.samples import Samples
 from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training import figures
@@ -33,6 +34,8 @@ log = logging.getLogger(__name__)
 
 # Branch of the seed tree for the V trained here, beside those of runs, evaluation and the stage.
 JUDGE_STREAM = 4
+# States at which a controller trained under another limit is held against the problem's.
+LIMIT_PROBES = 2**14
 MODEL = {"name": "mlp", "modes": None, "waves": None, "width": None, "depth": 3, "activation": None, "gated": None}
 
 
@@ -52,6 +55,10 @@ def certify(
     there is no lower bound). Raises `InputError` where the controller or the value fails.
     """
     require_integer("seed", seed, 0)
+    if not problem.evaluable:
+        raise InputError(
+            "problem is a data set, on which no given controller can be certified: nothing can be simulated."
+        )
     defaults = fill({"model": dict(MODEL), "trainer": {}, "optimizer": {}, "certificate": {}}, problem)
     settings = settings or build_certificate_settings(defaults)
     bounds = resolve_bounds(problem)
@@ -100,7 +107,12 @@ def law_of(controller: Callable | Controller, problem: Problem) -> ControlLaw:
             f"but the problem has d = {problem.dim} and m = {problem.control_dim}."
         )
     fields = in_float64(controller.fields)
-    return control_laws(controller.occupation, controller.problem, fields, controller.bounds)[controller.kind]
+    law = control_laws(controller.occupation, controller.problem, fields, controller.bounds)[controller.kind]
+    if controller.problem.control_limit != problem.control_limit:  # its own limit it obeys by itself
+        x = scrambled_sobol(LIMIT_PROBES, problem.dim, 0, torch.float64)
+        with torch.no_grad():
+            require_limit(batched(law, x), x, problem.control_limit)
+    return law
 
 
 def value_of(value: Field | Controller, problem: Problem) -> Field:

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from ocp_torch import calculus, formulas
 from ocp_torch.certificate import Certificate
-from ocp_torch.control_laws import occupation_density
+from ocp_torch.control_laws import admissible_density, occupation_density
 from ocp_torch.samples import Samples
 from ocp_torch.steppers import StepReport
 
@@ -25,11 +25,12 @@ def liouville_residual(trainer, batch: Samples) -> dict[str, Tensor]:
     """`mean |mu0 - mu - div(a mu + B w) / rho|` on ``batch``, whatever gives `mu`: also where the loss needs no divergences
     (a player that rests, the plain saddle) or `mu` is in closed form. Nothing where the problem gives no divergences."""
     problem, fields, rho = trainer.problem, trainer.fields, trainer.problem.discount
-    samples = Samples.of(problem, batch.x)
+    samples = Samples.of(problem, batch.x) if problem.evaluable else batch
     if samples.div_a is None or samples.div_B is None:
         return {}
-    _, inflow = formulas.controlled_inflow(samples, fields.control_density, rho)
-    density = occupation_density(trainer.objective.occupation, problem, fields, trainer.bounds)
+    form = (trainer.objective.occupation, problem, fields, trainer.bounds)
+    _, inflow = formulas.controlled_inflow(samples, admissible_density(*form), rho)
+    density = occupation_density(*form)
     if problem.driftless:
         loss = density(samples.x)
     else:

@@ -105,6 +105,8 @@ def _hand_out(trainer: Trainer, certificate: Certificate, fields: Fields, folder
     """Write `controller.safetensors` and `certificate.json`; the law that the controller follows."""
     if certificate.best_perf is not None:
         kind = certificate.best_perf[0]
+    elif certificate.subject is not None:
+        kind = certificate.subject
     else:
         kind = "value" if fields.value is not None else "density"
     controller_of(trainer, certificate, kind, fields).save(folder / "controller.safetensors")

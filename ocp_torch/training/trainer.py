@@ -87,8 +87,9 @@ class Trainer:
 
     def draw(self) -> Samples:
         """The next batch of training samples, on the run's device."""
-        x = self.sampler.draw(self.settings.batch).to(self.settings.torch_device)
-        return Samples.of(self.problem, x, divergences=self.objective.needs_divergences)
+        places = self.sampler.draw(self.settings.batch).to(self.settings.torch_device)
+        drawn = self.problem.samples(places, divergences=self.objective.needs_divergences)
+        return drawn if self.problem.evaluable else drawn.to(next(self.fields.parameters()))
 
     @property
     def end(self) -> int:
@@ -190,8 +191,8 @@ class Trainer:
 
         An `M` that was a guess and turned out too small is raised for the next round.
         """
-        if self.round + 1 >= self.settings.rounds or self.fields.value is None:
-            return False
+        if self.round + 1 >= self.settings.rounds or self.fields.value is None or not self.problem.evaluable:
+            return False  # without a simulation there is no gap to go by
         guessed = self.bounds.sources["M"] == ESTIMATED
         certificate = self.look(occupation_states=CertificateSettings.occupation_states if guessed else 0)
         better = raised(self.bounds, certificate.assumptions.estimated_sup_occupation)
@@ -209,16 +210,21 @@ class Trainer:
         """A quick certificate of the averaged fields, on states that neither training nor `certify` uses."""
         if occupation_states or self._seen is None or self._seen[:2] != (self.step, self.bounds):
             run = replace(self.run, seed=derive_seed(self.seed, LOOK_STREAM))
-            certificate = self.certify(replace(QUICK, occupation_states=occupation_states), run=run)
+            settings = replace(QUICK, occupation_states=occupation_states)
+            certificate = self.certify(settings, run=run, problem=self.problem.rehearsal)
             self._seen = (self.step, self.bounds, certificate)
         return self._seen[2]
 
     def certify(
-        self, settings: CertificateSettings, fields: Fields | None = None, run: Run | None = None
+        self,
+        settings: CertificateSettings,
+        fields: Fields | None = None,
+        run: Run | None = None,
+        problem: Problem | None = None,
     ) -> Certificate:
         """The certificate of ``fields``, or of the averaged ones as they stand."""
         trained = Trained(fields or self.averaged_fields, self.objective.occupation, self.network)
-        return certify_fields(self.problem, trained, self.bounds, settings, run or self.run)
+        return certify_fields(problem or self.problem, trained, self.bounds, settings, run or self.run)
 
     def choose(self) -> tuple[Fields, str | None]:
         """The fields to hand out: the averaged ones, or those of the best look where they are clearly worse than that; and

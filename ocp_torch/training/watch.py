@@ -11,12 +11,12 @@ from torch import Tensor
 from ocp_torch.bounds import Bounds
 from ocp_torch.certificate import Certificate
 from ocp_torch.problems import Problem
-from ocp_torch.samplers import evaluation_points
+from ocp_torch.samplers import derive_seed
 
 # A run whose weights or losses have grown by so much since it began is not coming back.
 GROWN_WEIGHTS, GROWN_LOSS = 100.0, 1e4
 # States on which the bound of the best constant V is computed.
-CONSTANT_STATES = 2**13
+CONSTANT_STATES, CONSTANT_STREAM = 2**13, 7
 # A lower bound that falls short of it by less is as good: networks round, and both are sampled.
 ROUNDING = 1e-4
 
@@ -119,6 +119,6 @@ def hopeless(problem: Problem, bounds: Bounds, certificate: Certificate, seed: i
 @torch.no_grad()
 def best_constant(problem: Problem, bounds: Bounds, seed: int) -> float:
     """`max_c F_M(c) = max_c c - M E[(c - f)_+]` over constants `c`, reached at the `1 / M` quantile of `f`."""
-    f = problem.state_cost(evaluation_points(CONSTANT_STATES, problem.dim, 0, seed))
-    c = torch.quantile(f, min(1.0, 1.0 / bounds.M))
-    return float(c - bounds.M * (c - f).clamp_min(0.0).mean())
+    met = problem.survey(CONSTANT_STATES, derive_seed(seed, CONSTANT_STREAM))
+    c = torch.quantile(met.f, min(1.0, 1.0 / bounds.M))  # any c gives a lower bound: that of uniform states will do
+    return float(c - bounds.M * met.mean((c - met.f).clamp_min(0.0)))

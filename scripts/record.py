@@ -1,0 +1,22 @@
+"""Record samples of a problem: python scripts/record.py problem=manufactured samples=20000 out=data.npz"""
+
+from __future__ import annotations
+
+import hydra
+from omegaconf import DictConfig
+
+from ocp_torch.launch import job, launch
+from ocp_torch.record import prepare
+
+
+def record(config: dict, folder) -> None:
+    prepare(config).run()
+
+
+@hydra.main(version_base="1.3", config_path="../configs", config_name="record")
+def main(config: DictConfig) -> None:
+    job(record, config)
+
+
+if __name__ == "__main__":
+    launch(main, "record", prepare)
