@@ -2,10 +2,25 @@
 
 from ocp_torch.problems.arm import Arm
 from ocp_torch.problems.circle import Circle
+from ocp_torch.problems.dubins import Dubins
+from ocp_torch.problems.kuramoto import Kuramoto
 from ocp_torch.problems.manufactured import Manufactured
+from ocp_torch.problems.pendulum import Pendulum
+from ocp_torch.problems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.torus import Torus
+from ocp_torch.problems.unicycle import Unicycle
 
-PROBLEMS = {"circle": Circle, "torus": Torus, "manufactured": Manufactured, "arm": Arm}
+PROBLEMS = {
+    "circle": Circle,
+    "torus": Torus,
+    "manufactured": Manufactured,
+    "kuramoto": Kuramoto,
+    "phase_neurons": PhaseNeurons,
+    "arm": Arm,
+    "unicycle": Unicycle,
+    "dubins": Dubins,
+    "pendulum": Pendulum,
+}
 
-__all__ = ["PROBLEMS", "Arm", "Circle", "Manufactured", "Problem", "Torus"]
+__all__ = ["PROBLEMS", "Problem", *sorted(cls.__name__ for cls in PROBLEMS.values())]
