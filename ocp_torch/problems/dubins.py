@@ -22,7 +22,8 @@ class Dubins(PlanarVehicle):
     smooth, so `V*` is bounded by `sup f`, continuous, and the viscosity solution; a smooth `V` with `Q <= 0` is at most
     `V*` by integration along any trajectory, so the shifted bound, and `F_M` with an `M >= sup mu*`, are lower bounds as
     before; simulated performance and the Lagrangian bound speak of the learned, smooth controller and need no optimum.
-    What is lost is the a-priori bound on `u*` (Proposition 2), for which a least-squares `alpha` stands, and any knowledge of `mu*`.
+    What is lost is the a-priori bound on `u*` (Proposition 2), for which a least-squares `alpha` stands, and knowledge
+    of `mu*`.
     """
 
     def __init__(

@@ -22,7 +22,7 @@ class Kuramoto(Problem):
     r"""`dtheta_i/dt = omega_i + (coupling / n) sum_j A_ij sin(theta_j - theta_i) + strength u_i`, `x = theta / 2 pi`.
 
     Kuramoto (1975), on a graph as in Rodrigues et al. (Physics Reports 610, 2016). Phases are in radians, ``frequencies``
-    `omega`, ``coupling`` and ``strength`` in rad/s; `u_i` acts on the oscillators in ``controlled`` (numbers from 0; null: all).
+    `omega`, ``coupling`` and ``strength`` in rad/s; `u_i` acts on those in ``controlled`` (numbers from 0; null: all).
     Cost: ``weight`` times `1 - r^2` to synchronise, `r^2` to desynchronise (`r` the order parameter), or
     `mean_i (1 - cos theta_i) / 2` to entrain, that is to bring all to phase 0.
 
