@@ -15,7 +15,7 @@ from ocp_torch.problems.problem import Problem
 # Points of a link at which the cost of obstacles is taken, at equal distances.
 POINTS_PER_LINK = 8
 TARGET = (0.2, 0.65)
-OBSTACLES = ((0.75, 0.15, 0.1), (-0.55, 0.5, 0.1))
+OBSTACLES = ((0.75, -0.4, 0.08),)
 
 
 class Arm(Problem):
@@ -41,10 +41,10 @@ class Arm(Problem):
         lengths: list[float] | None = None,
         target: list[float] = TARGET,
         obstacles: list[list[float]] = OBSTACLES,
-        clearance: float = 0.1,
+        clearance: float = 0.2,
         target_weight: float = 1.0,
-        obstacle_weight: float = 10.0,
-        speed: float = 0.5,
+        obstacle_weight: float = 3.0,
+        speed: float = 0.35,
         discount: float = 1.0,
         exponent: float = 2.0,
     ) -> None:
