@@ -33,8 +33,6 @@ class Arm(Problem):
     `F_M` a bound. Raises `InputError` for wrong arguments.
     """
 
-    picture = "arm"
-
     def __init__(
         self,
         dim: int = 2,

@@ -34,8 +34,6 @@ class Kuramoto(Problem):
     Raises `InputError` for wrong arguments.
     """
 
-    picture = "phases"
-
     def __init__(
         self,
         oscillators: int = 3,

@@ -29,8 +29,6 @@ class Pendulum(Problem):
     Raises `InputError` for wrong arguments.
     """
 
-    picture = "pendulum"
-
     def __init__(
         self,
         gravity: float = 10.0,

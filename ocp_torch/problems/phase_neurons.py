@@ -28,8 +28,6 @@ class PhaseNeurons(Problem):
     still holds. Where all phases agree the stimulus cannot part them. Raises `InputError` for wrong arguments.
     """
 
-    picture = "phases"
-
     def __init__(
         self,
         neurons: int = 2,

@@ -21,8 +21,6 @@ class PlanarVehicle(Problem):
     at the centre of an obstacle and 0 from ``clearance`` metres outside its rim on. Positions are in metres, in [0, size).
     """
 
-    picture = "vehicle"
-
     def __init__(
         self,
         control_dim: int,
