@@ -6,17 +6,22 @@ import hydra
 from omegaconf import DictConfig
 
 from ocp_torch.launch import job, launch
-from ocp_torch.training.evaluation import certify_saved, load_run, settings_for
+from ocp_torch.pictures import require_gif
+from ocp_torch.training.evaluation import animated, certify_saved, load_run, settings_for
 
 
 def check(config: dict):
     controller = load_run(config)
+    if config["animation"] is not None:
+        require_gif(controller.problem, config["animation"])
     return controller, settings_for(controller, config)
 
 
 def evaluate(config: dict, folder) -> None:
     controller, settings = check(config)
     certify_saved(controller, settings, config["seed"])
+    if config["animation"] is not None:
+        animated(controller, config["animation"], config["seed"])
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="evaluate")

@@ -7,10 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields, table
+from ocp_torch.certificate.certify import in_float64
 from ocp_torch.config import build_certificate_settings, build_network, build_problem
+from ocp_torch.control_laws import ControlLaw, control_laws
 from ocp_torch.controller import Controller, load_controller
 from ocp_torch.errors import InputError, require_integer
+from ocp_torch.pictures import animate, require_gif
 from ocp_torch.process import prepare
+from ocp_torch.training.practice import write_metrics
 from ocp_torch.training.settings import MOST_THREADS
 from ocp_torch.training.watch import hopeless
 
@@ -57,4 +61,18 @@ def certify_saved(controller: Controller, settings: CertificateSettings, seed: i
     fresh = [note for note in found if note not in certificate.warnings]
     certificate = replace(certificate, warnings=[*certificate.warnings, *fresh])
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
+    if settings.trajectories:
+        write_metrics(controller.problem, law_of(controller), run.seed, None)
     return certificate
+
+
+def law_of(controller: Controller) -> ControlLaw:
+    """The law that ``controller`` follows, in float64."""
+    laws = control_laws(controller.occupation, controller.problem, in_float64(controller.fields), controller.bounds)
+    return laws[controller.kind]
+
+
+def animated(controller: Controller, file: object, seed: int | None = None) -> None:
+    """Write the motion under ``controller`` as the GIF ``file``. Raises `InputError` for anything else."""
+    animate(controller.problem, law_of(controller), require_gif(controller.problem, file), seed or 0)
+    log.info("animated in %s", file)

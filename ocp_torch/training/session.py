@@ -10,6 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings, table
+from ocp_torch.certificate.certify import in_float64
+from ocp_torch.control_laws import control_laws
 from ocp_torch.controller import Controller
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.fields import Fields
@@ -19,6 +21,7 @@ from ocp_torch.training import figures
 from ocp_torch.training.checkpoint import LAST
 from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.monitor import Monitor
+from ocp_torch.training.practice import practical_figures, write_metrics
 from ocp_torch.training.signals import Signals
 from ocp_torch.training.trainer import NOT_FINITE, TARGET_GAP, Trainer
 from ocp_torch.training.watch import hopeless
@@ -27,7 +30,8 @@ log = logging.getLogger(__name__)
 
 
 def run_session(trainer: Trainer, certificate_settings: CertificateSettings, folder: Path) -> Certificate:
-    """Fill ``folder`` with a run: events, `checkpoints/`, `certificate.json`, `controller.safetensors`, figures.
+    """Fill ``folder`` with a run: events, `checkpoints/`, `certificate.json`, `controller.safetensors`, figures, and
+    `metrics.json` for problems with numbers of their own.
 
     A trainer that was resumed goes on where it is. SIGTERM and Ctrl-C raise `Preempted` once the state is saved. Raises
     `InputError` when a loss stops being finite (what the best look so far gives is handed out first), and `StorageError`
@@ -49,9 +53,11 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, fol
                 failure = f"Training stopped at step {trainer.step}, before the update: {error}"
                 certificate, fields = _salvage(trainer, certificate_settings, failure)
             kind = _hand_out(trainer, certificate, fields, folder)
+            law = control_laws(trainer.objective.occupation, trainer.problem, in_float64(fields), trainer.bounds)[kind]
             if trainer.settings.figures:
                 drawn = figures.draw(trainer.problem, fields, trainer.bounds, trainer.objective.occupation)
                 drawn["certificate"] = figures.interval(certificate.to_dict())
+                drawn |= practical_figures(trainer.problem, law, trainer.seed)
                 figures.save(drawn, folder / "figures")
                 monitor.figures(drawn, trainer.step)
             # Last, so that a start that was killed before this point leaves no points to be doubled.
@@ -60,6 +66,8 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, fol
     except OSError as error:
         raise StorageError(f"{folder} cannot be written to: {error.strerror or error}.") from None
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
+    if certificate_settings.trajectories:
+        write_metrics(trainer.problem, law, trainer.seed, folder)
     log.info("controller from %s, %.0f s in all, in %s", kind, time.perf_counter() - started, folder)
     if failure is not None:
         raise InputError(f"{failure.rstrip('.')}; the controller in {folder} is that of the best look before.")

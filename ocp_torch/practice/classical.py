@@ -1,0 +1,106 @@
+"""A simple classical controller for each system, as a yardstick: tuned by hand once, not to any seed."""
+
+from __future__ import annotations
+
+from functools import singledispatch
+
+import torch
+from torch import Tensor
+
+from ocp_torch.practice.paths import Law
+from ocp_torch.problems.angles import TURN
+from ocp_torch.problems.arm import Arm
+from ocp_torch.problems.dubins import Dubins
+from ocp_torch.problems.kuramoto import Kuramoto
+from ocp_torch.problems.pendulum import Pendulum
+from ocp_torch.problems.phase_neurons import PhaseNeurons
+from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.unicycle import Unicycle
+
+# Gains per second, the damping of the pseudo-inverse relative to the arm's length, and where the pendulum's balance starts.
+REACH, DAMPING = 1.5, 0.1
+DRIVE, STEER = 1.0, 2.0
+DESCENT = 2.0
+PUMP, BALANCE, CATCH = 0.2, (20.0, 5.0), 0.5
+
+
+@singledispatch
+def classical_law(problem: Problem) -> Law | None:
+    """The classical controller of ``problem``, or `None` where nobody has named one."""
+    return None
+
+
+@classical_law.register
+def resolved_rate(problem: Arm) -> Law:
+    r"""`dtheta/dt = -k J^+ (p - target)`, `J^+` the damped pseudo-inverse (Whitney, 1969; Nakamura and Hanafusa, 1986)."""
+    damping = (DAMPING * sum(problem.lengths)) ** 2
+
+    def law(x: Tensor) -> Tensor:
+        joints = problem.joints(x)
+        lever = joints[:, -1:] - joints[:, :-1]
+        J = torch.stack([-lever[..., 1], lever[..., 0]], dim=1)  # (N, 2, n), metres per radian
+        error = problem.end_effector(x) - torch.as_tensor(problem.target).to(x)
+        square = J @ J.mT + damping * torch.eye(2).to(x)
+        rate = -REACH * (J.mT @ torch.linalg.solve(square, error.unsqueeze(-1))).squeeze(-1)
+        return rate / (TURN * problem.speed)
+
+    return law
+
+
+def _bearing(problem: Unicycle | Dubins, x: Tensor) -> tuple[Tensor, Tensor]:
+    """The way to the target along and across the heading, in metres, both ``(N,)``."""
+    way, ahead = problem.to_target(x), problem.heading(x)
+    return (way * ahead).sum(dim=-1), ahead[:, 0] * way[:, 1] - ahead[:, 1] * way[:, 0]
+
+
+@classical_law.register
+def go_to_goal(problem: Unicycle) -> Law:
+    """Speed in proportion to the way ahead, turn rate to the bearing of the nearer end, front or back."""
+
+    def law(x: Tensor) -> Tensor:
+        along, across = _bearing(problem, x)
+        bearing = torch.atan2(across, along.abs()) * torch.where(along < 0.0, -1.0, 1.0)
+        return torch.stack([DRIVE * along / problem.speed, STEER * bearing / (TURN * problem.turn_rate)], dim=-1)
+
+    return law
+
+
+@classical_law.register
+def pursue(problem: Dubins) -> Law:
+    """Turn rate in proportion to the bearing of the target."""
+
+    def law(x: Tensor) -> Tensor:
+        along, across = _bearing(problem, x)
+        return (STEER * torch.atan2(across, along) / (TURN * problem.turn_rate)).unsqueeze(-1)
+
+    return law
+
+
+@classical_law.register(Kuramoto)
+@classical_law.register(PhaseNeurons)
+def descend(problem: Problem) -> Law:
+    r"""`u = -k B' grad f`: proportional feedback on how the stimulus changes the synchrony (for Kuramoto, the mean field)."""
+
+    def law(x: Tensor) -> Tensor:
+        with torch.enable_grad():
+            at = x.detach().requires_grad_(True)
+            (slope,) = torch.autograd.grad(problem.state_cost(at).sum(), at)
+        return -DESCENT / problem.discount * torch.einsum("ndm,nd->nm", problem.control_matrix(x), slope)
+
+    return law
+
+
+@classical_law.register
+def energy_pump(problem: Pendulum) -> Law:
+    """Pump energy, then balance by proportional and derivative feedback (Astrom and Furuta, 2000); `|u| <= 1`."""
+
+    def law(x: Tensor) -> Tensor:
+        angle, velocity = problem.from_torus(x).unbind(dim=-1)
+        pull = 1.5 * problem.gravity / problem.length
+        missing = pull * (1.0 - angle.cos()) - 0.5 * velocity.square()
+        pump = PUMP * missing * torch.where(velocity < 0.0, -1.0, 1.0)
+        balance = -(BALANCE[0] * angle + BALANCE[1] * velocity) / 3.0
+        near = (angle.abs() < CATCH) & (velocity.abs() < 2.0)
+        return (torch.where(near, balance, pump) / problem.max_torque).clamp(-1.0, 1.0).unsqueeze(-1)
+
+    return law

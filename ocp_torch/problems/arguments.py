@@ -1,0 +1,25 @@
+"""Checks of arguments that several problems share: lists of numbers, points and round obstacles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ocp_torch.errors import InputError, require_number
+
+
+def require_numbers(name: str, value: object, count: int | None = None, above: float | None = None) -> list[float]:
+    """``value`` as a list of finite floats, ``count`` of them and each ``above`` a number where given; else `InputError`."""
+    if isinstance(value, str) or not isinstance(value, Sequence) or (count is not None and len(value) != count):
+        wanted = "a list of" + (f" {count}" if count is not None else "") + " numbers"
+        raise InputError(f"{name} is {value!r}, but must be {wanted}.")
+    return [require_number(f"{name}[{i}]", v, above=above) for i, v in enumerate(value)]
+
+
+def require_obstacles(name: str, value: object) -> list[list[float]]:
+    """``value`` as a list of round obstacles `[x, y, radius]` with positive radius; else `InputError`."""
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise InputError(f"{name} is {value!r}, but must be a list of [x, y, radius].")
+    rows = [require_numbers(f"{name}[{i}]", row, 3) for i, row in enumerate(value)]
+    for i, row in enumerate(rows):
+        require_number(f"{name}[{i}][2]", row[2], above=0.0)
+    return rows
