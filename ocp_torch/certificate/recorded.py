@@ -209,8 +209,9 @@ def closed_loop_J(
         largest, deepest = max(largest, float(v.max())), max(deepest, float(-slack.min()))
         highest = max(highest, float(mu.max()))
     with torch.no_grad():
-        v, gradient = calculus.value_and_gradient(value, training.x.double())
-        slack = formulas.hjb_slack(training.to(v), v, gradient, cost, rho)
+        loop = training.to(torch.zeros((), dtype=torch.float64))
+        v, gradient = calculus.value_and_gradient(value, loop.x)
+        slack = formulas.hjb_slack(loop, v, gradient, cost, rho)
     largest, deepest = max(largest, float(v.max())), max(deepest, float(-slack.min()))
     C_V = max(bounds.C_V, MARGIN * (largest + deepest))
     excess = best_multiples(terms, lambda t, s: t.J(s, C_V))
