@@ -25,7 +25,7 @@ from ocp_torch.controller import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.objectives import Dual, primal, saddle
-from ocp_torch.problems import Dataset, Manufactured
+from ocp_torch.problems import Circle, Dataset, Manufactured
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.record import Recorder, prepare
 from ocp_torch.samples import Samples
@@ -360,6 +360,23 @@ def test_a_torus_recorded_without_divergences_has_them_all_the_same(tmp_path):
     assert primal(data, resolve_bounds(data)).occupation == NETWORK
     with pytest.raises(InputError, match=r"method\.occupation"):
         primal(data, resolve_bounds(data), occupation="closed")
+
+
+@pytest.mark.parametrize(("discount", "bounded"), [(4.0, True), (0.5, False)])
+def test_a_density_without_bound_is_noticed_without_a_simulation(tmp_path, discount, bounded):
+    """On the circle mu* is bounded exactly for rho > 1: below, no M can be believed, and F_M is not used."""
+    problem = Circle(discount=discount)
+    data = Dataset(str(record(tmp_path, problem, 2000)))
+    smooth = lambda x: problem._alpha * (1.0 + (2.0 * torch.pi * x[:, 0]).cos()) / (2.0 * torch.pi**2)
+    fields = Fields({"value": Exactly(smooth)}).double()
+    settings_ = CertificateSettings(stage=StageSettings(steps=200, rounds=1, batch=64))
+    network = lambda **form: PeriodicMLP(width=24, depth=2, modes=3, **form)
+    trained = Trained(fields, None, network)
+    found = certify_fields(data, trained, resolve_bounds(data), settings_, Run("dataset", "dual"))
+    assert found.assumptions.occupation_holds is bounded
+    assert (found.best_lower is not None) is bounded
+    assert any("grows beyond all bounds" in w for w in found.warnings) is not bounded
+    json.dumps(found.to_dict(), allow_nan=False)
 
 
 RUN = ("problem=dataset", "certificate.stage.steps=10", "certificate.stage.rounds=1", "trainer.evaluate_every=10")

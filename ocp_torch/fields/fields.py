@@ -64,8 +64,7 @@ def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:
 
     Raises `InputError` when the state cost is not finite at some sampled state.
     """
-    met = problem.survey(1024, 0)
-    x, f = met.x, met.f
+    x, f = problem.survey(1024, 0, "x", "f")
     if f.shape != (len(x),):
         raise InputError(f"state_cost gave shape {tuple(f.shape)} for states {tuple(x.shape)}; it must give (N,).")
     if not torch.isfinite(f).all():

@@ -145,8 +145,8 @@ class Dataset(Problem):
         """The training samples of the rows ``places``; a recording gives its divergences for nothing."""
         return self.training.take(places.to("cpu"))
 
-    def survey(self, count: int, branch: int) -> Samples:
-        return self.training.take(slice(count))
+    def survey(self, count: int, branch: int, *columns: str) -> tuple[Tensor, ...]:
+        return tuple(getattr(self.training, name)[:count] for name in columns)
 
     @property
     def rows(self) -> int:

@@ -137,9 +137,14 @@ class Problem:
         """The data at the ``places`` a sampler drew: states ``(N, d)``, unless the problem has a sampler of its own kind."""
         return Samples.of(self, places, divergences=divergences)
 
-    def survey(self, count: int, branch: int) -> Samples:
-        """Data spread over the torus, in float64, at most ``count``: what sizes and bounds are estimated from."""
-        return Samples.of(self, scrambled_sobol(count, self.dim, branch, torch.float64), divergences=False)
+    @torch.no_grad()
+    def survey(self, count: int, branch: int, *columns: str) -> tuple[Tensor, ...]:
+        """``columns`` of `Samples` (x, f, a, B, mu0 or weight) at states spread over the torus, in float64, at most ``count``:
+        what sizes and bounds are estimated from."""
+        x = scrambled_sobol(count, self.dim, branch, torch.float64)
+        of = {"f": self.state_cost, "a": self.drift, "B": self.control_matrix, "mu0": self.initial_density}
+        of |= {"x": lambda x: x, "weight": lambda x: torch.ones_like(x[:, 0])}
+        return tuple(of[name](x) for name in columns)
 
     @property
     def rehearsal(self) -> Problem:
