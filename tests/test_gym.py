@@ -109,7 +109,7 @@ def test_a_data_set_is_no_environment(tmp_path):
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("gym") / "run"
     quick = ("certificate.points=64", "certificate.trajectories=4", "certificate.ascents=2", "trainer.figures=false")
-    enough = ("trainer.steps=400", "trainer.batch=64", "model.width=24", "optimizer.lr=0.01")
+    enough = ("trainer.steps=300", "trainer.batch=64", "model.width=24", "optimizer.lr=0.01")
     session(small("problem=circle", "method=dual", *enough, *quick), folder)
     return folder
 

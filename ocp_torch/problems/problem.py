@@ -139,8 +139,8 @@ class Problem:
 
     @torch.no_grad()
     def survey(self, count: int, branch: int, *columns: str) -> tuple[Tensor, ...]:
-        """``columns`` of `Samples` (x, f, a, B, mu0 or weight) at states spread over the torus, in float64, at most ``count``:
-        what sizes and bounds are estimated from."""
+        """``columns`` of `Samples` (x, f, a, B, mu0 or weight) at states spread over the torus, in float64, at most ``count``
+        of them: what sizes and bounds are estimated from."""
         x = scrambled_sobol(count, self.dim, branch, torch.float64)
         of = {"f": self.state_cost, "a": self.drift, "B": self.control_matrix, "mu0": self.initial_density}
         of |= {"x": lambda x: x, "weight": lambda x: torch.ones_like(x[:, 0])}
