@@ -1,17 +1,21 @@
 """Controllers for control-affine problems on the torus, with a certificate of how far from optimal they can be."""
 
 from ocp_torch.control_cost import PowerCost
+from ocp_torch.control_limit import LimitedCost
 from ocp_torch.controller import Controller, load_controller
 from ocp_torch.errors import InputError
-from ocp_torch.problems import PROBLEMS, Circle, Manufactured, Problem, Torus
+from ocp_torch.problems import PROBLEMS, Callable, Circle, Dataset, Manufactured, Problem, Torus
 from ocp_torch.training.given import certify
 
 __version__ = "0.1.0"
 __all__ = [
     "PROBLEMS",
+    "Callable",
     "Circle",
     "Controller",
+    "Dataset",
     "InputError",
+    "LimitedCost",
     "Manufactured",
     "PowerCost",
     "Problem",

@@ -82,7 +82,8 @@ def state_cost_supremum(problem: Problem) -> float:
     """`sup f`: the problem's own bound, or a sampled and climbed estimate with head-room."""
     if problem.state_cost_bound is not None:
         return problem.state_cost_bound
-    return MARGIN * supremum(problem.state_cost, problem.survey(SEARCHED, 1).x, differentiable=False).value
+    (x,) = problem.survey(SEARCHED, 1, "x")
+    return MARGIN * supremum(problem.state_cost, x, differentiable=False).value
 
 
 def _estimate_value_bound(problem: Problem) -> tuple[float, str]:
@@ -94,14 +95,15 @@ def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
     total = 2.0 * conjugate * state_cost_supremum(problem)
     if problem.driftless:
         return total ** (1.0 / q), "Proposition 2 of the paper with a sampled sup f"
-    met = problem.survey(SEARCHED, 1).take(slice(2048))
-    alpha = torch.linalg.pinv(met.B) @ met.a.unsqueeze(-1)
+    B, a = problem.survey(SEARCHED // 4, 1, "B", "a")
+    alpha = torch.linalg.pinv(B) @ a.unsqueeze(-1)
     largest = float(alpha.squeeze(-1).norm(dim=-1).max())
     return (total + 2.0**q * (conjugate - 1.0) * largest) ** (1.0 / q), "Proposition 2 with a least-squares alpha"
 
 
 def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
-    largest = float(problem.survey(SEARCHED, 1).mu0.max())
+    (mu0,) = problem.survey(SEARCHED, 1, "mu0")
+    largest = float(mu0.max())
     return OCCUPATION_GUESS * largest, f"a guess to train with, {OCCUPATION_GUESS:g} times sup mu0"
 
 

@@ -129,7 +129,7 @@ def made(name: str, render_mode: str | None):
     except InputError:
         raise
     except Exception as error:  # whatever a stranger's environment may raise
-        reason = next(iter(str(error).splitlines()), "no message").rstrip(".")
+        reason = next(iter(str(error).splitlines()), "no message").rstrip(".?!")
         raise InputError(f"env is {name!r}, which cannot be made: {reason}.") from None
 
 
@@ -154,7 +154,7 @@ def _picture(env, name: str) -> np.ndarray:
     try:
         picture = np.asarray(env.render())
     except Exception as error:  # whatever a stranger's environment may raise
-        reason = next(iter(str(error).splitlines()), "no message").rstrip(".")
+        reason = next(iter(str(error).splitlines()), "no message").rstrip(".?!")
         raise InputError(f"{name} cannot be drawn here: {reason}.") from None
     if picture.ndim != 3 or picture.shape[2] not in (3, 4):
         raise InputError(f"{name} gives no pictures (its render gave shape {picture.shape}); leave video out.")

@@ -1,6 +1,7 @@
 """A limit `|u| <= c`: closed forms against brute force, gradients against differences, bounds against exact truth."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -216,7 +217,7 @@ def test_the_bounds_at_the_exact_truth_are_the_optimum(problem):
     assert bounds.lagrangian.value == pytest.approx(problem.exact_optimum, rel=1e-9)
 
 
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(st.sampled_from(zoo.LIMITED), st.integers(0, 10**6), st.sampled_from([0.1, 1.0, 5.0]))
 def test_random_networks_obey_weak_duality_and_the_limit(name, seed, size):
     """Networks that say anything: the density player's flux is cut to the limit, its divergence with it."""
@@ -318,7 +319,8 @@ def test_a_given_controller_that_breaks_the_limit_is_refused_with_its_state_and_
 
 def test_one_trained_under_another_limit_is_held_against_this_one():
     trainer = small("problem=manufactured", "method=dual")
-    free = controller_of(trainer, trainer.look(), "value", trainer.averaged_fields)
+    certificate = SimpleNamespace(to_dict=dict)
+    free = controller_of(trainer, certificate, "value", trainer.averaged_fields)
     for parameter in free.fields.parameters():
         parameter.data.mul_(3.0)
     settings = CertificateSettings(points=64, replicates=2, trajectories=2, stage=StageSettings(steps=0))
@@ -330,11 +332,11 @@ def test_one_trained_under_another_limit_is_held_against_this_one():
 @pytest.mark.parametrize("overrides", [("method=primal",), ("method=pd",), ("method=pd", "method.augmentation=0")])
 def test_every_method_trains_with_a_limit_and_hands_out_a_controller_that_obeys(overrides, tmp_path):
     quick = ("certificate.points=256", "certificate.trajectories=4", "certificate.ascents=2", "trainer.figures=false")
-    trainer = small("problem=manufactured", "problem.control_limit=0.02", *quick, *overrides)
+    trainer = small("problem=manufactured", "problem.dim=1", "problem.control_limit=0.02", *quick, *overrides)
     certificate = session(trainer, tmp_path)
     u = load_controller(tmp_path / "controller.safetensors")
     assert u.problem.control_limit == 0.02
-    assert float(u(torch.rand(500, 2)).norm(dim=-1).max()) <= 0.02 * (1.0 + 1e-5)
+    assert float(u(torch.rand(500, 1)).norm(dim=-1).max()) <= 0.02 * (1.0 + 1e-5)
     exact = certificate.exact
     for low in certificate.lower.values():
         assert low is None or low.interval(0.99999)[0] <= exact
@@ -344,9 +346,15 @@ def test_every_method_trains_with_a_limit_and_hands_out_a_controller_that_obeys(
 
 @pytest.mark.slow
 def test_a_short_run_certifies_near_the_exact_optimum(tmp_path):
-    overrides = ("problem=manufactured", "problem.control_limit=0.5", "method=dual", "trainer.steps=500")
+    overrides = (
+        "problem=manufactured",
+        "problem.dim=1",
+        "problem.control_limit=0.5",
+        "method=dual",
+        "trainer.steps=400",
+    )
     overrides += ("trainer.batch=128", "model.width=48", "optimizer.lr=0.01", "trainer.evaluate_every=0")
-    effort = ("certificate.points=4096", "certificate.stage.steps=250", "certificate.trajectories=16")
+    effort = ("certificate.points=2048", "certificate.stage.steps=200", "certificate.trajectories=8")
     trainer = small(*overrides, *effort)
     certificate = session(trainer, tmp_path)
     exact = trainer.problem.exact_optimum

@@ -10,9 +10,11 @@ its data at the recorded states too: `f + R(u)`, `a + B u` and, from `div a` and
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from ocp_torch import calculus, formulas
 from ocp_torch.bounds import ESTIMATED, Bounds
@@ -37,6 +39,8 @@ from ocp_torch.samples import Samples
 # Held-out samples are put into so many groups: the scatter of their means gives the standard error, with nearly as many
 # degrees of freedom as there are groups.
 GROUPS, FEWEST = 64, 8
+# The samples with most mass, at which the contraction of the flow is looked at.
+TOP = 10
 # Branch of the seed tree for the draws of the fit, as in `stage`.
 STREAM = 3
 
@@ -198,7 +202,7 @@ def closed_loop_J(
     fitted = fit_closed_loop(problem, rough, trained.fields, trained.network, bounds, settings.stage, seed, pool)
     fitted = replace(trained, fields=fitted).in_float64()
     value = fields.value if fields.value is not None else fitted.value
-    terms, largest, deepest, highest = [], 0.0, 0.0, 0.0
+    terms, densities, spreads, largest, deepest = [], [], [], 0.0, 0.0
     for samples in sets:
         loop = closed_loop_samples(samples, law, cost)
         v, gradient = chunked_gradient(value, loop.x)
@@ -207,15 +211,28 @@ def closed_loop_J(
             mu, spent = formulas.drifting_loss(loop, fitted.log_occupation, rho)
         terms.append(Terms(loop, v, mu * slack, loop.mu0 - spent))
         largest, deepest = max(largest, float(v.max())), max(deepest, float(-slack.min()))
-        highest = max(highest, float(mu.max()))
+        densities.append(mu)
+        spreads.append(loop.div_a)
     with torch.no_grad():
-        v, gradient = calculus.value_and_gradient(value, training.x.double())
-        slack = formulas.hjb_slack(training.to(v), v, gradient, cost, rho)
+        loop = training.to(torch.zeros((), dtype=torch.float64))
+        v, gradient = calculus.value_and_gradient(value, loop.x)
+        slack = formulas.hjb_slack(loop, v, gradient, cost, rho)
     largest, deepest = max(largest, float(v.max())), max(deepest, float(-slack.min()))
     C_V = max(bounds.C_V, MARGIN * (largest + deepest))
     excess = best_multiples(terms, lambda t, s: t.J(s, C_V))
     J = [integral(t.samples, t.v * t.samples.mu0) + e for t, e in zip(terms, excess, strict=True)]
-    return Estimate.of(J, controller=kind), C_V, highest
+    return Estimate.of(J, controller=kind), C_V, highest_occupation(torch.cat(densities), torch.cat(spreads), rho)
+
+
+def highest_occupation(mu: Tensor, spread: Tensor, rho: float) -> float:
+    """The largest of the fitted densities ``mu`` ``(N,)``; infinite where it need not end there, by ``spread`` `= div g_u`.
+
+    Where a density is largest its gradient is 0, and Liouville's equation says `-div g_u = rho (1 - mu0 / mu) < rho`. A flow
+    that contracts faster than the discount forgets, there where the fit has most mass, has a density without bound, of
+    which a fit shows the lower part.
+    """
+    top = mu.topk(min(TOP, len(mu))).indices
+    return float(mu.max()) if float((-spread[top]).max()) < rho else math.inf
 
 
 def posed(problem: Dataset) -> WellPosed:

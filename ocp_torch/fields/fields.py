@@ -78,7 +78,7 @@ def _waves(problem: Problem, count: int) -> Tensor:
     """`prominent_waves` of the problem's data, from the same states always."""
     known = _found.setdefault(problem, {})
     if count not in known:
-        known[count] = prominent_waves(problem.survey(STATES, 0, independent=True), count)
+        known[count] = prominent_waves(problem.independent_samples(STATES), count)
     return known[count]
 
 
@@ -87,8 +87,7 @@ def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:
 
     Raises `InputError` when the state cost is not finite at some sampled state.
     """
-    met = problem.survey(1024, 0)
-    x, f = met.x, met.f
+    x, f = problem.survey(1024, 0, "x", "f")
     if f.shape != (len(x),):
         raise InputError(f"state_cost gave shape {tuple(f.shape)} for states {tuple(x.shape)}; it must give (N,).")
     if not torch.isfinite(f).all():

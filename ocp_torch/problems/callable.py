@@ -95,7 +95,7 @@ class Callable(Problem):
     @torch.no_grad()
     def _divergences(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """`div a` and `div B` by central differences, all `2 d` shifted batches in one call."""
-        at = x.detach().double().remainder(1.0)
+        at = x.detach().cpu().double().remainder(1.0)
         if "divergences" not in (kept := self.answers(at)):
             moves = self._step * torch.eye(self.dim, dtype=torch.float64)
             shifted = torch.cat([at + s * e for e in moves for s in (1.0, -1.0)]).remainder(1.0)

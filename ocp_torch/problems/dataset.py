@@ -145,7 +145,10 @@ class Dataset(Problem):
         """The training samples of the rows ``places``; a recording gives its divergences for nothing."""
         return self.training.take(places.to("cpu"))
 
-    def survey(self, count: int, branch: int, independent: bool = False) -> Samples:
+    def survey(self, count: int, branch: int, *columns: str) -> tuple[Tensor, ...]:
+        return tuple(getattr(self.training, name)[:count] for name in columns)
+
+    def independent_samples(self, count: int) -> Samples:
         return self.training.take(slice(count))
 
     @property

@@ -137,15 +137,19 @@ class Problem:
         """The data at the ``places`` a sampler drew: states ``(N, d)``, unless the problem has a sampler of its own kind."""
         return Samples.of(self, places, divergences=divergences)
 
-    def survey(self, count: int, branch: int, independent: bool = False) -> Samples:
-        """Data spread over the torus, in float64, at most ``count``: what sizes and bounds are estimated from.
+    @torch.no_grad()
+    def survey(self, count: int, branch: int, *columns: str) -> tuple[Tensor, ...]:
+        """``columns`` of `Samples` (x, f, a, B, mu0 or weight) at states spread over the torus, in float64, at most ``count``
+        of them: what sizes and bounds are estimated from."""
+        x = scrambled_sobol(count, self.dim, branch, torch.float64)
+        of = {"f": self.state_cost, "a": self.drift, "B": self.control_matrix, "mu0": self.initial_density}
+        of |= {"x": lambda x: x, "weight": lambda x: torch.ones_like(x[:, 0])}
+        return tuple(of[name](x) for name in columns)
 
-        With ``independent`` the states are random draws: evenly spread ones show waves that are not there.
-        """
-        if independent:
-            x = torch.rand(count, self.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(branch))
-        else:
-            x = scrambled_sobol(count, self.dim, branch, torch.float64)
+    def independent_samples(self, count: int) -> Samples:
+        """Data at independent draws of states, at most ``count``, the same ones always: evenly spread states show waves
+        that are not there."""
+        x = torch.rand(count, self.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
         return Samples.of(self, x, divergences=False)
 
     @property

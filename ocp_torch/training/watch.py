@@ -119,6 +119,6 @@ def hopeless(problem: Problem, bounds: Bounds, certificate: Certificate, seed: i
 @torch.no_grad()
 def best_constant(problem: Problem, bounds: Bounds, seed: int) -> float:
     """`max_c F_M(c) = max_c c - M E[(c - f)_+]` over constants `c`, reached at the `1 / M` quantile of `f`."""
-    met = problem.survey(CONSTANT_STATES, derive_seed(seed, CONSTANT_STREAM))
-    c = torch.quantile(met.f, min(1.0, 1.0 / bounds.M))  # any c gives a lower bound: that of uniform states will do
-    return float(c - bounds.M * met.mean((c - met.f).clamp_min(0.0)))
+    f, weight = problem.survey(CONSTANT_STATES, derive_seed(seed, CONSTANT_STREAM), "f", "weight")
+    c = torch.quantile(f, min(1.0, 1.0 / bounds.M))  # any c gives a lower bound: that of unweighted states will do
+    return float(c - bounds.M * (weight * (c - f).clamp_min(0.0)).mean())
