@@ -96,9 +96,20 @@ def test_the_tip_may_be_any_link_behind_turning_joints(urdf):
         RobotArm(urdf=str(urdf))
 
 
+def test_without_a_file_it_is_a_six_joint_arm_that_can_reach_its_target():
+    robot = RobotArm()
+    x = states(6, 4096)
+    assert robot.dim == 6
+    best = x[robot.distance(x).argmin()].clone().requires_grad_(True)
+    for _ in range(300):
+        (slope,) = torch.autograd.grad(robot.state_cost(best.unsqueeze(0)).sum(), best)
+        best = (best - 0.01 * slope).detach().requires_grad_(True)
+    assert float(robot.distance(best.detach().unsqueeze(0))) < 1e-3
+
+
 def test_wrong_arguments_are_refused():
-    with pytest.raises(InputError, match="problem.urdf must be a URDF file"):
-        RobotArm()
+    with pytest.raises(InputError, match="both given"):
+        RobotArm(urdf="arm.urdf", chain=PLANAR)
     with pytest.raises(InputError, match="rows of 15 numbers"):
         RobotArm(chain=[PLANAR[0]])
     with pytest.raises(InputError, match=r"problem.chain\[1\]"):

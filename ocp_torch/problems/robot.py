@@ -16,6 +16,16 @@ from ocp_torch.problems.urdf import read_chain
 
 # Points of a link at which the cost of obstacles is taken, at equal distances from one joint to the next.
 POINTS_PER_LINK = 4
+# Without a file, an elbow arm of the usual build: where each joint sits against the one before, in metres, and its axis.
+ELBOW = (
+    ((0.0, 0.0, 0.2), (0.0, 0.0, 1.0)),
+    ((0.0, 0.0, 0.2), (0.0, 1.0, 0.0)),
+    ((0.4, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ((0.2, 0.0, 0.0), (1.0, 0.0, 0.0)),
+    ((0.2, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ((0.1, 0.0, 0.0), (1.0, 0.0, 0.0)),
+    ((0.1, 0.0, 0.0), (0.0, 0.0, 0.0)),
+)
 
 
 class RobotArm(Problem):
@@ -23,7 +33,7 @@ class RobotArm(Problem):
 
     `Arm` in space: `x_i` is the angle of joint `i` in turns, `p = T_1 R_1(x_1) ... T_n R_n(x_n) T_tip 0` in metres, with the
     fixed transforms `T` and rotations `R` about the joints' axes that the ``urdf`` file names up to the link ``tip`` (null:
-    the last one that turning joints move). Every joint turns all the way round: limits of joints are not part of the
+    the last one that turning joints move; without a file, a six-joint elbow arm). Every joint turns all the way round: limits of joints are not part of the
     model. ``obstacles`` are balls `[x, y, z, radius]`, felt ``clearance`` metres from their surface, along the lines from
     joint to joint. ``speed`` in turns per second at `u = 1`.
 
@@ -45,9 +55,10 @@ class RobotArm(Problem):
         discount: float = 1.0,
         exponent: float = 2.0,
     ) -> None:
-        if (urdf is None) == (chain is None):
-            raise InputError("problem.urdf must be a URDF file (or, for a saved one, problem.chain its numbers).")
-        given = read_chain(urdf, tip) if chain is None else chain
+        if urdf is not None and chain is not None:
+            raise InputError("problem.urdf and problem.chain are both given, but either alone is the kinematics.")
+        given = chain if urdf is None else read_chain(urdf, tip)
+        given = _elbow() if given is None else given
         if isinstance(given, str) or not isinstance(given, Sequence) or len(given) < 2:
             raise InputError(
                 "problem.chain must be a list of rows of 15 numbers, one for each joint and one for the tip."
@@ -119,3 +130,7 @@ class RobotArm(Problem):
     def from_torus(self, x: Tensor) -> Tensor:
         """States as joint angles in [-pi, pi) radians, ``(N, n)``."""
         return to_radians(x)
+
+
+def _elbow() -> list[list[float]]:
+    return [[1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z, *axis] for (x, y, z), axis in ELBOW]
