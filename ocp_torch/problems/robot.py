@@ -33,9 +33,9 @@ class RobotArm(Problem):
 
     `Arm` in space: `x_i` is the angle of joint `i` in turns, `p = T_1 R_1(x_1) ... T_n R_n(x_n) T_tip 0` in metres, with the
     fixed transforms `T` and rotations `R` about the joints' axes that the ``urdf`` file names up to the link ``tip`` (null:
-    the last one that turning joints move; without a file, a six-joint elbow arm). Every joint turns all the way round: limits of joints are not part of the
-    model. ``obstacles`` are balls `[x, y, z, radius]`, felt ``clearance`` metres from their surface, along the lines from
-    joint to joint. ``speed`` in turns per second at `u = 1`.
+    the last one that turning joints move; without a file, a six-joint elbow arm). Every joint turns all the way round:
+    limits of joints are not part of the model. ``obstacles`` are balls `[x, y, z, radius]`, felt ``clearance`` metres from
+    their surface, along the lines from joint to joint. ``speed`` in turns per second at `u = 1`.
 
     ``chain`` is the kinematics as numbers (`ocp_torch.problems.urdf.read_chain`), in place of ``urdf``: what a saved
     controller holds. `mu*` is declared unbounded, as for `Arm`. Raises `InputError` for wrong arguments.
