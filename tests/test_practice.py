@@ -37,8 +37,8 @@ def test_a_simulated_cost_is_the_exact_value(problem):
 def test_states_of_a_path_are_those_of_the_flow():
     circle = Circle()
     x0 = torch.tensor([[0.7], [0.4]], dtype=torch.float64)
-    path = simulate(circle, lambda x: torch.full_like(x, 0.3), x0, 2.0, 8)
-    expected = (x0 + 0.3 * path.times.reshape(-1, 1, 1)).remainder(1.0)
+    path = simulate(circle, lambda x: torch.full_like(x, 0.31), x0, 2.0, 8)
+    expected = (x0 + 0.31 * path.times.reshape(-1, 1, 1)).remainder(1.0)
     torch.testing.assert_close(path.states, expected)
     assert path.late(0.25).shape == (2, 2, 1)
 
@@ -46,13 +46,19 @@ def test_states_of_a_path_are_those_of_the_flow():
 @zoo.on(list(BETTER))
 def test_the_classical_controller_does_what_no_control_does_not(request, problem):
     number, larger = BETTER[request.node.callspec.params["problem"]]
-    found = metrics(problem, classical_law(problem), seed=3, starts=64)
+    law = classical_law(problem)
+    found = metrics(problem, law, seed=3, starts=48)
     gain = found["classical"][number] - found["zero"][number]
     assert gain >= 0.2 if larger else gain <= -0.2
     assert found["controller"] == found["classical"]
-    assert metrics(problem, classical_law(problem), seed=3, starts=64) == found
-    assert metrics(problem, classical_law(problem), seed=4, starts=64) != found
     assert metrics_table(found).count("\n") == 4
+
+
+def test_numbers_repeat_with_a_seed_and_change_with_another():
+    arm = zoo.build("arm n=2")
+    found = [metrics(arm, zero_law(arm), seed=seed, starts=16) for seed in (3, 3, 4)]
+    assert found[0] == found[1]
+    assert found[0]["zero"] != found[2]["zero"]
 
 
 def test_problems_that_ask_for_nothing_but_a_low_cost_have_no_numbers_and_no_scene():
