@@ -7,7 +7,18 @@ import pytest
 import torch
 
 from ocp_torch.fields import PeriodicMLP
-from ocp_torch.problems import Circle, Manufactured, Problem, Torus
+from ocp_torch.problems import (
+    Arm,
+    Circle,
+    Dubins,
+    Kuramoto,
+    Manufactured,
+    Pendulum,
+    PhaseNeurons,
+    Problem,
+    Torus,
+    Unicycle,
+)
 from ocp_torch.problems.torus import SHEARS
 
 TURN = 2.0 * math.pi
@@ -67,6 +78,25 @@ _CASES = {**_KINKED, **_SMOOTH, **_LIMITED, "swing": Swing}
 # Names by what is known: V* with kinks and no drift; V* smooth, with drift; both of them; and every problem there is.
 KINKED, SMOOTH, EXACT = tuple(_KINKED), tuple(_SMOOTH), (*_KINKED, *_SMOOTH)
 ALL, LIMITED = (*EXACT, "swing"), tuple(_LIMITED)
+# Systems people have, without exact truth.
+_NATURAL = {
+    "arm n=2": Arm,
+    "arm n=3 q=1.5": partial(Arm, dim=3, lengths=[0.5, 0.3, 0.1], target=[-0.3, 0.4], exponent=1.5),
+    "arm without obstacles": partial(Arm, dim=4, obstacles=[]),
+    "unicycle": Unicycle,
+    "dubins": Dubins,
+    "pendulum": Pendulum,
+    "pendulum of Gymnasium": partial(Pendulum, torque_cost=0.001),
+    "kuramoto n=3": Kuramoto,
+    "kuramoto n=3 absolute": partial(Kuramoto, relative=False),
+    "kuramoto n=6 random": partial(Kuramoto, oscillators=6, graph="random", controlled=[0, 2, 5], seed=3),
+    "kuramoto entrain": partial(Kuramoto, goal="entrain", graph="ring"),
+    "kuramoto desynchronise": partial(Kuramoto, goal="desynchronise", coupling=2.0),
+    "phase neurons n=2": PhaseNeurons,
+    "phase neurons n=3 type 1": partial(PhaseNeurons, neurons=3, response="type1"),
+}
+
+NATURAL = tuple(_NATURAL)
 # A few that together show every feature, for tests that cost more.
 FEW_SMOOTH = ("manufactured 1-d q=2", "manufactured 2-d mu0", "manufactured 3-d m=2 B(x) q=1.5")
 FEW = ("circle rho=2", "torus 2-d chain", "torus 3-d random", *FEW_SMOOTH)
@@ -74,12 +104,12 @@ FEW = ("circle rho=2", "torus 2-d chain", "torus 3-d random", *FEW_SMOOTH)
 
 @cache
 def build(name: str) -> Problem:
-    return _CASES[name]()
+    return fresh(name)
 
 
 def fresh(name: str) -> Problem:
     """A problem no other test has touched."""
-    return _CASES[name]()
+    return {**_CASES, **_NATURAL}[name]()
 
 
 def on(names):

@@ -10,6 +10,7 @@ from ocp_torch.problems.manufactured import Manufactured
 from ocp_torch.problems.pendulum import Pendulum
 from ocp_torch.problems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.robot import RobotArm
 from ocp_torch.problems.torus import Torus
 from ocp_torch.problems.unicycle import Unicycle
 
@@ -25,6 +26,7 @@ PROBLEMS = {
     "unicycle": Unicycle,
     "dubins": Dubins,
     "pendulum": Pendulum,
+    "robot": RobotArm,
 }
 
 __all__ = ["Callable", "Problem", "PROBLEMS", *sorted(cls.__name__ for cls in PROBLEMS.values())]

@@ -15,11 +15,12 @@ def require_numbers(name: str, value: object, count: int | None = None, above: f
     return [require_number(f"{name}[{i}]", v, above=above) for i, v in enumerate(value)]
 
 
-def require_obstacles(name: str, value: object) -> list[list[float]]:
-    """``value`` as a list of round obstacles `[x, y, radius]` with positive radius; else `InputError`."""
+def require_obstacles(name: str, value: object, space: int = 2) -> list[list[float]]:
+    """``value`` as a list of round obstacles `[x, y, radius]`, or in ``space`` 3 `[x, y, z, radius]`, with positive radius;
+    else `InputError`."""
     if isinstance(value, str) or not isinstance(value, Sequence):
-        raise InputError(f"{name} is {value!r}, but must be a list of [x, y, radius].")
-    rows = [require_numbers(f"{name}[{i}]", row, 3) for i, row in enumerate(value)]
+        raise InputError(f"{name} is {value!r}, but must be a list of [{', '.join('xyz'[:space])}, radius].")
+    rows = [require_numbers(f"{name}[{i}]", row, space + 1) for i, row in enumerate(value)]
     for i, row in enumerate(rows):
-        require_number(f"{name}[{i}][2]", row[2], above=0.0)
+        require_number(f"{name}[{i}][{space}]", row[space], above=0.0)
     return rows
