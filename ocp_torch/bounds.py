@@ -13,6 +13,8 @@ from ocp_torch.problems.problem import MARGIN, Problem
 
 # Without any knowledge of mu*, M starts at this multiple of sup mu0 and the certificate judges it afterwards.
 OCCUPATION_GUESS = 4.0
+# And where mu* is known to have no bound: what won on flows that contract onto a goal.
+OCCUPATION_WEIGHT = 20.0
 # States a problem is searched at for what it does not say.
 SEARCHED = 2**13
 
@@ -21,13 +23,18 @@ FROM_CONFIGURATION, FROM_PROBLEM, ESTIMATED = "configuration", "problem", "estim
 
 @dataclass(frozen=True)
 class Bounds:
-    """`M >= sup mu*`, `C_V >= sup V*`, `C_u >= sup |u*|` and, per name, its source."""
+    """`M >= sup mu*`, `C_V >= sup V*`, `C_u >= sup |u*|` and, per name, its source.
+
+    Where ``unbounded``, no `M` is thought to be large enough: it is but a weight of training, which then aims at the bound
+    that needs none.
+    """
 
     M: float
     C_V: float
     C_u: float
     sources: dict[str, str]
     warnings: tuple[str, ...] = ()
+    unbounded: bool = False
 
     def __post_init__(self) -> None:
         for name in ("M", "C_V", "C_u"):
@@ -75,7 +82,12 @@ def resolve_bounds(
             notes.append(
                 f"method.occupation_bound = {chosen['M']:.4g} is below this problem's sup mu*, which is {true}."
             )
-    return Bounds(**chosen, sources=sources, warnings=tuple(notes))
+    return Bounds(**chosen, sources=sources, warnings=tuple(notes), unbounded=_unbounded(problem))
+
+
+def _unbounded(problem: Problem) -> bool:
+    """Whether `mu*` is known to have no bound."""
+    return problem.occupation_bound is not None and math.isinf(problem.occupation_bound)
 
 
 def state_cost_supremum(problem: Problem) -> float:
@@ -103,8 +115,8 @@ def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
 
 def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
     (mu0,) = problem.survey(SEARCHED, 1, "mu0")
-    largest = float(mu0.max())
-    return OCCUPATION_GUESS * largest, f"a guess to train with, {OCCUPATION_GUESS:g} times sup mu0"
+    guess = OCCUPATION_WEIGHT if _unbounded(problem) else OCCUPATION_GUESS
+    return guess * float(mu0.max()), f"a guess to train with, {guess:g} times sup mu0"
 
 
 _ESTIMATES = {"M": _estimate_occupation_bound, "C_V": _estimate_value_bound, "C_u": _estimate_control_bound}

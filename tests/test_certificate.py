@@ -8,9 +8,10 @@ import torch
 
 import zoo
 from ocp_torch.bounds import ESTIMATED, resolve_bounds
-from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields, raised
+from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lagrangian import closed_loop_bounds
+from ocp_torch.certificate.raising import raised
 from ocp_torch.config import build_trainer
 from ocp_torch.control_laws import ValueLaw
 from ocp_torch.fields import Fields, PeriodicMLP

@@ -1,7 +1,10 @@
-r"""The dual with an exact penalty, D(M) (section 4.1 of the paper)."""
+r"""The dual with an exact penalty, D(M) (section 4.1 of the paper), and the bound without `M` where no `M` will do."""
 
 from __future__ import annotations
 
+import math
+
+import torch
 from torch import Tensor
 
 from ocp_torch import calculus, formulas
@@ -12,6 +15,9 @@ from ocp_torch.objectives.objective import Objective
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
 
+# Width of the soft maximum of the slack at the start and at the end of a run, in units of the `V` network.
+WIDEST, NARROWEST = 0.5, 0.005
+
 
 class Dual(Objective):
     r"""Maximise `F_M(V) = E[V mu0 - M max(Q, 0)]`: at most `OPT` for every `V` once `M >= sup mu*` (Proposition 3).
@@ -19,6 +25,10 @@ class Dual(Objective):
     With ``residual`` `k > 0` also `-(k/s) E[Q^2]`, `s` the scale of the `V` network. `V*` is optimal for that too, since
     `Q = 0` almost everywhere there; unlike the hinge it has a gradient on both sides of the solution. The paper's dual is
     ``residual = 0``.
+
+    Where `mu*` is unbounded (`Bounds.unbounded`) no `F_M` is a bound, and what is certified is `E[V mu0] - sup Q`. Then
+    `- tau log E exp(Q / tau)` joins in, concave in `V` and at least `- sup Q`, with `tau` falling along the run: a soft
+    maximum, because the hard one has a gradient at one state only.
     """
 
     players = {"value": (VALUE,)}
@@ -30,12 +40,34 @@ class Dual(Objective):
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         value, gradient = calculus.value_and_gradient(fields.value, samples.x)
         slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
-        return {"value": -samples.mean(dual_integrand(fields, samples, value, slack, self.bounds.M, self.residual))}
+        return {"value": value_loss(self, fields, samples, value, slack, self.residual)}
+
+
+def value_loss(
+    objective: Objective, fields: Fields, samples: Samples, value: Tensor, slack: Tensor, residual: float
+) -> Tensor:
+    """What a value player on its own minimises: minus the mean of `dual_integrand`, plus the soft maximum of the slack
+    where `mu*` is unbounded."""
+    loss = -samples.mean(dual_integrand(fields, samples, value, slack, objective.bounds.M, residual))
+    if not objective.bounds.unbounded:
+        return loss
+    tau = scale_of(fields) * WIDEST * (NARROWEST / WIDEST) ** objective.progress
+    return loss + soft_maximum(slack, samples.weight, tau)
 
 
 def dual_integrand(fields: Fields, samples: Samples, value: Tensor, slack: Tensor, M: float, residual: float) -> Tensor:
-    """`V mu0 - M max(Q, 0) - (residual / s) Q^2`, ``(N,)``: what a value player on its own maximises."""
+    """`V mu0 - M max(Q, 0) - (residual / s) Q^2`, ``(N,)``."""
     penalised = value * samples.mu0 - M * slack.clamp_min(0.0)
     if residual == 0.0:
         return penalised
-    return penalised - residual / getattr(fields.value, "scale", 1.0) * slack.square()
+    return penalised - residual / scale_of(fields) * slack.square()
+
+
+def scale_of(fields: Fields) -> float | Tensor:
+    """The units of the `V` network."""
+    return getattr(fields.value, "scale", 1.0)
+
+
+def soft_maximum(slack: Tensor, weight: Tensor, tau: float | Tensor) -> Tensor:
+    """`tau log E exp(slack / tau)` with the mean weighted by ``weight`` ``(N,)``: between the mean and the maximum."""
+    return tau * (torch.logsumexp(slack / tau + weight.log(), dim=0) - math.log(len(slack)))

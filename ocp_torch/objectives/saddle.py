@@ -11,7 +11,7 @@ from ocp_torch import calculus, control_laws, formulas
 from ocp_torch.bounds import Bounds
 from ocp_torch.errors import require_number
 from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fields
-from ocp_torch.objectives.dual import dual_integrand
+from ocp_torch.objectives.dual import value_loss
 from ocp_torch.objectives.objective import Objective
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
@@ -41,8 +41,8 @@ class Saddle(Objective):
         if self.augmentation == 0.0:
             return {"value": -psi, "density": psi}
         slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
-        own = samples.mean(dual_integrand(fields, samples, value, slack, self.bounds.M, residual=0.0))
-        return {"value": -psi - self.augmentation * own, "density": psi}
+        own = value_loss(self, fields, samples, value, slack, residual=0.0)
+        return {"value": -psi + self.augmentation * own, "density": psi}
 
 
 class AugmentedSaddle(Objective):
@@ -84,12 +84,12 @@ class AugmentedSaddle(Objective):
         return self.progress >= self.resting["density"]
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        k, M, C_V = self.augmentation, self.bounds.M, self.bounds.C_V
+        k, C_V = self.augmentation, self.bounds.C_V
         value, gradient = calculus.value_and_gradient(fields.value, samples.x)
         slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
-        of_value = k * dual_integrand(fields, samples, value, slack, M, self.residual)
+        of_value = k * value_loss(self, fields, samples, value, slack, self.residual)
         if not self.needs_divergences:
-            return {"value": -samples.mean(of_value)}
+            return {"value": of_value}
         w, inflow = formulas.controlled_inflow(samples, self.admissible(fields), self.rho)
         mu, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
         running = samples.f * mu + self.cost.perspective(w, mu)
@@ -98,8 +98,8 @@ class AugmentedSaddle(Objective):
         local = running + formulas.multiplier_term(samples, value.detach(), gradient.detach(), mu, w, self.rho)
         if self.coupling > 0.0:
             seen = formulas.multiplier_term(samples, value, gradient, mu.detach(), w.detach(), self.rho)
-            of_value = of_value + self.coupling * (value * samples.mu0 + seen)
-        return {"value": -samples.mean(of_value), "density": samples.mean(local.clamp_min(0.0) + k * hinged)}
+            of_value = of_value - self.coupling * samples.mean(value * samples.mu0 + seen)
+        return {"value": of_value, "density": samples.mean(local.clamp_min(0.0) + k * hinged)}
 
 
 def saddle(

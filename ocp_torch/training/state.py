@@ -27,7 +27,11 @@ def gather(trainer: Trainer) -> dict:
         "config": trainer.config,
         "step": trainer.step,
         "round": trainer.round,
-        "bounds": {"M": trainer.bounds.M, "warnings": list(trainer.bounds.warnings)},
+        "bounds": {
+            "M": trainer.bounds.M,
+            "warnings": list(trainer.bounds.warnings),
+            "unbounded": trainer.bounds.unbounded,
+        },
         "samples": trainer.samples,
         "seconds": trainer.seconds,
         "elapsed": trainer.elapsed,
@@ -62,7 +66,8 @@ def restore(trainer: Trainer, state: dict) -> None:
         setattr(trainer, name, require_number(f"{name} of the checkpoint", state[name], at_least=0.0))
     trainer.pending, trainer.retry = bool(state["pending"]), int(state["retry"])
     bounds = state["bounds"]
-    trainer.use(replace(trainer.bounds, M=bounds["M"], warnings=tuple(map(str, bounds["warnings"]))))
+    warnings, unbounded = tuple(map(str, bounds["warnings"])), bool(bounds["unbounded"])
+    trainer.use(replace(trainer.bounds, M=bounds["M"], warnings=warnings, unbounded=unbounded))
     trainer.fields.load_state_dict(state["fields"])
     trainer.average.load_state_dict(state["average"])
     for name, tensor in (*trainer.fields.state_dict().items(), *trainer.average.state_dict().items()):

@@ -12,7 +12,15 @@ import torch
 from torch import nn
 
 from ocp_torch.bounds import ESTIMATED, Bounds
-from ocp_torch.certificate import Certificate, CertificateSettings, Run, StageSettings, Trained, certify_fields, raised
+from ocp_torch.certificate import (
+    Certificate,
+    CertificateSettings,
+    Run,
+    StageSettings,
+    Trained,
+    certify_fields,
+    retrained,
+)
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.fields.fields import typical_sizes
@@ -189,14 +197,14 @@ class Trainer:
     def _wants_another_round(self) -> bool:
         """Whether rounds are left and the gap is not good yet; never without a lower bound to measure it by.
 
-        An `M` that was a guess and turned out too small is raised for the next round.
+        An `M` that was a guess and turned out too small is raised for the next round, or given up.
         """
         if self.round + 1 >= self.settings.rounds or self.fields.value is None or not self.problem.evaluable:
             return False  # without a simulation there is no gap to go by
-        guessed = self.bounds.sources["M"] == ESTIMATED
+        guessed = self.bounds.sources["M"] == ESTIMATED and not self.bounds.unbounded
         certificate = self.look(occupation_states=CertificateSettings.occupation_states if guessed else 0)
-        better = raised(self.bounds, certificate.assumptions.estimated_sup_occupation)
-        if better.M > self.bounds.M:
+        better = retrained(self.bounds, certificate.assumptions.estimated_sup_occupation)
+        if better != self.bounds:
             self.use(better)
             return True
         gap = certificate.plain_gap
