@@ -172,10 +172,15 @@ def test_taylor_models_hold_the_conjugate_below_across_and_beyond_the_limit(q, d
         box = Box(centre, torch.full_like(centre, half), 4)
         model = cost.conjugate_model(box.coordinates())
         low, high = model.bounds()
-        for _ in range(20):
-            t = 2.0 * torch.rand(300, dim, generator=generator, dtype=torch.float64) - 1.0
+        inner = 2.0 * torch.rand(20, 300, dim, generator=generator, dtype=torch.float64) - 1.0
+        # The corner farthest from 0 is where R* exceeds its limited version most.
+        for t in (*inner, torch.ones(300, dim, dtype=torch.float64)):
             truth = cost.conjugate(centre + half * t)
             assert ((low <= truth) & (truth <= high)).all()
+            # And state by state: the polynomial there is within its radius of the truth.
+            powers = torch.stack([(t ** t.new_tensor(alpha)).prod(dim=-1) for alpha in box.basis.exponents])
+            off = ((powers * model.coefficients).sum(dim=0) - truth).abs()
+            assert (off <= model.radius + 1e-12 * (1.0 + truth)).all()
         across = ((centre.norm(dim=-1) - 0.5 ** (q - 1.0)).abs() < half).nonzero()
         assert len(across) or half < 0.01
         if half == 1e-3:

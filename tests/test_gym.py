@@ -224,3 +224,10 @@ def test_gifs_hold_their_frames(tmp_path):
     save_gif(tmp_path / "a.gif", frames, 10)
     with Image.open(tmp_path / "a.gif") as film:
         assert (film.n_frames, film.size) == (5, (30, 20))
+
+
+def test_actions_apply_the_controls_they_are_made_of(gymnasium):
+    env = make_environment(Manufactured(control_size=0.4))
+    u = np.array([0.1, -0.2])
+    assert env.to_action(u) * env.control_bound == pytest.approx(u)
+    assert env.to_action(9.0 * u).tolist() == [1.0, -1.0]
