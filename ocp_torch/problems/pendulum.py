@@ -38,7 +38,7 @@ class Pendulum(Problem):
         seam: float = 10.0,
         max_torque: float = 2.0,
         torque_cost: float = 0.1,
-        discount: float = 1.0,
+        discount: float = 2.0,
         exponent: float = 2.0,
     ) -> None:
         super().__init__(dim=2, control_dim=1, discount=discount, exponent=exponent)

@@ -36,10 +36,10 @@ class PhaseNeurons(Problem):
         frequencies: list[float] | None = None,
         frequency: float = 2.0,
         spread: float = 0.2,
-        coupling: float = 1.0,
-        strength: float = 2.0,
+        coupling: float = 0.5,
+        strength: float = 1.0,
         weight: float = 1.0,
-        discount: float = 0.5,
+        discount: float = 0.7,
         exponent: float = 2.0,
     ) -> None:
         n = require_integer("problem.neurons", neurons, 2, maximum=512)
