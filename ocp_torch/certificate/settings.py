@@ -15,7 +15,7 @@ TRUNCATED, RANDOM = "truncated", "random"
 class CertificateSettings:
     """Effort and level of a certificate. Raises `InputError` on counts that cannot give a standard error."""
 
-    points: int = 32768  # states per replicate for the integrals and sampled suprema
+    points: int = 16384  # states per replicate for the integrals and sampled suprema
     replicates: int = 8  # independent randomised point sets behind each standard error
     trajectories: int = 256  # simulated starts per replicate; 0 skips every simulation
     ascents: int = 32  # local ascents from the worst sampled states
