@@ -14,7 +14,7 @@ from ocp_torch.problems.problem import MARGIN, Problem
 # Without any knowledge of mu*, M starts at this multiple of sup mu0 and the certificate judges it afterwards.
 OCCUPATION_GUESS = 4.0
 # And where mu* is known to have no bound: what won on flows that contract onto a goal.
-OCCUPATION_WEIGHT = 20.0
+OCCUPATION_WEIGHT = 40.0
 # States a problem is searched at for what it does not say.
 SEARCHED = 2**13
 
@@ -82,10 +82,10 @@ def resolve_bounds(
             notes.append(
                 f"method.occupation_bound = {chosen['M']:.4g} is below this problem's sup mu*, which is {true}."
             )
-    return Bounds(**chosen, sources=sources, warnings=tuple(notes), unbounded=_unbounded(problem))
+    return Bounds(**chosen, sources=sources, warnings=tuple(notes), unbounded=is_unbounded(problem))
 
 
-def _unbounded(problem: Problem) -> bool:
+def is_unbounded(problem: Problem) -> bool:
     """Whether `mu*` is known to have no bound."""
     return problem.occupation_bound is not None and math.isinf(problem.occupation_bound)
 
@@ -115,7 +115,7 @@ def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
 
 def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
     (mu0,) = problem.survey(SEARCHED, 1, "mu0")
-    guess = OCCUPATION_WEIGHT if _unbounded(problem) else OCCUPATION_GUESS
+    guess = OCCUPATION_WEIGHT if is_unbounded(problem) else OCCUPATION_GUESS
     return guess * float(mu0.max()), f"a guess to train with, {guess:g} times sup mu0"
 
 

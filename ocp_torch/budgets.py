@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 
+from ocp_torch.bounds import is_unbounded
 from ocp_torch.errors import require_section
 from ocp_torch.problems import Problem
 
@@ -39,6 +40,9 @@ BUDGETS = (
     Budget(inf, modes=1, waves=128, width=128, **GATED, steps=1200, batch=512, good_gap=0.02, stage_steps=800),
 )
 
+# Where mu* is unbounded the slack must be small everywhere, not on average: that wants more states at once.
+LARGE_BATCH, MANY_WAVES = 1024, 64
+
 
 def fill(config: dict, problem: Problem) -> dict:
     """``config`` with the fields that are null, and have a default by dimension, filled in."""
@@ -46,6 +50,8 @@ def fill(config: dict, problem: Problem) -> dict:
     for name in ("model", "trainer", "optimizer", "certificate"):
         require_section(name, config.get(name))
     filled = copy.deepcopy(config)
+    if is_unbounded(problem):
+        budget = replace(budget, batch=max(budget.batch, LARGE_BATCH), waves=max(budget.waves, MANY_WAVES))
     defaults = {
         ("model", "modes"): budget.modes,
         ("model", "waves"): budget.waves,

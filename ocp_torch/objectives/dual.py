@@ -2,9 +2,6 @@ r"""The dual with an exact penalty, D(M) (section 4.1 of the paper), and the bou
 
 from __future__ import annotations
 
-import math
-
-import torch
 from torch import Tensor
 
 from ocp_torch import calculus, formulas
@@ -15,8 +12,8 @@ from ocp_torch.objectives.objective import Objective
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
 
-# Width of the soft maximum of the slack at the start and at the end of a run, in units of the `V` network.
-WIDEST, NARROWEST = 0.5, 0.005
+# Where `mu*` is unbounded: the part of `M` that a round starts with, and the part of the round in which it grows.
+LEAST_WEIGHT, GROWTH = 1.0 / 20.0, 0.7
 
 
 class Dual(Objective):
@@ -26,9 +23,9 @@ class Dual(Objective):
     `Q = 0` almost everywhere there; unlike the hinge it has a gradient on both sides of the solution. The paper's dual is
     ``residual = 0``.
 
-    Where `mu*` is unbounded (`Bounds.unbounded`) no `F_M` is a bound, and what is certified is `E[V mu0] - sup Q`. Then
-    `- tau log E exp(Q / tau)` joins in, concave in `V` and at least `- sup Q`, with `tau` falling along the run: a soft
-    maximum, because the hard one has a gradient at one state only.
+    Where `mu*` is unbounded (`Bounds.unbounded`) no `F_M` is a bound, and what is certified is `E[V mu0] - sup Q`. A large
+    `M` keeps the supremum small; but from the start it ends in subsolutions far below `V*`, which have no gradient. So `M`
+    grows along a round: first `V` is too high, and then comes down until it is feasible.
     """
 
     players = {"value": (VALUE,)}
@@ -46,13 +43,11 @@ class Dual(Objective):
 def value_loss(
     objective: Objective, fields: Fields, samples: Samples, value: Tensor, slack: Tensor, residual: float
 ) -> Tensor:
-    """What a value player on its own minimises: minus the mean of `dual_integrand`, plus the soft maximum of the slack
-    where `mu*` is unbounded."""
-    loss = -samples.mean(dual_integrand(fields, samples, value, slack, objective.bounds.M, residual))
-    if not objective.bounds.unbounded:
-        return loss
-    tau = scale_of(fields) * WIDEST * (NARROWEST / WIDEST) ** objective.progress
-    return loss + soft_maximum(slack, samples.weight, tau)
+    """What a value player on its own minimises: minus the mean of `dual_integrand`."""
+    M = objective.bounds.M
+    if objective.bounds.unbounded:
+        M = M * LEAST_WEIGHT ** max(0.0, 1.0 - objective.progress / GROWTH)
+    return -samples.mean(dual_integrand(fields, samples, value, slack, M, residual))
 
 
 def dual_integrand(fields: Fields, samples: Samples, value: Tensor, slack: Tensor, M: float, residual: float) -> Tensor:
@@ -60,14 +55,4 @@ def dual_integrand(fields: Fields, samples: Samples, value: Tensor, slack: Tenso
     penalised = value * samples.mu0 - M * slack.clamp_min(0.0)
     if residual == 0.0:
         return penalised
-    return penalised - residual / scale_of(fields) * slack.square()
-
-
-def scale_of(fields: Fields) -> float | Tensor:
-    """The units of the `V` network."""
-    return getattr(fields.value, "scale", 1.0)
-
-
-def soft_maximum(slack: Tensor, weight: Tensor, tau: float | Tensor) -> Tensor:
-    """`tau log E exp(slack / tau)` with the mean weighted by ``weight`` ``(N,)``: between the mean and the maximum."""
-    return tau * (torch.logsumexp(slack / tau + weight.log(), dim=0) - math.log(len(slack)))
+    return penalised - residual / getattr(fields.value, "scale", 1.0) * slack.square()

@@ -1,0 +1,69 @@
+"""Where `mu*` is unbounded: what training aims at, and when it notices."""
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import pytest
+
+import zoo
+from ocp_torch import calculus, formulas
+from ocp_torch.bounds import OCCUPATION_WEIGHT, resolve_bounds
+from ocp_torch.budgets import fill
+from ocp_torch.certificate import retrained
+from ocp_torch.fields import VALUE, Fields, PeriodicMLP
+from ocp_torch.objectives import Dual
+from ocp_torch.problems import Arm, Circle, Torus
+from ocp_torch.samples import Samples
+
+
+def test_which_problems_are_known_to_be_unbounded():
+    """The torus contracts faster than it forgets from a small discount on."""
+    assert resolve_bounds(Arm()).unbounded
+    assert resolve_bounds(Arm()).M == OCCUPATION_WEIGHT
+    assert resolve_bounds(Torus(2, discount=0.5)).unbounded
+    assert not resolve_bounds(Torus(2)).unbounded
+    assert not resolve_bounds(Circle()).unbounded
+
+
+def test_a_further_round_gives_up_a_guess_that_cannot_be_met():
+    guess = resolve_bounds(zoo.Swing())
+    assert retrained(guess, None) == guess
+    assert retrained(guess, 0.5) == guess
+    assert retrained(guess, 6.0).M == pytest.approx(7.5)
+    for hopeless in (float("inf"), 1e3):
+        given_up = retrained(guess, hopeless)
+        assert given_up.unbounded
+        assert "without M" in given_up.warnings[-1]
+        assert retrained(given_up, hopeless) == given_up
+    known = resolve_bounds(Circle())
+    assert retrained(known, 1e3) == known
+
+
+def test_the_weight_of_the_slack_grows_along_a_round():
+    """`loss = -E[V mu0] + M E[max(Q, 0)]`, so two values of the loss give the weight."""
+    problem = zoo.build("arm n=2")
+    bounds = resolve_bounds(problem)
+    fields = Fields.build(problem, (VALUE,), partial(PeriodicMLP, width=16), 0).double()
+    samples = Samples.of(problem, zoo.states(problem, 500), divergences=False)
+    value, gradient = calculus.value_and_gradient(fields.value, samples.x)
+    slack = formulas.hjb_slack(samples, value, gradient, problem.control_cost, problem.discount)
+    violation, started = float(slack.clamp_min(0.0).mean()), float((value * samples.mu0).mean())
+    weights = {}
+    for unbounded in (True, False):
+        objective = Dual(problem, replace(bounds, unbounded=unbounded), residual=0.0)
+        for progress in (0.0, 0.35, 0.7, 1.0):
+            objective.progress = progress
+            loss = float(objective.losses(fields, samples)["value"])
+            weights[unbounded, progress] = (loss + started) / violation
+    M = bounds.M
+    for progress, expected in ((0.0, M / 20.0), (0.35, M / math.sqrt(20.0)), (0.7, M), (1.0, M)):
+        assert weights[True, progress] == pytest.approx(expected, rel=1e-6)
+        assert weights[False, progress] == pytest.approx(M, rel=1e-6)
+
+
+def test_default_sizes_follow():
+    defaults = lambda problem: fill({"model": {}, "trainer": {}, "optimizer": {}, "certificate": {}}, problem)
+    bounded, unbounded = defaults(Torus(2)), defaults(Arm())
+    assert unbounded["trainer"]["batch"] > bounded["trainer"]["batch"]
+    assert unbounded["model"]["waves"] > bounded["model"]["waves"]
