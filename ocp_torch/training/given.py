@@ -92,7 +92,8 @@ def train_value(
     makers = {player: optimizer_maker("soap", lr, betas=(0.95, 0.95)) for player in objective.players}
     stepper = Simultaneous(fields, objective, makers, schedule_maker("cosine", steps))
     average = averaged(fields, decay=0.98)
-    for _ in range(steps):
+    for step in range(steps):
+        objective.progress = step / steps
         stepper.step(draw, lambda: average.update_parameters(fields))
     return average.module
 
