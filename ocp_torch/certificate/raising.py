@@ -15,6 +15,8 @@ def raised(bounds: Bounds, sup_occupation: float | None) -> Bounds:
     """``bounds`` with an `M` that nobody gave raised above the occupation density met under the learned controller."""
     if bounds.sources["M"] != ESTIMATED or sup_occupation is None or not math.isfinite(sup_occupation):
         return bounds
+    if bounds.unbounded:
+        return bounds  # whatever was met, more is to be had
     M = OCCUPATION_ROOM * sup_occupation
     if M <= bounds.M:
         return bounds
