@@ -12,7 +12,8 @@ from ocp_torch.certificate.simulation import discounted_integral
 from ocp_torch.controller import problem_name
 from ocp_torch.errors import InputError
 from ocp_torch.extremum import supremum
-from ocp_torch.problems import PROBLEMS, Arm, Dubins, Kuramoto, Pendulum, PhaseNeurons, Unicycle
+from ocp_torch.practice import metrics
+from ocp_torch.problems import PROBLEMS, Arm, Dubins, Kuramoto, Pendulum, PhaseNeurons, RobotArm, Unicycle
 from ocp_torch.problems.local import discounted_riccati, occupation_bound_at_rest
 from ocp_torch.reference.reference import solve_reference
 from ocp_torch.samples import Samples
@@ -431,3 +432,76 @@ def test_wrong_arguments_are_refused_in_one_sentence(cls, arguments, message):
         cls(**arguments)
     assert str(caught.value).endswith(".")
     assert "\n" not in str(caught.value)
+
+
+# Control limits.
+SOME_LIMITED = [
+    Arm(control_limit=0.2),
+    Unicycle(control_limit=0.2),
+    Dubins(control_limit=0.2),
+    Kuramoto(control_limit=0.2),
+    PhaseNeurons(control_limit=0.2),
+    Pendulum(control_limit=0.2),
+    RobotArm(control_limit=0.2),
+]
+
+
+@pytest.mark.parametrize("problem", SOME_LIMITED, ids=lambda problem: type(problem).__name__)
+def test_every_system_takes_a_control_limit_and_pays_infinitely_beyond_it(problem):
+    u = torch.zeros(2, problem.control_dim, dtype=torch.float64)
+    u[0, 0], u[1, -1] = 0.199, 0.201
+    cost = problem.control_cost.cost(u)
+    assert cost.tolist() == [pytest.approx(0.199**2 / 2.0), math.inf]
+    assert problem.parameters["control_limit"] == 0.2
+    assert PROBLEMS[problem_name(problem)](**problem.parameters).control_limit == 0.2
+    free = type(problem)()
+    assert free.control_limit is None
+    assert problem.occupation_bound == free.occupation_bound
+    with pytest.raises(InputError, match="problem.control_limit"):
+        type(problem)(control_limit=0.0)
+
+
+def test_a_limit_makes_the_optimum_dearer_but_changes_nothing_near_the_state_of_rest():
+    """Why the criterion for an unbounded `mu*` needs no limit: `V*` upright is that of the discounted Riccati equation."""
+    free, limited = Pendulum(), Pendulum(control_limit=0.3)
+    one, other = solve_reference(free, side=64), solve_reference(limited, side=64)
+    assert other.optimum - other.error > one.optimum + one.error
+    near = limited.to_torus(torch.tensor([[0.0, 0.0], [0.02, -0.02]], dtype=torch.float64))
+    torch.testing.assert_close(other.interpolate(near)[0], one.interpolate(near)[0], rtol=0.0, atol=1e-3 * one.optimum)
+
+
+def test_the_practitioners_numbers_hold_every_law_to_the_limit():
+    pendulum = Pendulum(control_limit=0.3)
+    reckless = lambda x: torch.full_like(x[:, :1], 50.0)
+    at_limit = lambda x: torch.full_like(x[:, :1], 0.3)
+    one, other = (metrics(pendulum, law, seed=1, starts=8)["controller"] for law in (reckless, at_limit))
+    assert one == other
+    assert math.isfinite(one["cost"])
+
+
+# Gymnasium's pendulum, by hand: the environment itself is in test_gym.py.
+def test_an_observation_of_gymnasiums_pendulum_is_the_state_it_was_made_of():
+    pendulum = Pendulum()
+    drawn = 2.0 * torch.rand(200, 2, generator=generator(11), dtype=torch.float64) - 1.0
+    physical = drawn * torch.tensor([3.0 * math.pi, pendulum.max_speed])
+    observed = torch.stack([physical[:, 0].cos(), physical[:, 0].sin(), physical[:, 1]], dim=-1)
+    states = np.stack([pendulum.from_observation("Pendulum-v1", row) for row in observed.numpy()])
+    off = torch.from_numpy(states) - pendulum.to_torus(physical)
+    torch.testing.assert_close(off - off.round(), torch.zeros_like(off), **ROUNDING)
+    back = pendulum.from_torus(torch.from_numpy(states))
+    same_turns(back[:, 0], physical[:, 0])
+    torch.testing.assert_close(back[:, 1], physical[:, 1], **ROUNDING)
+
+
+def test_the_torque_is_that_of_the_model_and_never_beyond_what_gymnasium_allows():
+    pendulum = Pendulum(max_torque=1.5)
+    assert pendulum.to_action("Pendulum-v1", np.array([-0.4])).tolist() == [pytest.approx(-0.6)]
+    assert pendulum.to_action("Pendulum-v1", np.array([7.0])).tolist() == [1.5]
+    # A speed a stranger's variant may show beyond the seam is taken at the seam.
+    assert pendulum.from_observation("Pendulum-v1", np.array([1.0, 0.0, 99.0])) == pytest.approx([0.0, 0.5])
+
+
+def test_the_pendulum_knows_no_other_environment():
+    for call in (lambda p: p.from_observation("Acrobot-v1", np.zeros(6)), lambda p: p.to_action("Acrobot-v1", [0.0])):
+        with pytest.raises(InputError, match="Pendulum does not know the environment Acrobot-v1"):
+            call(Pendulum())
