@@ -462,12 +462,24 @@ def test_every_system_takes_a_control_limit_and_pays_infinitely_beyond_it(proble
 
 
 def test_a_limit_makes_the_optimum_dearer_but_changes_nothing_near_the_state_of_rest():
-    """Why the criterion for an unbounded `mu*` needs no limit: `V*` upright is that of the discounted Riccati equation."""
-    free, limited = Pendulum(), Pendulum(control_limit=0.3)
-    one, other = solve_reference(free, side=64), solve_reference(limited, side=64)
+    """Why the criterion for an unbounded `mu*` needs no limit: there `V*` is that of the discounted Riccati equation."""
+    two = dict(oscillators=2, spread=0.0, coupling=0.2)
+    free, limited = Kuramoto(**two), Kuramoto(**two, control_limit=0.2)
+    one, other = solve_reference(free, side=512), solve_reference(limited, side=512)
     assert other.optimum - other.error > one.optimum + one.error
-    near = limited.to_torus(torch.tensor([[0.0, 0.0], [0.02, -0.02]], dtype=torch.float64))
-    torch.testing.assert_close(other.interpolate(near)[0], one.interpolate(near)[0], rtol=0.0, atol=1e-3 * one.optimum)
+    at = torch.zeros(1, 1, dtype=torch.float64)
+    A = torch.func.jacrev(lambda x: free.drift(x[None])[0])(at[0])
+    Q = torch.func.hessian(lambda x: free.state_cost(x[None])[0])(at[0])
+    P = discounted_riccati(A, free.control_matrix(at)[0], Q, free.discount)
+    near = torch.tensor([[-0.02], [0.01], [0.02]], dtype=torch.float64)
+    expected = 0.5 * free.discount * float(P) * near[:, 0].square()
+    for found in (one, other):
+        value, control = found.interpolate(near)
+        torch.testing.assert_close(value, expected, rtol=0.03, atol=0.0)
+        assert float(control.norm(dim=-1).max()) < 0.19
+    # Far away the limit is felt.
+    far = torch.tensor([[0.4]], dtype=torch.float64)
+    assert float(other.interpolate(far)[0]) > 1.05 * float(one.interpolate(far)[0])
 
 
 def test_the_practitioners_numbers_hold_every_law_to_the_limit():
