@@ -231,3 +231,61 @@ def test_actions_apply_the_controls_they_are_made_of(gymnasium):
     u = np.array([0.1, -0.2])
     assert env.to_action(u) * env.control_bound == pytest.approx(u)
     assert env.to_action(9.0 * u).tolist() == [1.0, -1.0]
+
+
+@pytest.fixture
+def theirs(gymnasium):
+    """Gymnasium's own pendulum, without the frame that cuts its episodes."""
+    env = gymnasium.make("Pendulum-v1").unwrapped
+    yield env
+    env.close()
+
+
+def test_the_pendulum_is_gymnasiums_over_a_short_time(theirs):
+    """One of their steps against the model's velocity: their Euler step is off by `O(dt^2)`, so a tenth of it by a hundredth."""
+    pendulum = PROBLEMS["pendulum"](torque_cost=0.001, control_limit=1.0)
+    rng = np.random.default_rng(5)
+    errors = {0.05: [], 0.005: []}
+    for _ in range(40):
+        theirs.reset()
+        start, u = rng.uniform([-3.0, -7.0], [3.0, 7.0]), rng.uniform(-1.0, 1.0, 1)
+        for dt, found in errors.items():
+            theirs.state, theirs.dt = start.copy(), dt
+            x = pendulum.from_observation("Pendulum-v1", theirs._get_obs().astype(np.float64))
+            velocity = pendulum.velocity(torch.from_numpy(x)[None], torch.from_numpy(u)[None])[0].numpy()
+            observation, reward, *_ = theirs.step(pendulum.to_action("Pendulum-v1", u))
+            off = pendulum.from_observation("Pendulum-v1", observation) - x - dt * velocity
+            found.append(float(np.abs(off - off.round()).max()))
+            # The cost agrees but for `theta^2`, which the model makes smooth, and single precision of the observation.
+            cost = float(pendulum.state_cost(torch.from_numpy(x)[None]) + pendulum.control_cost.cost(torch.from_numpy(u)))
+            smooth = start[0] ** 2 - 2.0 * (1.0 - math.cos(start[0]))
+            assert -reward - smooth == pytest.approx(cost / pendulum._scale, rel=1e-4, abs=1e-4)
+    assert max(errors[0.05]) < 0.02
+    assert max(errors[0.005]) < 0.015 * max(errors[0.05]) + 1e-6
+
+
+def test_a_saved_pendulum_controller_plays_gymnasiums_untouched(gymnasium, tmp_path):
+    """The classical swing-up through the same maps: what does not swing up returns about -1200."""
+    from ocp_torch.practice import classical_law
+
+    pendulum = PROBLEMS["pendulum"](torque_cost=0.001, control_limit=1.0)
+    law = classical_law(pendulum)
+
+    class Classical:
+        problem = pendulum
+
+        def __call__(self, x):
+            return law(torch.from_numpy(x)).numpy()
+
+    env = made("Pendulum-v1", None)
+    found = play(Classical(), env, "Pendulum-v1", 20, 0)
+    env.close()
+    assert (found.lengths == 200).all()
+    assert found.mean > -500.0
+    folder = tmp_path / "run"
+    few = ("certificate.points=64", "certificate.trajectories=4", "certificate.ascents=2", "trainer.figures=false")
+    small_run = ("trainer.steps=5", "trainer.batch=32", "trainer.rounds=1", "model.width=16", "model.waves=0")
+    session(small("experiment=gymnasium_pendulum", *small_run, *few), folder)
+    played = asked(folder, env="Pendulum-v1", episodes=2).run()
+    assert (played.lengths == 200).all()
+    assert np.isfinite(played.returns).all()

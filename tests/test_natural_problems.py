@@ -12,7 +12,8 @@ from ocp_torch.certificate.simulation import discounted_integral
 from ocp_torch.controller import problem_name
 from ocp_torch.errors import InputError
 from ocp_torch.extremum import supremum
-from ocp_torch.problems import PROBLEMS, Arm, Dubins, Kuramoto, Pendulum, PhaseNeurons, Unicycle
+from ocp_torch.practice import metrics
+from ocp_torch.problems import PROBLEMS, Arm, Dubins, Kuramoto, Pendulum, PhaseNeurons, RobotArm, Unicycle
 from ocp_torch.problems.local import discounted_riccati, occupation_bound_at_rest
 from ocp_torch.reference.reference import solve_reference
 from ocp_torch.samples import Samples
@@ -431,3 +432,88 @@ def test_wrong_arguments_are_refused_in_one_sentence(cls, arguments, message):
         cls(**arguments)
     assert str(caught.value).endswith(".")
     assert "\n" not in str(caught.value)
+
+
+# Control limits.
+SOME_LIMITED = [
+    Arm(control_limit=0.2),
+    Unicycle(control_limit=0.2),
+    Dubins(control_limit=0.2),
+    Kuramoto(control_limit=0.2),
+    PhaseNeurons(control_limit=0.2),
+    Pendulum(control_limit=0.2),
+    RobotArm(control_limit=0.2),
+]
+
+
+@pytest.mark.parametrize("problem", SOME_LIMITED, ids=lambda problem: type(problem).__name__)
+def test_every_system_takes_a_control_limit_and_pays_infinitely_beyond_it(problem):
+    u = torch.zeros(2, problem.control_dim, dtype=torch.float64)
+    u[0, 0], u[1, -1] = 0.199, 0.201
+    cost = problem.control_cost.cost(u)
+    assert cost.tolist() == [pytest.approx(0.199**2 / 2.0), math.inf]
+    assert problem.parameters["control_limit"] == 0.2
+    assert PROBLEMS[problem_name(problem)](**problem.parameters).control_limit == 0.2
+    free = type(problem)()
+    assert free.control_limit is None
+    assert problem.occupation_bound == free.occupation_bound
+    with pytest.raises(InputError, match="problem.control_limit"):
+        type(problem)(control_limit=0.0)
+
+
+def test_a_limit_makes_the_optimum_dearer_but_changes_nothing_near_the_state_of_rest():
+    """Why the criterion for an unbounded `mu*` needs no limit: there `V*` is that of the discounted Riccati equation."""
+    two = dict(oscillators=2, spread=0.0, coupling=0.2)
+    free, limited = Kuramoto(**two), Kuramoto(**two, control_limit=0.2)
+    one, other = solve_reference(free, side=512), solve_reference(limited, side=512)
+    assert other.optimum - other.error > one.optimum + one.error
+    at = torch.zeros(1, 1, dtype=torch.float64)
+    A = torch.func.jacrev(lambda x: free.drift(x[None])[0])(at[0])
+    Q = torch.func.hessian(lambda x: free.state_cost(x[None])[0])(at[0])
+    P = discounted_riccati(A, free.control_matrix(at)[0], Q, free.discount)
+    near = torch.tensor([[-0.02], [0.01], [0.02]], dtype=torch.float64)
+    expected = 0.5 * free.discount * float(P) * near[:, 0].square()
+    for found in (one, other):
+        value, control = found.interpolate(near)
+        torch.testing.assert_close(value, expected, rtol=0.03, atol=0.0)
+        assert float(control.norm(dim=-1).max()) < 0.19
+    # Far away the limit is felt.
+    far = torch.tensor([[0.4]], dtype=torch.float64)
+    assert float(other.interpolate(far)[0]) > 1.05 * float(one.interpolate(far)[0])
+
+
+def test_the_practitioners_numbers_hold_every_law_to_the_limit():
+    pendulum = Pendulum(control_limit=0.3)
+    reckless = lambda x: torch.full_like(x[:, :1], 50.0)
+    at_limit = lambda x: torch.full_like(x[:, :1], 0.3)
+    one, other = (metrics(pendulum, law, seed=1, starts=8)["controller"] for law in (reckless, at_limit))
+    assert one == other
+    assert math.isfinite(one["cost"])
+
+
+# Gymnasium's pendulum, by hand: the environment itself is in test_gym.py.
+def test_an_observation_of_gymnasiums_pendulum_is_the_state_it_was_made_of():
+    pendulum = Pendulum()
+    drawn = 2.0 * torch.rand(200, 2, generator=generator(11), dtype=torch.float64) - 1.0
+    physical = drawn * torch.tensor([3.0 * math.pi, pendulum.max_speed])
+    observed = torch.stack([physical[:, 0].cos(), physical[:, 0].sin(), physical[:, 1]], dim=-1)
+    states = np.stack([pendulum.from_observation("Pendulum-v1", row) for row in observed.numpy()])
+    off = torch.from_numpy(states) - pendulum.to_torus(physical)
+    torch.testing.assert_close(off - off.round(), torch.zeros_like(off), **ROUNDING)
+    back = pendulum.from_torus(torch.from_numpy(states))
+    same_turns(back[:, 0], physical[:, 0])
+    torch.testing.assert_close(back[:, 1], physical[:, 1], **ROUNDING)
+
+
+def test_the_torque_is_that_of_the_model_and_never_beyond_what_gymnasium_allows():
+    pendulum = Pendulum(max_torque=1.5)
+    assert pendulum.to_action("Pendulum-v1", np.array([-0.4])).tolist() == [pytest.approx(-0.6)]
+    assert pendulum.to_action("Pendulum-v1", np.array([7.0])).tolist() == [1.5]
+    # A speed a stranger's variant may show beyond the seam is taken at the seam.
+    assert pendulum.from_observation("Pendulum-v1", np.array([1.0, 0.0, 99.0])) == pytest.approx([0.0, 0.5])
+
+
+def test_the_pendulum_knows_no_other_environment():
+    for call in (lambda p: p.from_observation("Acrobot-v1", np.zeros(6)), lambda p: p.to_action("Acrobot-v1", [0.0])):
+        with pytest.raises(InputError, match="Pendulum does not know the environment Acrobot-v1"):
+            call(Pendulum())

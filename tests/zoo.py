@@ -82,11 +82,11 @@ ALL, LIMITED = (*EXACT, "swing"), tuple(_LIMITED)
 _NATURAL = {
     "arm n=2": Arm,
     "arm n=3 q=1.5": partial(Arm, dim=3, lengths=[0.5, 0.3, 0.1], target=[-0.3, 0.4], exponent=1.5),
-    "arm without obstacles": partial(Arm, dim=4, obstacles=[]),
+    "arm without obstacles": partial(Arm, dim=4, obstacles=[], control_limit=0.3),
     "unicycle": Unicycle,
     "dubins": Dubins,
     "pendulum": Pendulum,
-    "pendulum of Gymnasium": partial(Pendulum, torque_cost=0.001),
+    "pendulum of Gymnasium": partial(Pendulum, torque_cost=0.001, control_limit=1.0),
     "kuramoto n=3": Kuramoto,
     "kuramoto n=3 absolute": partial(Kuramoto, relative=False),
     "kuramoto n=6 random": partial(Kuramoto, oscillators=6, graph="random", controlled=[0, 2, 5], seed=3),

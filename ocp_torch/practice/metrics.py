@@ -101,9 +101,14 @@ def metrics(problem: Problem, law: Law, seed: int = 0, starts: int = STARTS) -> 
     for name, each in laws.items():
         if each is None:
             continue
-        path = simulate(problem, each, x0, duration, STEPS)
+        path = simulate(problem, _within_limit(problem, each), x0, duration, STEPS)
         found[name] = {**measure(problem, path), "cost": float(path.cost.mean())}
     return {"starts": starts, "seed": seed, "duration": duration, **found}
+
+
+def _within_limit(problem: Problem, law: Law) -> Law:
+    """``law``, shrunk to the problem's control limit where it has one: a classical law knows none, and others round."""
+    return lambda x: problem.control_cost.within(law(x), torch.ones_like(x[:, 0]))
 
 
 def random_starts(problem: Problem, count: int, seed: int) -> Tensor:

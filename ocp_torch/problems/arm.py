@@ -30,7 +30,7 @@ class Arm(Problem):
 
     ``lengths`` in metres, by default 1 / dim each; ``target`` `[x, y]`; ``obstacles`` a list of `[x, y, radius]`. The
     optimal flow contracts onto the configurations that reach the target: `mu*` is declared unbounded, and no `M` makes
-    `F_M` a bound. Raises `InputError` for wrong arguments.
+    `F_M` a bound, with a control limit or without, as the control is small there. Raises `InputError` for wrong arguments.
     """
 
     def __init__(
@@ -45,8 +45,9 @@ class Arm(Problem):
         speed: float = 0.35,
         discount: float = 1.0,
         exponent: float = 2.0,
+        control_limit: float | None = None,
     ) -> None:
-        super().__init__(dim=dim, discount=discount, exponent=exponent)
+        super().__init__(dim=dim, discount=discount, exponent=exponent, control_limit=control_limit)
         equal = [1.0 / self.dim] * self.dim
         self.lengths = equal if lengths is None else require_numbers("problem.lengths", lengths, self.dim, above=0.0)
         self.target = require_numbers("problem.target", target, 2)

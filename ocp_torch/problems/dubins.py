@@ -38,8 +38,10 @@ class Dubins(PlanarVehicle):
         turn_rate: float = 0.25,
         discount: float = 0.5,
         exponent: float = 2.0,
+        control_limit: float | None = None,
     ) -> None:
-        super().__init__(1, size, target, obstacles, clearance, target_weight, obstacle_weight, discount, exponent)
+        weights = target_weight, obstacle_weight
+        super().__init__(1, size, target, obstacles, clearance, *weights, discount, exponent, control_limit)
         self.speed = require_number("problem.speed", speed, above=0.0)
         self.turn_rate = require_number("problem.turn_rate", turn_rate, above=0.0)
 

@@ -29,7 +29,8 @@ class Kuramoto(Problem):
     ``relative`` phases `y_i = x_i - x_n`, `i < n`, drop one dimension and lose nothing where the cost depends on
     differences alone: it is the default to (de)synchronise, and refused to entrain. ``frequencies`` is a list, or null
     for normal draws of deviation ``spread`` by ``seed``, shifted to mean 0; ``graph`` is complete, ring, random (by
-    ``probability`` and ``seed``), a file or a list of rows. The flow contracts onto the goal: `mu*` is declared unbounded.
+    ``probability`` and ``seed``), a file or a list of rows. The flow contracts onto the goal: `mu*` is declared unbounded,
+    also under a control limit (an `inf` only keeps `F_M` out of the certificate).
     Where not all oscillators are controlled, assumption A2 of the paper fails (see `Dubins` for what then still holds).
     Raises `InputError` for wrong arguments.
     """
@@ -50,6 +51,7 @@ class Kuramoto(Problem):
         discount: float = 1.0,
         exponent: float = 2.0,
         seed: int = 0,
+        control_limit: float | None = None,
     ) -> None:
         self.oscillators = n = require_integer("problem.oscillators", oscillators, 2, maximum=512)
         self.goal = require_choice("problem.goal", goal, GOALS)
@@ -58,7 +60,7 @@ class Kuramoto(Problem):
         if self.relative and not invariant:
             raise InputError("problem.relative is true, but problem.goal = entrain asks for phases, not differences.")
         self.controlled = _subset(controlled, n)
-        super().__init__(n - self.relative, len(self.controlled), discount, exponent)
+        super().__init__(n - self.relative, len(self.controlled), discount, exponent, control_limit)
         self.seed = require_integer("problem.seed", seed, 0)
         self.spread = require_number("problem.spread", spread, at_least=0.0)
         self.probability = require_number("problem.probability", probability, at_least=0.0, at_most=1.0)

@@ -26,7 +26,8 @@ def occupation_bound_at_rest(A: Tensor, B: Tensor, Q: Tensor, rho: float, expone
     r"""`math.inf` if the optimal flow contracts volume at rate `rho` or more at a state of rest with `f = 0`, else `None`.
 
     There mass gathers as fast as the discount forgets it, and `mu*` is unbounded; otherwise nothing is known. ``A`` and
-    ``B`` are the linear dynamics, ``Q`` the Hessian of `f`. For `q < 2` the control vanishes faster than linearly.
+    ``B`` are the linear dynamics, ``Q`` the Hessian of `f`. For `q < 2` the control vanishes faster than linearly. A limit on
+    the control changes nothing: near the state of rest the control is small.
     """
     flow = A
     if exponent == 2.0:

@@ -2,6 +2,7 @@ r"""Swing up a pendulum by a torque at its pivot: the model and parameters of Gy
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -11,6 +12,8 @@ from ocp_torch.problems.local import occupation_bound_at_rest
 from ocp_torch.problems.problem import Problem
 
 SPEED_COST = 0.1
+# The environment this is a model of: it observes cos theta, sin theta and theta', and takes a torque in N m.
+GYMNASIUM = "Pendulum-v1"
 
 
 class Pendulum(Problem):
@@ -40,8 +43,9 @@ class Pendulum(Problem):
         torque_cost: float = 0.1,
         discount: float = 2.0,
         exponent: float = 2.0,
+        control_limit: float | None = None,
     ) -> None:
-        super().__init__(dim=2, control_dim=1, discount=discount, exponent=exponent)
+        super().__init__(dim=2, control_dim=1, discount=discount, exponent=exponent, control_limit=control_limit)
         self.gravity = require_number("problem.gravity", gravity, at_least=0.0)
         self.mass = require_number("problem.mass", mass, above=0.0)
         self.length = require_number("problem.length", length, above=0.0)
@@ -118,3 +122,17 @@ class Pendulum(Problem):
         """States as angles in [-pi, pi) radians, 0 upright, and velocities in [-seam, seam) rad/s, ``(N, 2)``."""
         velocity = ((x[:, 1:] + 0.5).remainder(1.0) - 0.5) * (2.0 * self.seam)
         return torch.cat([to_radians(x[:, :1]), velocity], dim=-1)
+
+    def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
+        """The state of Pendulum-v1 that shows `(cos theta, sin theta, theta')`; speeds beyond the seam are taken at it."""
+        if env != GYMNASIUM:
+            return super().from_observation(env, observation)
+        cosine, sine, velocity = np.asarray(observation, dtype=np.float64)
+        physical = [[np.arctan2(sine, cosine), np.clip(velocity, -self.seam, self.seam)]]
+        return self.to_torus(torch.tensor(physical, dtype=torch.float64))[0].numpy()
+
+    def to_action(self, env: str, control: np.ndarray) -> np.ndarray:
+        """The torque in N m, within the ``max_torque`` that Pendulum-v1 allows."""
+        if env != GYMNASIUM:
+            return super().to_action(env, control)
+        return np.clip(self.max_torque * np.asarray(control), -self.max_torque, self.max_torque)

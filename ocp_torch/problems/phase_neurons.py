@@ -41,9 +41,10 @@ class PhaseNeurons(Problem):
         weight: float = 1.0,
         discount: float = 0.7,
         exponent: float = 2.0,
+        control_limit: float | None = None,
     ) -> None:
         n = require_integer("problem.neurons", neurons, 2, maximum=512)
-        super().__init__(dim=n, control_dim=1, discount=discount, exponent=exponent)
+        super().__init__(n, 1, discount, exponent, control_limit)
         self.neurons = n
         self.response = require_choice("problem.response", response, (TYPE_1, TYPE_2))
         self.goal = require_choice("problem.goal", goal, (DESYNCHRONISE, SYNCHRONISE))

@@ -32,8 +32,9 @@ class PlanarVehicle(Problem):
         obstacle_weight: float,
         discount: float,
         exponent: float,
+        control_limit: float | None,
     ) -> None:
-        super().__init__(dim=3, control_dim=control_dim, discount=discount, exponent=exponent)
+        super().__init__(3, control_dim, discount, exponent, control_limit)
         self.size = require_number("problem.size", size, above=0.0)
         self.target = require_numbers("problem.target", target, 2)
         self.obstacles = require_obstacles("problem.obstacles", obstacles)

@@ -54,6 +54,7 @@ class RobotArm(Problem):
         speed: float = 0.35,
         discount: float = 1.0,
         exponent: float = 2.0,
+        control_limit: float | None = None,
     ) -> None:
         if urdf is not None and chain is not None:
             raise InputError("problem.urdf and problem.chain are both given, but either alone is the kinematics.")
@@ -64,7 +65,7 @@ class RobotArm(Problem):
                 "problem.chain must be a list of rows of 15 numbers, one for each joint and one for the tip."
             )
         self.chain = [require_numbers(f"problem.chain[{i}]", row, 15) for i, row in enumerate(given)]
-        super().__init__(dim=len(self.chain) - 1, discount=discount, exponent=exponent)
+        super().__init__(len(self.chain) - 1, discount=discount, exponent=exponent, control_limit=control_limit)
         self.urdf, self.tip = None, None  # a saved controller needs no file
         self.target = require_numbers("problem.target", target, 3)
         self.obstacles = require_obstacles("problem.obstacles", obstacles, space=3)

@@ -35,11 +35,14 @@ class Unicycle(PlanarVehicle):
         turn_rate: float = 0.25,
         discount: float = 1.0,
         exponent: float = 2.0,
+        control_limit: float | None = None,
     ) -> None:
-        super().__init__(2, size, target, obstacles, clearance, target_weight, obstacle_weight, discount, exponent)
+        weights = target_weight, obstacle_weight
+        super().__init__(2, size, target, obstacles, clearance, *weights, discount, exponent, control_limit)
         self.speed = require_number("problem.speed", speed, above=0.0)
         self.turn_rate = require_number("problem.turn_rate", turn_rate, above=0.0)
-        # With V = p r^2 / 2 along the heading: p + (speed p)^2 / rho^2 = 2 target_weight, contraction speed^2 p / rho.
+        # With V = p r^2 / 2 along the heading: p + (speed p)^2 / rho^2 = 2 target_weight, contraction speed^2 p / rho. The
+        # control vanishes at the target, so that no limit changes any of it there.
         fast = self.target_weight * self.speed**2 >= self.discount**2
         self.occupation_bound = math.inf if fast and self.exponent == 2.0 else None
 
