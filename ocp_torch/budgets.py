@@ -33,15 +33,15 @@ PLAIN, GATED = dict(gated=False, activation="gelu", lr=1e-2), dict(gated=True, a
 
 # Kinks want Fourier modes, affordable in one and two dimensions; many dimensions want products and samples.
 BUDGETS = (
-    Budget(1, modes=6, waves=0, width=96, **PLAIN, steps=1200, batch=256, good_gap=0.005, stage_steps=300),
-    Budget(2, modes=6, waves=16, width=96, **PLAIN, steps=1200, batch=256, good_gap=0.005, stage_steps=400),
+    Budget(1, modes=6, waves=0, width=96, **PLAIN, steps=900, batch=256, good_gap=0.005, stage_steps=300),
+    Budget(2, modes=6, waves=16, width=96, **PLAIN, steps=900, batch=256, good_gap=0.005, stage_steps=400),
     Budget(4, modes=3, waves=32, width=128, **PLAIN, steps=1500, batch=384, good_gap=0.005, stage_steps=600),
     Budget(8, modes=1, waves=64, width=128, **GATED, steps=1000, batch=512, good_gap=0.01, stage_steps=600),
     Budget(inf, modes=1, waves=128, width=128, **GATED, steps=1200, batch=512, good_gap=0.02, stage_steps=800),
 )
 
-# Where mu* is unbounded the slack must be small everywhere, not on average: that wants more states at once.
-LARGE_BATCH, MANY_WAVES = 1024, 64
+# Where mu* is unbounded the slack must be small everywhere, not on average: that wants more states at once, and longer.
+LARGE_BATCH, MANY_WAVES, MANY_STEPS = 1024, 64, 1200
 
 
 def fill(config: dict, problem: Problem) -> dict:
@@ -51,7 +51,12 @@ def fill(config: dict, problem: Problem) -> dict:
         require_section(name, config.get(name))
     filled = copy.deepcopy(config)
     if is_unbounded(problem):
-        budget = replace(budget, batch=max(budget.batch, LARGE_BATCH), waves=max(budget.waves, MANY_WAVES))
+        budget = replace(
+            budget,
+            batch=max(budget.batch, LARGE_BATCH),
+            waves=max(budget.waves, MANY_WAVES),
+            steps=max(budget.steps, MANY_STEPS),
+        )
     defaults = {
         ("model", "modes"): budget.modes,
         ("model", "waves"): budget.waves,

@@ -242,7 +242,7 @@ def theirs(gymnasium):
 
 
 def test_the_pendulum_is_gymnasiums_over_a_short_time(theirs):
-    """One of their steps against the model's velocity: their Euler step is off by `O(dt^2)`, so a tenth of it by a hundredth."""
+    """One of their steps against the model's velocity: their Euler step is off by `O(dt^2)`: a tenth of `dt`, a hundredth."""
     pendulum = PROBLEMS["pendulum"](torque_cost=0.001, control_limit=1.0)
     rng = np.random.default_rng(5)
     errors = {0.05: [], 0.005: []}
@@ -257,7 +257,9 @@ def test_the_pendulum_is_gymnasiums_over_a_short_time(theirs):
             off = pendulum.from_observation("Pendulum-v1", observation) - x - dt * velocity
             found.append(float(np.abs(off - off.round()).max()))
             # The cost agrees but for `theta^2`, which the model makes smooth, and single precision of the observation.
-            cost = float(pendulum.state_cost(torch.from_numpy(x)[None]) + pendulum.control_cost.cost(torch.from_numpy(u)))
+            cost = float(
+                pendulum.state_cost(torch.from_numpy(x)[None]) + pendulum.control_cost.cost(torch.from_numpy(u))
+            )
             smooth = start[0] ** 2 - 2.0 * (1.0 - math.cos(start[0]))
             assert -reward - smooth == pytest.approx(cost / pendulum._scale, rel=1e-4, abs=1e-4)
     assert max(errors[0.05]) < 0.02
