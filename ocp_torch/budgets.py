@@ -33,8 +33,8 @@ PLAIN, GATED = dict(gated=False, activation="gelu", lr=1e-2), dict(gated=True, a
 
 # Kinks want Fourier modes, affordable in one and two dimensions; many dimensions want products and samples.
 BUDGETS = (
-    Budget(1, modes=6, waves=0, width=96, **PLAIN, steps=900, batch=256, good_gap=0.005, stage_steps=300),
-    Budget(2, modes=6, waves=16, width=96, **PLAIN, steps=900, batch=256, good_gap=0.005, stage_steps=400),
+    Budget(1, modes=6, waves=0, width=96, **PLAIN, steps=1000, batch=256, good_gap=0.005, stage_steps=300),
+    Budget(2, modes=6, waves=16, width=96, **PLAIN, steps=1000, batch=256, good_gap=0.005, stage_steps=400),
     Budget(4, modes=3, waves=32, width=128, **PLAIN, steps=1500, batch=384, good_gap=0.005, stage_steps=600),
     Budget(8, modes=1, waves=64, width=128, **GATED, steps=1000, batch=512, good_gap=0.01, stage_steps=600),
     Budget(inf, modes=1, waves=128, width=128, **GATED, steps=1200, batch=512, good_gap=0.02, stage_steps=800),
