@@ -12,6 +12,7 @@ from concurrent.futures.process import BrokenProcessPool
 import numpy as np
 
 from ocp_torch.errors import InputError
+from ocp_torch.problems.target import asked, resolved
 
 _function = None
 
@@ -21,14 +22,10 @@ def _start(target: str, path: list[str], folder: str) -> None:
     global _function
     sys.path[:] = path
     os.chdir(folder)
-    from ocp_torch.problems.callable import resolved
-
     _function = resolved(target)
 
 
 def _share(x: np.ndarray, one_by_one: bool):
-    from ocp_torch.problems.callable import asked
-
     return asked(_function, x, one_by_one)
 
 
