@@ -28,6 +28,7 @@ from ocp_torch.problems import Problem
 from ocp_torch.process import prepare
 from ocp_torch.samplers import SAMPLERS, RowSampler, derive_seed
 from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
+from ocp_torch.training.batches import Batches
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.trainer import Trainer
 
@@ -81,6 +82,7 @@ def build_trainer(config: dict) -> Trainer:
     average = call(averaged, "averaging", require_section("averaging", config["averaging"]), fields=fields)
     sampler_section = require_section("sampler", config["sampler"])
     sampler_name = require_choice("sampler.name", sampler_section.pop("name", None), SAMPLERS)
+    visited = sampler_section.pop("visited", None)
     given = {"dim": problem.dim, "seed": seed, "dtype": settings.torch_dtype}
     if problem.evaluable:
         sampler = call(SAMPLERS[sampler_name], "sampler", sampler_section, **given)
@@ -89,9 +91,10 @@ def build_trainer(config: dict) -> Trainer:
         raise InputError(f"{field} is set, but a data set has its own samples, and no simulation to see a gap by.")
     else:
         sampler = RowSampler(problem.rows, seed, problem.recording.digest)
+    batches = Batches(problem, fields, objective, sampler, settings.batch, seed, visited)
     names = (problem_name(problem), name)
     return Trainer(
-        problem, fields, objective, bounds, stepper, average, sampler, settings, network, seed, names, config
+        problem, fields, objective, bounds, stepper, average, batches, settings, network, seed, names, config
     )
 
 

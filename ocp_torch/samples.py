@@ -19,7 +19,8 @@ class Samples:
     """A problem's data at `N` states.
 
     `weight` is one over the density the states were drawn from, so that a weighted mean estimates an integral over the
-    torus. The divergences are `None` where the problem cannot give them.
+    torus. `attention` is what a violated inequality weighs at each state, `None` for as much as `weight`; it may look where
+    `weight` is 0. The divergences are `None` where the problem cannot give them.
     """
 
     x: Tensor  # (N, d) states
@@ -30,6 +31,7 @@ class Samples:
     weight: Tensor  # (N,) importance weight
     div_a: Tensor | None = None  # (N,) divergence of the drift
     div_B: Tensor | None = None  # (N, m) divergence of each column of B
+    attention: Tensor | None = None  # (N,) weight in penalties
 
     @classmethod
     @torch.no_grad()
@@ -52,6 +54,10 @@ class Samples:
     def mean(self, integrand: Tensor) -> Tensor:
         """The weighted mean of ``integrand`` ``(N,)``: an estimate of its integral over the torus."""
         return (self.weight * integrand).mean()
+
+    def penalty(self, violation: Tensor) -> Tensor:
+        """The mean of ``violation`` ``(N,)`` as `attention` weighs it."""
+        return ((self.weight if self.attention is None else self.attention) * violation).mean()
 
     def require_divergences(self, who: str) -> tuple[Tensor, Tensor]:
         """`div a` and `div B`, or an `InputError` that names ``who`` needs them."""

@@ -72,7 +72,7 @@ def test_values_reach_what_they_name():
     assert trainer.bounds.C_V == 0.3
     assert trainer.stepper.learning_rates() == {"density": 0.25}
     assert trainer.stepper.radius == 5
-    assert trainer.sampler.draw(2).dtype == torch.float64
+    assert trainer.batches.sampler.draw(2).dtype == torch.float64
     assert next(trainer.fields.parameters()).dtype == torch.float64
     assert trainer.run.seed == 7
 

@@ -43,16 +43,11 @@ class Dual(Objective):
 def value_loss(
     objective: Objective, fields: Fields, samples: Samples, value: Tensor, slack: Tensor, residual: float
 ) -> Tensor:
-    """What a value player on its own minimises: minus the mean of `dual_integrand`."""
+    """What a value player on its own minimises: `E[M max(Q, 0) + (residual / s) Q^2 - V mu0]`."""
     M = objective.bounds.M
     if objective.bounds.unbounded:
         M = M * LEAST_WEIGHT ** max(0.0, 1.0 - objective.progress / GROWTH)
-    return -samples.mean(dual_integrand(fields, samples, value, slack, M, residual))
-
-
-def dual_integrand(fields: Fields, samples: Samples, value: Tensor, slack: Tensor, M: float, residual: float) -> Tensor:
-    """`V mu0 - M max(Q, 0) - (residual / s) Q^2`, ``(N,)``."""
-    penalised = value * samples.mu0 - M * slack.clamp_min(0.0)
-    if residual == 0.0:
-        return penalised
-    return penalised - residual / getattr(fields.value, "scale", 1.0) * slack.square()
+    violation = M * slack.clamp_min(0.0)
+    if residual > 0.0:
+        violation = violation + residual / getattr(fields.value, "scale", 1.0) * slack.square()
+    return samples.penalty(violation) - samples.mean(value * samples.mu0)

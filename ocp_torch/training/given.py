@@ -25,9 +25,9 @@ from ocp_torch.objectives import Dual
 from ocp_torch.problems import Problem
 from ocp_torch.process import prepare
 from ocp_torch.samplers import UniformSampler, derive_seed, scrambled_sobol
-from ocp_torch.samples import Samples
 from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training import figures
+from ocp_torch.training.batches import Batches
 from ocp_torch.training.loading import load_law, load_saved
 
 log = logging.getLogger(__name__)
@@ -88,13 +88,13 @@ def train_value(
     fields = Fields.build(problem, (VALUE,), network, derive_seed(seed, JUDGE_STREAM, 0))
     objective = Dual(problem, bounds)
     sampler = UniformSampler(problem.dim, derive_seed(seed, JUDGE_STREAM, 1), torch.float32)
-    draw = lambda: Samples.of(problem, sampler.draw(batch), divergences=False)
+    batches = Batches(problem, fields, objective, sampler, batch, derive_seed(seed, JUDGE_STREAM, 2))
     makers = {player: optimizer_maker("soap", lr, betas=(0.95, 0.95)) for player in objective.players}
     stepper = Simultaneous(fields, objective, makers, schedule_maker("cosine", steps))
     average = averaged(fields, decay=0.98)
     for step in range(steps):
         objective.progress = step / steps
-        stepper.step(draw, lambda: average.update_parameters(fields))
+        stepper.step(batches.draw, lambda: average.update_parameters(fields))
     return average.module
 
 

@@ -41,7 +41,7 @@ def gather(trainer: Trainer) -> dict:
         "fields": trainer.fields.state_dict(),
         "average": trainer.average.state_dict(),
         "stepper": trainer.stepper.state_dict(),
-        "sampler": trainer.sampler.state_dict(),
+        "batches": trainer.batches.state_dict(),
         "watch": trainer.watch.state_dict(),
         "generators": generator_states(),
     }
@@ -78,7 +78,7 @@ def restore(trainer: Trainer, state: dict) -> None:
         trainer.stepper.load_state_dict(state["stepper"], moves=_moves(trainer))
     else:
         trainer.stepper.load_state_dict(state["stepper"])
-    trainer.sampler.load_state_dict(state["sampler"])
+    trainer.batches.load_state_dict(state["batches"])
     trainer.watch.load_state_dict(state["watch"])
     restore_generators(state["generators"])
 

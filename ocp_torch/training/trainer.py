@@ -27,8 +27,8 @@ from ocp_torch.fields.fields import typical_sizes
 from ocp_torch.objectives import Objective
 from ocp_torch.problems import Problem
 from ocp_torch.samplers import derive_seed
-from ocp_torch.samples import Samples
 from ocp_torch.steppers import NonFiniteError, Stepper
+from ocp_torch.training.batches import Batches
 from ocp_torch.training.checkpoint import BEST, load_checkpoint, save_checkpoint
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.signals import Signals
@@ -53,8 +53,8 @@ RETRY = 1.25
 
 
 class Trainer:
-    """Everything a run is made of. ``average`` is a `torch.optim.swa_utils.AveragedModel` of ``fields``; ``sampler``
-    draws states; ``config`` is the configuration all this was built from, as plain data without nulls to fill."""
+    """Everything a run is made of. ``average`` is a `torch.optim.swa_utils.AveragedModel` of ``fields``; ``batches``
+    draws samples; ``config`` is the configuration all this was built from, as plain data without nulls to fill."""
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class Trainer:
         bounds: Bounds,
         stepper: Stepper,
         average,
-        sampler,
+        batches: Batches,
         settings: TrainerSettings,
         network: Callable[..., nn.Module],
         seed: int,
@@ -72,7 +72,7 @@ class Trainer:
         config: dict,
     ) -> None:
         self.problem, self.fields, self.objective, self.bounds = problem, fields, objective, bounds
-        self.stepper, self.average, self.sampler, self.settings = stepper, average, sampler, settings
+        self.stepper, self.average, self.batches, self.settings = stepper, average, batches, settings
         self.network, self.seed, self.names, self.config = network, seed, names, config
         self.step, self.round, self.samples = 0, 0, 0
         self.seconds, self.elapsed = 0.0, 0.0  # in steps alone; with looks and checkpoints
@@ -92,12 +92,6 @@ class Trainer:
         """Who and where this run is, for its certificate."""
         problem, method = self.names
         return Run(problem, method, self.seed, self.step, self.samples, self.seconds, self.stopped)
-
-    def draw(self) -> Samples:
-        """The next batch of training samples, on the run's device."""
-        places = self.sampler.draw(self.settings.batch).to(self.settings.torch_device)
-        drawn = self.problem.samples(places, divergences=self.objective.needs_divergences)
-        return drawn if self.problem.evaluable else drawn.to(next(self.fields.parameters()))
 
     @property
     def end(self) -> int:
@@ -149,7 +143,7 @@ class Trainer:
         settings = self.settings
         started = time.perf_counter()
         self.objective.progress = self.progress
-        report = self.stepper.step(self.draw, lambda: self.average.update_parameters(self.fields))
+        report = self.stepper.step(self.batches.draw, lambda: self.average.update_parameters(self.fields))
         self.step += 1
         self.samples += report.samples
         stepped = time.perf_counter()
@@ -279,7 +273,7 @@ class Trainer:
         """One step for nothing: shows whether an optimiser can work with the state it was given."""
         self.objective.progress = 1.0
         try:
-            self.stepper.step(self.draw, lambda: self.average.update_parameters(self.fields))
+            self.stepper.step(self.batches.draw, lambda: self.average.update_parameters(self.fields))
         except NonFiniteError:
             pass  # the run itself will say so
 

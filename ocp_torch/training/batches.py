@@ -1,0 +1,123 @@
+"""Training batches: states of a sampler and, where that pays, states that the controller in training visits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ocp_torch.control_laws import ValueLaw
+from ocp_torch.errors import InputError, require_number
+from ocp_torch.fields import VALUE, Fields
+from ocp_torch.objectives import Objective
+from ocp_torch.problems import Problem
+from ocp_torch.samplers import derive_seed
+from ocp_torch.samples import Samples
+
+VISITS_STREAM = 9
+# The part of a batch that is visited states, where `mu*` is unbounded and nobody said otherwise.
+VISITED = 0.25
+# At least a tenth of a batch is for the integrals.
+MOST = 0.9
+# Visited states move on, from batch to batch, by this part of 1 / rho, but never further than a stride on the torus.
+MOVE, STRIDE = 0.05, 0.05
+
+
+class Batches:
+    r"""``size`` states a batch for ``objective``; the part ``visited`` of them comes from the closed loop of the present `V`.
+
+    Visited states follow the controller of `V`, and start again at a uniform state at the rate `rho`: in the long run their
+    law is about the occupation measure of that controller. They carry no weight in integrals but, for as long as they stay,
+    `Samples.attention` for the penalties. That makes the penalty of D(M) exact also where `mu*` is unbounded: it is exact
+    wherever the measure that weighs the slack dominates `mu*` (proof of Proposition 3), which no multiple of the uniform
+    one then does. And in many dimensions a goal is so small that uniform states never meet it.
+
+    ``visited`` null takes a quarter where `Bounds.unbounded`, and none elsewhere. Raises `InputError` where it is not in
+    [0, 0.9], or above 0 for a method without `V` or a problem that has data only where it was recorded.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        fields: Fields,
+        objective: Objective,
+        sampler,
+        size: int,
+        seed: int,
+        visited: float | None = None,
+    ) -> None:
+        self.problem, self.fields, self.objective, self.sampler, self.size = problem, fields, objective, sampler, size
+        self.visited = (
+            None if visited is None else require_number("sampler.visited", visited, at_least=0.0, at_most=MOST)
+        )
+        self._possible = VALUE in objective.fields and problem.evaluable
+        if self.visited and not self._possible:
+            lacks = (
+                "a data set has no data at other states" if not problem.evaluable else "this method has no V to follow"
+            )
+            raise InputError(f"sampler.visited is {visited:g}, but {lacks}; leave it out.")
+        self.generator = torch.Generator().manual_seed(derive_seed(seed, VISITS_STREAM))
+        self.states: Tensor | None = None  # (k, d), where the visitors are
+
+    def draw(self) -> Samples:
+        """The next batch, in the precision and on the device of the fields."""
+        like = next(self.fields.parameters())
+        count = self._count()
+        places = self.sampler.draw(self.size - count).to(like.device)
+        drawn = self.problem.samples(places, divergences=self.objective.needs_divergences)
+        if not self.problem.evaluable:
+            return drawn.to(like)
+        return self._with_visited(drawn, count, like) if count else drawn
+
+    def _count(self) -> int:
+        part = self.visited
+        if part is None:
+            part = VISITED if self._possible and self.objective.bounds.unbounded else 0.0
+        return min(int(part * self.size), self.size - 1)
+
+    def _with_visited(self, drawn: Samples, count: int, like: Tensor) -> Samples:
+        if self.states is None or len(self.states) != count:
+            self.states = self._born(count, like)
+        visited = self.problem.samples(self.states.to(like), divergences=self.objective.needs_divergences)
+        stay = self._move(visited)
+        # The drawn states stand for all integrals, as they would without the visited ones; the penalties see both.
+        share = (len(drawn) + count) / len(drawn)
+        drawn = replace(drawn, weight=share * drawn.weight, attention=drawn.weight)
+        visited = replace(visited, weight=torch.zeros_like(visited.weight), attention=stay)
+        return Samples.concatenate([drawn, visited])
+
+    def _move(self, at: Samples) -> Tensor:
+        """Along the closed loop for a short time, or back to a uniform state; the part of `MOVE` it took, ``(k,)``."""
+        law, rho = ValueLaw(self.problem, self.fields.value), self.problem.discount
+        u = law(at.x).detach()
+        velocity = at.a + torch.einsum("ndm,nm->nd", at.B, u)
+        time = (STRIDE / velocity.norm(dim=-1).clamp_min(1e-12)).clamp_max(MOVE / rho)
+        moved = (at.x + time.unsqueeze(-1) * velocity).remainder(1.0)
+        chance = torch.rand(len(moved), generator=self.generator).to(moved)
+        again = (chance < 1.0 - torch.exp(-rho * time)) | ~torch.isfinite(moved).all(dim=-1)
+        self.states = torch.where(again.unsqueeze(-1), self._born(len(moved), moved), moved)
+        return time * rho / MOVE
+
+    def _born(self, count: int, like: Tensor) -> Tensor:
+        return torch.rand(count, self.problem.dim, generator=self.generator).to(like)
+
+    def state_dict(self) -> dict:
+        return {
+            "sampler": self.sampler.state_dict(),
+            "generator": self.generator.get_state(),
+            "states": None if self.states is None else self.states.clone(),
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """The way back from `state_dict`. Raises `InputError` where the visited states are none."""
+        self.sampler.load_state_dict(state["sampler"])
+        self.generator.set_state(state["generator"])
+        states = state["states"]
+        if states is not None and (
+            states.ndim != 2 or states.shape[1] != self.problem.dim or not states.isfinite().all()
+        ):
+            raise InputError(
+                f"the checkpoint holds visited states that are no states of {self.problem.dim} coordinates."
+            )
+        self.states = states
