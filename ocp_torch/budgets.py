@@ -20,24 +20,21 @@ class Budget:
     waves: int
     width: int
     gated: bool
-    activation: str
-    lr: float
     steps: int
     batch: int
     good_gap: float
     stage_steps: int
 
 
-# A plain and a gated network: products of tanh learn terms that couple many coordinates several times faster.
-PLAIN, GATED = dict(gated=False, activation="gelu", lr=1e-2), dict(gated=True, activation="tanh", lr=1e-2)
-
-# Kinks want Fourier modes, affordable in one and two dimensions; many dimensions want products and samples.
+ACTIVATION, LEARNING_RATE = "tanh", 1e-2
+# Kinks want Fourier modes, affordable in one and two dimensions; many dimensions want samples, and gates: products of tanh
+# learn terms that couple many coordinates several times faster.
 BUDGETS = (
-    Budget(1, modes=6, waves=0, width=96, **PLAIN, steps=1000, batch=256, good_gap=0.005, stage_steps=300),
-    Budget(2, modes=6, waves=16, width=96, **PLAIN, steps=1000, batch=256, good_gap=0.005, stage_steps=400),
-    Budget(4, modes=3, waves=32, width=128, **PLAIN, steps=1500, batch=384, good_gap=0.005, stage_steps=600),
-    Budget(8, modes=1, waves=64, width=128, **GATED, steps=1000, batch=512, good_gap=0.01, stage_steps=600),
-    Budget(inf, modes=1, waves=128, width=128, **GATED, steps=1200, batch=512, good_gap=0.02, stage_steps=800),
+    Budget(1, modes=6, waves=0, width=96, gated=False, steps=900, batch=256, good_gap=0.005, stage_steps=300),
+    Budget(2, modes=6, waves=16, width=96, gated=False, steps=900, batch=256, good_gap=0.005, stage_steps=400),
+    Budget(4, modes=3, waves=32, width=128, gated=False, steps=1200, batch=384, good_gap=0.005, stage_steps=600),
+    Budget(8, modes=1, waves=64, width=128, gated=True, steps=1000, batch=512, good_gap=0.01, stage_steps=600),
+    Budget(inf, modes=1, waves=128, width=128, gated=True, steps=1200, batch=512, good_gap=0.02, stage_steps=800),
 )
 
 # Where mu* is unbounded the slack must be small everywhere, not on average: that wants more states at once, and longer.
@@ -62,12 +59,12 @@ def fill(config: dict, problem: Problem) -> dict:
         ("model", "waves"): budget.waves,
         ("model", "width"): budget.width,
         ("model", "gated"): budget.gated,
-        ("model", "activation"): budget.activation,
+        ("model", "activation"): ACTIVATION,
         ("trainer", "rounds"): 2 if config["trainer"].get("steps") is None else 1,
         ("trainer", "good_gap"): budget.good_gap,
         ("trainer", "steps"): budget.steps,
         ("trainer", "batch"): budget.batch,
-        ("optimizer", "lr"): budget.lr,
+        ("optimizer", "lr"): LEARNING_RATE,
         ("certificate", "stage", "steps"): budget.stage_steps,
     }
     for (*path, name), value in defaults.items():

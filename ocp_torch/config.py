@@ -86,10 +86,9 @@ def build_trainer(config: dict) -> Trainer:
     given = {"dim": problem.dim, "seed": seed, "dtype": settings.torch_dtype}
     if problem.evaluable:
         sampler = call(SAMPLERS[sampler_name], "sampler", sampler_section, **given)
-    elif sampler_name != "uniform" or settings.target_gap is not None:
-        field = "sampler" if sampler_name != "uniform" else "trainer.target_gap"
-        raise InputError(f"{field} is set, but a data set has its own samples, and no simulation to see a gap by.")
-    else:
+    elif settings.target_gap is not None:
+        raise InputError("trainer.target_gap is set, but a data set has no simulation to see a gap by.")
+    else:  # a data set has its own samples
         sampler = RowSampler(problem.rows, seed, problem.recording.digest)
     batches = Batches(problem, fields, objective, sampler, settings.batch, seed, visited)
     names = (problem_name(problem), name)

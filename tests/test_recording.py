@@ -211,10 +211,11 @@ def test_other_files_are_refused(tmp_path, plain):
     with pytest.raises(InputError, match=r"unpacks to|damaged"):
         Dataset(str(tmp_path / "bomb.npz"))
     assert "problem.path" in outcome("problem=dataset")
-    for override in ("sampler=sobol", "trainer.target_gap=0.1"):
-        assert "a data set has its own samples" in outcome(
-            "problem=dataset", f"problem.path={plain}", "method=dual", override
-        )
+    for override, sentence in (
+        ("trainer.target_gap=0.1", "no simulation"),
+        ("sampler.visited=0.2", "a data set has no data"),
+    ):
+        assert sentence in outcome("problem=dataset", f"problem.path={plain}", "method=dual", override)
     for field, sentence in (("held_out=1.5", "held_out"), ("held_out=0.01", "too few"), ("discount=-1", "discount")):
         assert sentence in outcome("problem=dataset", f"problem.path={plain}", f"problem.{field}")
 

@@ -24,7 +24,7 @@ from ocp_torch.fields.fields import VALUE
 from ocp_torch.objectives import Dual
 from ocp_torch.problems import Problem
 from ocp_torch.process import prepare
-from ocp_torch.samplers import UniformSampler, derive_seed, scrambled_sobol
+from ocp_torch.samplers import SobolSampler, derive_seed, scrambled_sobol
 from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training import figures
 from ocp_torch.training.batches import Batches
@@ -87,7 +87,7 @@ def train_value(
     """A `V` by the dual, with the defaults of a run."""
     fields = Fields.build(problem, (VALUE,), network, derive_seed(seed, JUDGE_STREAM, 0))
     objective = Dual(problem, bounds)
-    sampler = UniformSampler(problem.dim, derive_seed(seed, JUDGE_STREAM, 1), torch.float32)
+    sampler = SobolSampler(problem.dim, derive_seed(seed, JUDGE_STREAM, 1), torch.float32)
     batches = Batches(problem, fields, objective, sampler, batch, derive_seed(seed, JUDGE_STREAM, 2))
     makers = {player: optimizer_maker("soap", lr, betas=(0.95, 0.95)) for player in objective.players}
     stepper = Simultaneous(fields, objective, makers, schedule_maker("cosine", steps))
