@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, require_integer
 
 # A fresh scrambling after so many points: keeps the stream endless and fast-forwarding cheap.
 SOBOL_BLOCK = 2**18
@@ -100,7 +100,7 @@ class SobolSampler:
         return {"count": self.count}
 
     def load_state_dict(self, state: dict) -> None:
-        self.count, self._start = state["count"], -1
+        self.count, self._start = require_integer("count of the checkpoint", state["count"], 0, maximum=2**62), -1
 
 
 class RowSampler:
