@@ -14,17 +14,15 @@ from torch import Tensor
 
 from ocp_torch.fields.spectrum import STATES, standardised, waves_of
 
-# Up to here randomised Sobol sets integrate a smooth function to many digits as they are.
-FEW_COORDINATES = 4
 # Waves in the fit, and states evaluated at once.
 WAVES, CHUNK = 96, 8192
 
 
 def integrals(states: list[Tensor], values: list[Tensor]) -> list[float]:
     """The mean of each of ``values`` ``(N,)`` over its set of uniform ``states`` ``(N, d)``, with the noise of plane waves
-    taken off where there are many coordinates."""
+    taken off."""
     plain = [float(v.mean()) for v in values]
-    if states[0].shape[1] <= FEW_COORDINATES or len(states) < 2:
+    if len(states) < 2:
         return plain
     some = slice(0, max(1, STATES // len(states)))
     functions = standardised(torch.cat([v[some] for v in values]))

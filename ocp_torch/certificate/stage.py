@@ -20,7 +20,7 @@ from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
 from ocp_torch.objectives.policy_evaluation import PolicyEvaluation
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.problem import Problem
-from ocp_torch.samplers import UniformSampler, derive_seed
+from ocp_torch.samplers import SobolSampler, derive_seed
 from ocp_torch.samples import Samples
 from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
 
@@ -70,7 +70,7 @@ def fit_closed_loop(
 
     ``fields`` are the trained ones, ``law`` one of theirs in their precision; their `log mu`, if any, is the start. With no
     ``fields`` the law is somebody's own, in float64, and both `mu` and `V` are fitted in float32. ``pool``
-    is where samples of the closed loop come from, by default from evaluations at uniform states.
+    is where samples of the closed loop come from, by default from evaluations at Sobol points.
     """
     like = torch.zeros(()) if fields is None else next(fields.parameters())
     loop = ClosedLoop(problem, law)
@@ -79,9 +79,7 @@ def fit_closed_loop(
     fitted = Fields.build(problem, names, network, derive_seed(seed, STAGE_STREAM, 0)).to(like)
     if fields is not None and fields.log_occupation is not None:
         fitted.log_occupation.load_state_dict(fields.log_occupation.state_dict())
-    pool = pool or Pool(
-        loop, derive_seed(seed, STAGE_STREAM, 1), derive_seed(seed, STAGE_STREAM, 2), like, double=fields is None
-    )
+    pool = pool or Pool(loop, derive_seed(seed, STAGE_STREAM, 1), like, double=fields is None)
     draw = lambda: pool.draw(settings.batch)
     pool.grow(min(POOL, settings.steps * settings.batch))
     price = 1.0 if with_value else missing_price(loop, fields.value, pool.samples.take(slice(EXCESS_STATES)))
@@ -108,13 +106,11 @@ class Pool:
     The loop is evaluated in float64 if ``double``; samples are kept in the precision and on the device of ``like``.
     """
 
-    def __init__(
-        self, loop: ClosedLoop, states_seed: int, draws_seed: int, like: torch.Tensor, double: bool = False
-    ) -> None:
+    def __init__(self, loop: ClosedLoop, seed: int, like: torch.Tensor, double: bool = False) -> None:
         self.loop, self.like = loop, like
-        self.states = UniformSampler(loop.dim, states_seed, torch.float64 if double else like.dtype)
-        self.picker = torch.Generator().manual_seed(draws_seed)
+        self.states = SobolSampler(loop.dim, seed, torch.float64 if double else like.dtype)
         self.samples: Samples | None = None
+        self.drawn = 0
 
     def grow(self, count: int) -> None:
         """Fresh states up to ``count`` in all."""
@@ -125,9 +121,10 @@ class Pool:
             self.samples = Samples.concatenate([*kept, *(Samples.of(self.loop, x).to(self.like) for x in fresh)])
 
     def draw(self, count: int) -> Samples:
-        """``count`` of them, with replacement."""
-        index = torch.randint(len(self.samples), (count,), generator=self.picker)
-        return self.samples.take(index.to(self.like.device))
+        """The next ``count`` of them, round and round: consecutive Sobol points are spread evenly."""
+        index = (self.drawn + torch.arange(count, device=self.like.device)) % len(self.samples)
+        self.drawn += count
+        return self.samples.take(index)
 
 
 @torch.no_grad()
