@@ -38,7 +38,7 @@ class PeriodicMLP(nn.Module):
         modes: int = 3,
         width: int = 96,
         depth: int = 3,
-        activation: str = "tanh",
+        activation: str = "gelu",
         gated: bool = False,
         waves: int = 0,
         shift: float = 0.0,
