@@ -2,10 +2,13 @@ r"""Dubins' vehicle in a periodic plane: constant speed, only the turn rate is c
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from ocp_torch.errors import require_number
+from ocp_torch.problems.angles import TURN
 from ocp_torch.problems.planar import PlanarVehicle
 
 TARGET = (2.0, 2.0)
@@ -23,7 +26,8 @@ class Dubins(PlanarVehicle):
     `V*` by integration along any trajectory, so the shifted bound, and `F_M` with an `M >= sup mu*`, are lower bounds as
     before; simulated performance and the Lagrangian bound speak of the learned, smooth controller and need no optimum.
     What is lost is the a-priori bound on `u*` (Proposition 2), for which a least-squares `alpha` stands, and knowledge
-    of `mu*`.
+    of `mu*`. It is declared unbounded where the vehicle can turn faster than the discount forgets: the flow then gathers on
+    a circle about the target (an `inf` only keeps `F_M` out of the certificate).
     """
 
     def __init__(
@@ -44,6 +48,7 @@ class Dubins(PlanarVehicle):
         super().__init__(1, size, target, obstacles, clearance, *weights, discount, exponent, control_limit)
         self.speed = require_number("problem.speed", speed, above=0.0)
         self.turn_rate = require_number("problem.turn_rate", turn_rate, above=0.0)
+        self.occupation_bound = math.inf if TURN * self.turn_rate > self.discount else None
 
     def drift(self, x: Tensor) -> Tensor:
         ahead = self.speed / self.size * self.heading(x)
