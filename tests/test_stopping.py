@@ -211,7 +211,7 @@ class Holed(Circle):
 @pytest.mark.parametrize("stepper", ["simultaneous", "extragradient"])
 def test_what_is_not_finite_is_named_with_the_state_where_it_is(stepper):
     trainer = small("method=dual", "trainer.batch=256", f"stepper={stepper}")
-    trainer.problem = Holed()
+    trainer.problem = trainer.batches.problem = Holed()
     before = {n: t.clone() for n, t in trainer.fields.state_dict().items()}
     with pytest.raises(NonFiniteError, match=r"player 'value' .* at x = \[0\.2[3-6].*state cost") as error:
         trainer.fit(Silent())

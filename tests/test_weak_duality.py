@@ -129,7 +129,9 @@ def test_losses_are_the_numbers_of_the_certificate(name, seed, size):
     problem, sets = zoo.build(name), sets_of(name)[:2]
     fields, bounds = random_fields(problem, seed, size), bounds_of(name)
     mean = lambda objective, player: Estimate.of([float(objective.losses(fields, s)[player]) for s in sets]).value
-    F_M = lower_side(problem, fields.value, sets, bounds.M, ascents=1).F_M.value
+    # One set at a time: with several the certificate takes off what plane waves explain of their noise.
+    alone = [lower_side(problem, fields.value, [s], bounds.M, ascents=1).F_M.value for s in sets]
+    F_M = Estimate.of(alone).value
     assert mean(paper_dual(problem, bounds), "value") == pytest.approx(-F_M, rel=1e-9, abs=1e-9)
     J, G = upper_side(
         problem, fields.control_density, occupation_density(NETWORK, problem, fields, bounds), sets, bounds.C_V

@@ -37,11 +37,11 @@ def waves_of(x: Tensor, functions: list[Tensor], count: int, entries: int = 1) -
     non-zero entries."""
     dim = x.shape[1]
     if count == 0 or dim < entries or not functions:
-        return torch.zeros(0, dim)
-    left, right = candidate_parts(dim)
-    score = torch.zeros(len(left), len(right))
+        return torch.zeros(0, dim, dtype=torch.float32)
+    left, right = (k.float() for k in candidate_parts(dim))
+    score = torch.zeros(len(left), len(right), dtype=torch.float32)
     significant = torch.zeros(score.shape, dtype=torch.bool)
-    E_left, E_right = (torch.polar(torch.ones(()), -2.0 * math.pi * (x.float() @ k.T)) for k in (left, right))
+    E_left, E_right = (_wave(x.float() @ k.T) for k in (left, right))
     bar = math.log(score.numel() * len(functions)) + MARGIN
     for y in functions:
         # Under noise alone N |c|^2 is exponential with mean 1.
@@ -57,7 +57,12 @@ def waves_of(x: Tensor, functions: list[Tensor], count: int, entries: int = 1) -
             found.setdefault(tuple((wave * math.copysign(1.0, first)).tolist()))
         if len(found) == count:
             break
-    return torch.tensor(list(found)).reshape(-1, dim)
+    return torch.tensor(list(found), dtype=torch.float32).reshape(-1, dim)
+
+
+def _wave(turns: Tensor) -> Tensor:
+    """`e^{-2 pi i t}`."""
+    return torch.polar(torch.ones_like(turns), -2.0 * math.pi * turns)
 
 
 def candidate_parts(dim: int) -> tuple[Tensor, Tensor]:
@@ -88,7 +93,8 @@ def _channels(samples: Samples) -> list[Tensor]:
     for entries in (samples.a, samples.B.flatten(1)):
         spread = entries.float().std(dim=0)
         mix = (
-            torch.randn(entries.shape[1], MIXTURES, generator=generator) / torch.where(spread > 0, spread, 1.0)[:, None]
+            torch.randn(entries.shape[1], MIXTURES, generator=generator, dtype=torch.float32)
+            / torch.where(spread > 0, spread, 1.0)[:, None]
         )
         raw += list((entries.float() @ mix).T)
     channels = []
