@@ -26,7 +26,6 @@ class Budget:
     stage_steps: int
 
 
-ACTIVATION, LEARNING_RATE = "tanh", 1e-2
 # Kinks want Fourier modes, affordable in one and two dimensions; many dimensions want samples, and gates: products of tanh
 # learn terms that couple many coordinates several times faster.
 BUDGETS = (
@@ -38,8 +37,11 @@ BUDGETS = (
 )
 
 # Where mu* is unbounded the slack must be small everywhere, not on average: that wants more states at once, and longer.
-# Plain tanh networks then have steep spots that nobody visits, and the supremum does; gelu has fewer.
-LARGE_BATCH, MANY_WAVES, MANY_STEPS, GENTLE = 1024, 64, 1200, "gelu"
+LARGE_BATCH, MANY_WAVES, MANY_STEPS = 1024, 64, 1200
+# And no steep spots that nobody visits, but the supremum does: gelu leaves fewer than tanh, independent states fewer than
+# evenly spread ones.
+GENTLE_ACTIVATION, GENTLE_SAMPLER = "gelu", "uniform"
+ACTIVATION, SAMPLER, LEARNING_RATE = "tanh", "sobol", 1e-2
 
 
 def fill(config: dict, problem: Problem) -> dict:
@@ -48,9 +50,9 @@ def fill(config: dict, problem: Problem) -> dict:
     for name in ("model", "trainer", "optimizer", "certificate"):
         require_section(name, config.get(name))
     filled = copy.deepcopy(config)
-    activation = ACTIVATION
+    activation, sampler = ACTIVATION, SAMPLER
     if is_unbounded(problem):
-        activation = ACTIVATION if budget.gated else GENTLE
+        activation, sampler = ACTIVATION if budget.gated else GENTLE_ACTIVATION, GENTLE_SAMPLER
         budget = replace(
             budget,
             batch=max(budget.batch, LARGE_BATCH),
@@ -68,6 +70,7 @@ def fill(config: dict, problem: Problem) -> dict:
         ("trainer", "steps"): budget.steps,
         ("trainer", "batch"): budget.batch,
         ("optimizer", "lr"): LEARNING_RATE,
+        ("sampler", "name"): sampler,
         ("certificate", "stage", "steps"): budget.stage_steps,
     }
     for (*path, name), value in defaults.items():

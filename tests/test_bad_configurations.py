@@ -45,7 +45,7 @@ def leaves(node: dict, prefix: str = "") -> list[str]:
 
 GROUPS = {group.name: sorted(p.stem for p in group.glob("*.yaml")) for group in CONFIGS.iterdir() if group.is_dir()}
 DEFAULTS = {"problem": "circle", "method": "pd", "model": "mlp", "optimizer": "soap", "schedule": "cosine"}
-DEFAULTS |= {"stepper": "simultaneous", "averaging": "ema", "sampler": "sobol"}
+DEFAULTS |= {"stepper": "simultaneous", "averaging": "ema", "sampler": "default"}
 DEFAULTS |= {"trainer": "default", "certificate": "default"}
 FIELDS = [
     f"{group}.{field}"

@@ -24,7 +24,7 @@ from ocp_torch.fields.fields import VALUE
 from ocp_torch.objectives import Dual
 from ocp_torch.problems import Problem
 from ocp_torch.process import prepare
-from ocp_torch.samplers import SobolSampler, derive_seed, scrambled_sobol
+from ocp_torch.samplers import SAMPLERS, derive_seed, scrambled_sobol
 from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training import figures
 from ocp_torch.training.batches import Batches
@@ -67,8 +67,8 @@ def certify(
     steps = defaults["trainer"]["steps"] if train_steps is None else require_integer("train_steps", train_steps, 0)
     run = Run(problem_name(problem), "given", seed)
     if value is None and steps:
-        batch, lr = defaults["trainer"]["batch"], defaults["optimizer"]["lr"]
-        value = in_float64(train_value(problem, bounds, network, steps, batch, lr, seed)).value
+        batch, lr, sampler = defaults["trainer"]["batch"], defaults["optimizer"]["lr"], defaults["sampler"]["name"]
+        value = in_float64(train_value(problem, bounds, network, steps, batch, lr, sampler, seed)).value
         run = Run(problem_name(problem), "given", seed, steps, steps * batch)
     elif value is not None:
         value = value_of(value, problem)
@@ -82,13 +82,14 @@ def train_value(
     steps: int,
     batch: int,
     lr: float,
+    sampler: str,
     seed: int,
 ) -> Fields:
     """A `V` by the dual, with the defaults of a run."""
     fields = Fields.build(problem, (VALUE,), network, derive_seed(seed, JUDGE_STREAM, 0))
     objective = Dual(problem, bounds)
-    sampler = SobolSampler(problem.dim, derive_seed(seed, JUDGE_STREAM, 1), torch.float32)
-    batches = Batches(problem, fields, objective, sampler, batch, derive_seed(seed, JUDGE_STREAM, 2))
+    states = SAMPLERS[sampler](problem.dim, derive_seed(seed, JUDGE_STREAM, 1), torch.float32)
+    batches = Batches(problem, fields, objective, states, batch, derive_seed(seed, JUDGE_STREAM, 2))
     makers = {player: optimizer_maker("soap", lr, betas=(0.95, 0.95)) for player in objective.players}
     stepper = Simultaneous(fields, objective, makers, schedule_maker("cosine", steps))
     average = averaged(fields, decay=0.98)
