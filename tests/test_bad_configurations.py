@@ -16,7 +16,7 @@ from ocp_torch.launch import CONFIGS, launch
 from ocp_torch.training.start import prepare
 
 pytestmark = pytest.mark.usefixtures("quick_composition")
-EXAMPLES = int(os.environ.get("OCP_TORCH_EXAMPLES", "500"))
+EXAMPLES = int(os.environ.get("OCP_TORCH_EXAMPLES", "200"))
 
 
 def entered(*arguments: str) -> tuple[int, str, str]:
