@@ -9,10 +9,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ocp_torch.control_laws import zero_law
-from ocp_torch.pictures.scenes import Scene, scene
+from ocp_torch.pictures.scenes import Scene, projection, scene
 from ocp_torch.practice.metrics import random_starts
 from ocp_torch.practice.paths import Law, Path, simulate
-from ocp_torch.problems.arm import Arm
+from ocp_torch.problems.linkage import Linkage
 from ocp_torch.problems.pendulum import Pendulum
 from ocp_torch.problems.planar import PlanarVehicle
 from ocp_torch.problems.problem import Problem
@@ -26,14 +26,15 @@ STREAM, OSCILLATORS = 7, 24
 
 @dataclass(frozen=True)
 class Moving:
-    """Panels of a picture: for each its title, how it draws, and the path it draws."""
+    """Panels of a picture: for each its title, how it draws, and the path it draws; on axes of one ``projection``."""
 
     panels: list[tuple[str, Scene, Path]]
+    projection: str
 
     def draw(self, figure: Figure, frame: int) -> None:
         """All panels up to ``frame``, on a cleared ``figure``."""
         figure.clear()
-        axes = figure.subplots(1, len(self.panels), squeeze=False)[0]
+        axes = figure.subplots(1, len(self.panels), squeeze=False, subplot_kw={"projection": self.projection})[0]
         for one, (title, draw, path) in zip(axes, self.panels, strict=True):
             draw(one, path, frame)
             one.set_title(f"{title}  {one.get_title()}".strip(), fontsize="medium")
@@ -52,7 +53,7 @@ def starts_drawn(problem: Problem) -> tuple[int, bool]:
 
 
 @starts_drawn.register
-def _(problem: Arm) -> tuple[int, bool]:
+def _(problem: Linkage) -> tuple[int, bool]:
     return 3, True
 
 
@@ -72,9 +73,10 @@ def moving(problem: Problem, law: Law, seed: int = 0) -> Moving | None:
     duration = DURATION / problem.discount
     if apart:
         paths = [simulate(problem, law, x0[i : i + 1], duration, FRAMES) for i in range(count)]
-        return Moving([("", draw, path) for path in paths])
+        return Moving([("", draw, path) for path in paths], projection(problem))
     titles = {"controlled": law, "no control": zero_law(problem)}
-    return Moving([(t, draw, simulate(problem, each, x0, duration, FRAMES)) for t, each in titles.items()])
+    panels = [(t, draw, simulate(problem, each, x0, duration, FRAMES)) for t, each in titles.items()]
+    return Moving(panels, projection(problem))
 
 
 def motion(problem: Problem, law: Law, seed: int = 0) -> Figure | None:

@@ -9,18 +9,20 @@ import math
 from collections.abc import Callable
 from functools import singledispatch
 
+import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Wedge
 from torch import Tensor
 
 from ocp_torch.practice.paths import Path
-from ocp_torch.problems.arm import Arm
 from ocp_torch.problems.kuramoto import Kuramoto
+from ocp_torch.problems.linkage import Linkage
 from ocp_torch.problems.pendulum import Pendulum
 from ocp_torch.problems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.planar import PlanarVehicle
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.robot import RobotArm
 
 # Draws the path up to frame k.
 Scene = Callable[[Axes, Path, int], None]
@@ -34,6 +36,17 @@ def scene(problem: Problem) -> Scene | None:
     return None
 
 
+@singledispatch
+def projection(problem: Problem) -> str:
+    """Of the axes on which the scene of ``problem`` is drawn, by Matplotlib's name for it."""
+    return "rectilinear"
+
+
+@projection.register
+def _(problem: RobotArm) -> str:
+    return "3d"
+
+
 def _obstacles(axes: Axes, discs: list, clearance: float, period: float | None = None) -> None:
     shifts = [0.0] if period is None else [-period, 0.0, period]
     for x, y, radius in discs:
@@ -41,6 +54,16 @@ def _obstacles(axes: Axes, discs: list, clearance: float, period: float | None =
             for dy in shifts:
                 axes.add_patch(Circle((x + dx, y + dy), radius, color="0.45"))
                 axes.add_patch(Circle((x + dx, y + dy), radius + clearance, fill=False, color="0.7", linestyle=":"))
+
+
+def _balls(axes: Axes, balls: list, clearance: float) -> None:
+    """As `_obstacles`, in space."""
+    along, up = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 25), np.linspace(0.0, np.pi, 13))
+    sphere = np.stack([np.cos(along) * np.sin(up), np.sin(along) * np.sin(up), np.cos(up)])
+    for *centre, radius in balls:
+        surfaces = (np.reshape(centre, (3, 1, 1)) + r * sphere for r in (radius, radius + clearance))
+        axes.plot_surface(*next(surfaces), color="0.45", rstride=1, cstride=1, alpha=0.7)
+        axes.plot_wireframe(*next(surfaces), color="0.7", rstride=3, cstride=3, linewidth=0.5, linestyle=":")
 
 
 def _broken(track: Tensor, jump: float) -> Tensor:
@@ -52,19 +75,22 @@ def _broken(track: Tensor, jump: float) -> Tensor:
 
 
 @scene.register
-def arm_scene(problem: Arm) -> Scene:
-    """One trajectory: poses from light to dark, the way of the end effector, target and obstacles."""
-    reach = 1.08 * max(sum(problem.lengths), math.hypot(*problem.target))
+def arm_scene(problem: Linkage) -> Scene:
+    """One trajectory: poses from light to dark, the way of the tip, target and obstacles; in the plane or in space."""
+    base = [0.0] * len(problem.shoulder)
+    reach = 1.08 * max(problem.length, *(math.dist(problem.shoulder, place) for place in (problem.target, base)))
+    limits = {f"{name}lim": (at - reach, at + reach) for name, at in zip("xyz", problem.shoulder, strict=False)}
+    obstacles = {2: _obstacles, 3: _balls}[len(base)]
 
     def draw(axes: Axes, path: Path, k: int) -> None:
-        _obstacles(axes, problem.obstacles, problem.clearance)
+        obstacles(axes, problem.obstacles, problem.clearance)
         poses = problem.joints(path.states[: k + 1, 0])
         for j in range(0, k + 1, max(1, len(path.times) // GHOSTS)):
             axes.plot(*poses[j].T, "-", color="C0", alpha=0.15 + 0.35 * j / len(path.times))
         axes.plot(*poses[:, -1].T, "-", color="C1", linewidth=1.0)
         axes.plot(*poses[k].T, "o-", color="C0", linewidth=3.0, markersize=5)
         axes.plot(*problem.target, "*", color="C3", markersize=14)
-        axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="m", title=f"{path.times[k]:.2f} s")
+        axes.set(**limits, aspect="equal", xlabel="m", title=f"{path.times[k]:.2f} s")
 
     return draw
 

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from ocp_torch.practice.paths import Law
 from ocp_torch.problems.angles import TURN
-from ocp_torch.problems.arm import Arm
 from ocp_torch.problems.dubins import Dubins
 from ocp_torch.problems.kuramoto import Kuramoto
+from ocp_torch.problems.linkage import Linkage
 from ocp_torch.problems.pendulum import Pendulum
 from ocp_torch.problems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.problem import Problem
@@ -31,17 +31,14 @@ def classical_law(problem: Problem) -> Law | None:
 
 
 @classical_law.register
-def resolved_rate(problem: Arm) -> Law:
-    r"""`dtheta/dt = -k J^+ (p - target)`, `J^+` the damped pseudo-inverse (Whitney, 1969; Nakamura and Hanafusa, 1986)."""
-    damping = (DAMPING * sum(problem.lengths)) ** 2
+def resolved_rate(problem: Linkage) -> Law:
+    r"""`dtheta/dt = k J^+ (target - p)`, `J^+` the damped pseudo-inverse (Whitney, 1969; Nakamura and Hanafusa, 1986)."""
+    damping = (DAMPING * problem.length) ** 2 or 1.0  # a tip on the last of its joints does not move: J = 0
 
     def law(x: Tensor) -> Tensor:
-        joints = problem.joints(x)
-        lever = joints[:, -1:] - joints[:, :-1]
-        J = torch.stack([-lever[..., 1], lever[..., 0]], dim=1)  # (N, 2, n), metres per radian
-        error = problem.end_effector(x) - torch.as_tensor(problem.target).to(x)
-        square = J @ J.mT + damping * torch.eye(2).to(x)
-        rate = -REACH * (J.mT @ torch.linalg.solve(square, error.unsqueeze(-1))).squeeze(-1)
+        J, way = problem.jacobian(x), problem.to_target(x)
+        square = J @ J.mT + damping * torch.eye(way.shape[1]).to(x)
+        rate = REACH * (J.mT @ torch.linalg.solve(square, way.unsqueeze(-1))).squeeze(-1)
         return rate / (TURN * problem.speed)
 
     return law

@@ -10,9 +10,9 @@ from torch import Tensor
 from ocp_torch.control_laws import zero_law
 from ocp_torch.practice.classical import classical_law
 from ocp_torch.practice.paths import Law, Path, simulate
-from ocp_torch.problems.arm import Arm
 from ocp_torch.problems.dubins import Dubins
 from ocp_torch.problems.kuramoto import Kuramoto
+from ocp_torch.problems.linkage import Linkage
 from ocp_torch.problems.pendulum import Pendulum
 from ocp_torch.problems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.planar import PlanarVehicle
@@ -38,7 +38,7 @@ def admissible(problem: Problem, x: Tensor) -> Tensor:
     return torch.ones_like(x[:, 0], dtype=torch.bool)
 
 
-@admissible.register(Arm)
+@admissible.register(Linkage)
 @admissible.register(PlanarVehicle)
 def _(problem, x: Tensor) -> Tensor:
     return problem.gap(x) > problem.clearance
@@ -51,9 +51,9 @@ def _reaching(problem, path: Path, tolerance: float) -> dict[str, float]:
 
 
 @measure.register
-def _(problem: Arm, path: Path) -> dict[str, float]:
-    """Success: the end effector within 5 % of the arm's length of the target at the end, and no link ever in an obstacle."""
-    return _reaching(problem, path, REACHED * sum(problem.lengths))
+def _(problem: Linkage, path: Path) -> dict[str, float]:
+    """Success: the tip within 5 % of the arm's length of the target at the end, and no link ever in an obstacle."""
+    return _reaching(problem, path, REACHED * problem.length)
 
 
 @measure.register

@@ -2,23 +2,18 @@ r"""A planar arm of `n` revolute joints under joint-velocity control: reach a ta
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import require_number
-from ocp_torch.problems.angles import TURN, bump, to_radians, to_turns
-from ocp_torch.problems.arguments import require_numbers, require_obstacles
-from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.angles import TURN
+from ocp_torch.problems.arguments import require_numbers
+from ocp_torch.problems.linkage import Linkage
 
-# Points of a link at which the cost of obstacles is taken, at equal distances.
-POINTS_PER_LINK = 8
 TARGET = (0.2, 0.65)
 OBSTACLES = ((0.75, -0.4, 0.08),)
 
 
-class Arm(Problem):
+class Arm(Linkage):
     r"""`dx/dt = speed u` and `f = target_weight |p(x) - target|^2 + obstacle_weight sum_o (1 - prod_s (1 - b_o(r_s(x))))`.
 
     `x_i` is the angle of joint `i` against the link before it, in turns; the state space is exactly the torus and there is
@@ -47,22 +42,12 @@ class Arm(Problem):
         exponent: float = 2.0,
         control_limit: float | None = None,
     ) -> None:
-        super().__init__(dim=dim, discount=discount, exponent=exponent, control_limit=control_limit)
+        costs = (target, obstacles, clearance, target_weight, obstacle_weight)
+        super().__init__(dim, 2, *costs, speed, discount, exponent, control_limit)
         equal = [1.0 / self.dim] * self.dim
         self.lengths = equal if lengths is None else require_numbers("problem.lengths", lengths, self.dim, above=0.0)
-        self.target = require_numbers("problem.target", target, 2)
-        self.obstacles = require_obstacles("problem.obstacles", obstacles)
-        self.clearance = require_number("problem.clearance", clearance, above=0.0)
-        self.target_weight = require_number("problem.target_weight", target_weight, above=0.0)
-        self.obstacle_weight = require_number("problem.obstacle_weight", obstacle_weight, at_least=0.0)
-        self.speed = require_number("problem.speed", speed, above=0.0)
         self._lengths = torch.tensor(self.lengths, dtype=torch.float64)
-        self._target = torch.tensor(self.target, dtype=torch.float64)
-        self._discs = torch.tensor(self.obstacles, dtype=torch.float64).reshape(-1, 3)
-        self._along = torch.arange(1, POINTS_PER_LINK + 1, dtype=torch.float64) / POINTS_PER_LINK
-        farthest = sum(self.lengths) + math.hypot(*self.target)
-        self.state_cost_bound = self.target_weight * farthest**2 + self.obstacle_weight * len(self.obstacles)
-        self.occupation_bound = math.inf
+        self.stretch(sum(self.lengths), [0.0, 0.0])
 
     def joints(self, x: Tensor) -> Tensor:
         """Base, joints and end effector in metres, ``(N, n + 1, 2)``."""
@@ -70,49 +55,7 @@ class Arm(Problem):
         links = torch.stack([angle.cos(), angle.sin()], dim=-1) * self._like(x, "lengths", self._lengths).unsqueeze(-1)
         return torch.cat([links.new_zeros(len(x), 1, 2), links.cumsum(dim=1)], dim=1)
 
-    def end_effector(self, x: Tensor) -> Tensor:
-        """`p(x)` in metres, ``(N, 2)``."""
-        return self.joints(x)[:, -1]
-
-    def distance(self, x: Tensor) -> Tensor:
-        """From the end effector to the target, in metres, ``(N,)``."""
-        return (self.end_effector(x) - self._like(x, "target", self._target)).norm(dim=-1)
-
-    def gap(self, x: Tensor) -> Tensor:
-        """From the links to the nearest rim of an obstacle, in metres, ``(N,)``; negative inside, infinite without any."""
-        if not self.obstacles:
-            return torch.full_like(x[:, 0], math.inf)
-        discs = self._like(x, "discs", self._discs)
+    def jacobian(self, x: Tensor) -> Tensor:
         joints = self.joints(x)
-        start, link = joints[:, :-1].unsqueeze(2), joints.diff(dim=1).unsqueeze(2)
-        away = discs[:, :2] - start
-        nearest = ((away * link).sum(dim=-1) / link.square().sum(dim=-1)).clamp(0.0, 1.0)
-        distance = (away - nearest.unsqueeze(-1) * link).norm(dim=-1) - discs[:, 2]
-        return distance.flatten(1).amin(dim=1)
-
-    def state_cost(self, x: Tensor) -> Tensor:
-        joints = self.joints(x)
-        off = (joints[:, -1] - self._like(x, "target", self._target)).square().sum(dim=-1)
-        cost = self.target_weight * off
-        if not self.obstacles:
-            return cost
-        discs = self._like(x, "discs", self._discs)
-        along = self._like(x, "along", self._along).unsqueeze(-1)
-        points = joints[:, :-1].unsqueeze(2) + along * joints.diff(dim=1).unsqueeze(2)  # (N, n, points, 2)
-        square = (points.unsqueeze(-2) - discs[:, :2]).square().sum(dim=-1)
-        missed = (1.0 - bump(square, discs[:, 2] + self.clearance)).flatten(1, 2).prod(dim=1)  # (N, obstacles)
-        return cost + self.obstacle_weight * (1.0 - missed).sum(dim=-1)
-
-    def control_matrix(self, x: Tensor) -> Tensor:
-        return self.speed * super().control_matrix(x)
-
-    def control_divergence(self, x: Tensor) -> Tensor:
-        return torch.zeros_like(x)
-
-    def to_torus(self, angles: Tensor) -> Tensor:
-        """Joint angles in radians ``(N, n)`` as states."""
-        return to_turns(angles)
-
-    def from_torus(self, x: Tensor) -> Tensor:
-        """States as joint angles in [-pi, pi) radians, ``(N, n)``."""
-        return to_radians(x)
+        lever = joints[:, -1:] - joints[:, :-1]
+        return torch.stack([-lever[..., 1], lever[..., 0]], dim=1)
