@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from ocp_torch.errors import InputError
+from ocp_torch.pictures import motion
+from ocp_torch.practice import classical_law, metrics
 from ocp_torch.problems import Arm, RobotArm
 
 IDENTITY = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
@@ -34,6 +37,8 @@ URDF_TEXT = """<robot name="three">
   <joint name="rail" type="prismatic"> <parent link="tip"/> <child link="slide"/> <axis xyz="1 0 0"/>
     <limit lower="-1" upper="1" effort="1" velocity="1"/> </joint>
 </robot>"""
+
+ELBOW_AMONG_BALLS = dict(obstacles=[[0.3, -0.2, 0.5, 0.1]])
 
 
 @pytest.fixture
@@ -118,3 +123,34 @@ def test_wrong_arguments_are_refused():
         RobotArm(chain=PLANAR, obstacles="none")
     with pytest.raises(InputError, match=r"problem.obstacles\[0\]\[3\]"):
         RobotArm(chain=PLANAR, obstacles=[[0.1, 0.1, 0.1, -1.0]])
+
+
+@pytest.mark.parametrize("problem", [RobotArm(), Arm(dim=3, lengths=[0.5, 0.3, 0.1])], ids=["space", "plane"])
+def test_the_jacobian_is_the_slope_of_the_tip(problem):
+    x = states(problem.dim, 20)
+    slope = torch.func.vmap(torch.func.jacrev(lambda one: problem.end_effector(one[None])[0]))(x)
+    torch.testing.assert_close(problem.jacobian(x), slope / (2.0 * torch.pi))
+
+
+def test_the_gap_to_a_ball_is_what_points_along_the_links_say():
+    robot = RobotArm(**ELBOW_AMONG_BALLS)
+    joints = robot.joints(states(6, 50))
+    along = torch.linspace(0.0, 1.0, 2001, dtype=torch.float64).reshape(-1, 1)
+    points = joints[:, :-1, None] + along * joints.diff(dim=1)[:, :, None]
+    ball = torch.tensor(robot.obstacles[0], dtype=torch.float64)
+    expected = (points - ball[:3]).norm(dim=-1).flatten(1).amin(dim=1) - ball[3]
+    torch.testing.assert_close(robot.gap(states(6, 50)), expected, atol=1e-5, rtol=0.0)
+
+
+@pytest.mark.slow
+def test_the_resolved_rate_law_reaches_the_target_in_space_and_a_picture_shows_it(tmp_path):
+    robot = RobotArm(**ELBOW_AMONG_BALLS)
+    law = classical_law(robot)
+    found = metrics(robot, law, seed=1, starts=24)
+    assert found["classical"]["reached"] == 1.0
+    assert found["zero"]["reached"] < 0.2
+    figure = motion(robot, law)
+    assert {axes.name for axes in figure.axes} == {"3d"}
+    figure.savefig(tmp_path / "motion.png", dpi=40)
+    shades = Image.open(tmp_path / "motion.png").convert("L").getextrema()
+    assert shades[0] < 100 < 250 < shades[1]
