@@ -16,6 +16,9 @@ from torch import Tensor
 
 Field = Callable[[Tensor], Tensor]
 
+# States evaluated at once: what fits the cache is fastest.
+CHUNK = 1024
+
 
 def value_and_gradient(field: Field, x: Tensor) -> tuple[Tensor, Tensor]:
     """`V(x)` of shape ``(N,)`` and `grad V(x)` of shape ``(N, d)``."""
@@ -34,6 +37,13 @@ def value_and_gradient(field: Field, x: Tensor) -> tuple[Tensor, Tensor]:
             return value, torch.zeros_like(x)
         gradient = torch.autograd.grad(value, at, torch.ones_like(value), create_graph=again, materialize_grads=True)[0]
     return (value, gradient) if again else (value.detach(), gradient)
+
+
+@torch.no_grad()
+def chunked_gradient(field: Field, x: Tensor, chunk: int = CHUNK) -> tuple[Tensor, Tensor]:
+    """`V` and `grad V` at many states."""
+    pairs = [value_and_gradient(field, part) for part in x.split(chunk)]
+    return torch.cat([v for v, _ in pairs]), torch.cat([g for _, g in pairs])
 
 
 def value_and_jacobian(field: Field, x: Tensor) -> tuple[Tensor, Tensor]:

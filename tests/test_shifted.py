@@ -1,5 +1,7 @@
 """The lower bound that needs no `M`: the best multiple of `V`, shifted by the supremum of its slack."""
 
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -8,6 +10,7 @@ from hypothesis import strategies as st
 import zoo
 from ocp_torch.calculus import value_and_gradient
 from ocp_torch.certificate.estimate import replicated_samples
+from ocp_torch.certificate.mollified import DIRECTIONS, EVALUATIONS, Mollified
 from ocp_torch.certificate.shifted import TOP, SlackParts, climbed, scaled_by, slack_function
 from ocp_torch.certificate.sides import lower_side
 from ocp_torch.problems import Circle
@@ -59,11 +62,78 @@ def test_scaling_never_loses_and_never_passes_the_optimum(name, seed, size):
     assert found.shifted.value <= problem.exact_optimum + 6.0 * found.shifted.se + 1e-9
 
 
+@pytest.mark.slow
+@settings(max_examples=4)
+@given(**case)
+def test_averaging_never_loses_and_never_passes_the_optimum(name, seed, size):
+    problem = zoo.build(name)
+    sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
+    found = lower_side(problem, near(problem, seed, size), sets, 1.0, ascents=8, mollify=True)
+    assert found.best.bound >= found.own.bound
+    assert found.shifted.value <= problem.exact_optimum + 6.0 * found.shifted.se + 1e-9
+
+
+class Wave:
+    """`cos(2 pi k . x)`; it counts no state outside the unit cell."""
+
+    def __init__(self, wave: list[int]) -> None:
+        self.wave, self.outside = torch.tensor(wave, dtype=torch.float64), 0
+
+    def __call__(self, x):
+        self.outside += int(((x < 0.0) | (x >= 1.0)).sum())
+        return torch.cos(2.0 * math.pi * x @ self.wave)
+
+
+@pytest.mark.parametrize("dim", [1, 3, 12])
+def test_an_average_of_a_plane_wave_is_a_smaller_one(dim):
+    wave = Wave([(3 * i) % 5 - 2 for i in range(dim)])
+    averaged = Mollified(wave, dim, 0.03)
+    neighbours = averaged.offsets[1:]
+    assert len(neighbours) == 2 * min(dim, DIRECTIONS)
+    axes = neighbours[: len(neighbours) // 2]
+    torch.testing.assert_close(axes @ axes.T, 0.03**2 * torch.eye(len(axes), dtype=torch.float64))
+    torch.testing.assert_close(neighbours[len(axes) :], -axes)
+    x = torch.rand(40, dim, generator=torch.Generator().manual_seed(dim), dtype=torch.float64)
+    left = (1.0 + torch.cos(2.0 * math.pi * neighbours @ wave.wave).sum()) / (len(neighbours) + 1)
+    value, gradient = value_and_gradient(averaged, x)
+    torch.testing.assert_close(value, left * wave(x))
+    torch.testing.assert_close(averaged(x), value)
+    slope = -2.0 * math.pi * left * torch.sin(2.0 * math.pi * x @ wave.wave)
+    torch.testing.assert_close(gradient, slope.unsqueeze(-1) * wave.wave)
+    assert wave.outside == 0
+
+
+def test_a_narrow_spike_of_the_slack_is_averaged_out():
+    problem = Circle()
+    at = torch.tensor(0.3, dtype=torch.float64)
+    bump = lambda x: torch.exp(-((x[:, 0] - at) / 2e-3).square())
+    V = lambda x: problem.exact_value(x) + 2e-3 * bump(x)
+    sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
+    plain, averaged = (lower_side(problem, V, sets, 1.0, ascents=8, mollify=m) for m in (False, True))
+    assert plain.best.radius == 0.0 < averaged.best.radius
+    assert "averaged" in averaged.best.sentence
+    assert "averaged" not in plain.best.sentence
+    lost = problem.exact_optimum - torch.tensor([plain.shifted.value, averaged.shifted.value])
+    assert lost[1] < 0.7 * lost[0]
+    assert lost[1] >= -6.0 * averaged.shifted.se
+
+
+def test_large_sets_are_thinned_to_the_budget():
+    problem = zoo.build(zoo.FEW[0])
+    sets = replicated_samples(problem, 2**16, 8, seed=0, divergences=False)
+    averaged = Mollified(problem.exact_value, problem.dim, 0.01)
+    fewer = averaged.fitting(sets)
+    states = sum(len(s) for s in fewer) * len(averaged.offsets)
+    assert EVALUATIONS / 2 < states <= EVALUATIONS
+    assert len(fewer) == 8
+    torch.testing.assert_close(fewer[3].x, sets[3].x[: len(fewer[3])])
+
+
 @zoo.on(zoo.FEW)
 def test_a_value_function_of_the_wrong_size_is_put_right(problem):
     sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
     found = lower_side(problem, lambda x: 0.8 * problem.exact_value(x), sets, 1.0)
-    assert found.theta == pytest.approx(1.25, abs=0.02)
+    assert found.own.theta == pytest.approx(1.25, abs=0.02)
     assert found.shifted.value == pytest.approx(problem.exact_optimum, rel=5e-3, abs=6.0 * found.shifted.se)
 
 
@@ -79,7 +149,7 @@ def test_a_useless_value_function_still_gives_about_the_smallest_cost():
     sets = replicated_samples(problem, 512, 2, seed=0, divergences=False)
     rough = lower_side(problem, zoo.rough_network(1, 0, size=50.0), sets, 1.0)
     assert -1e-3 < rough.shifted.value < problem.exact_optimum
-    assert rough.theta < 0.1
+    assert rough.own.theta < 0.1
 
 
 class Negative(Circle):
@@ -91,5 +161,5 @@ def test_where_the_cost_is_negative_nothing_is_scaled():
     problem = Negative()
     sets = replicated_samples(problem, 512, 2, seed=0, divergences=False)
     found = lower_side(problem, zoo.rough_network(1, 0), sets, 1.0)
-    assert found.theta == 1.0
+    assert found.own.theta == 1.0
     assert found.shifted.value <= problem.exact_optimum - 0.1

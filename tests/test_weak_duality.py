@@ -14,7 +14,8 @@ from ocp_torch import calculus, formulas
 from ocp_torch.bounds import Bounds, resolve_bounds
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lagrangian import closed_loop_bounds
-from ocp_torch.certificate.sides import lower_side, slack_function, upper_side
+from ocp_torch.certificate.shifted import slack_function
+from ocp_torch.certificate.sides import lower_side, upper_side
 from ocp_torch.control_laws import CLOSED, NETWORK, occupation_density
 from ocp_torch.fields import Fields
 from ocp_torch.objectives import Dual, primal, saddle
@@ -203,7 +204,7 @@ def test_the_shifted_bound_undoes_a_constant_that_violates_the_constraint(proble
     ]
     change = found[1].shifted.value - found[0].shifted.value
     # Sampled, the mean of mu0 is not quite 1; what is left of that enters with the multiple of V that is shifted.
-    low, high = sorted(3.0 * (float(samples.mu0.mean()) - 1.0) * side.theta for side in found)
+    low, high = sorted(3.0 * (float(samples.mu0.mean()) - 1.0) * side.own.theta for side in found)
     assert low - 1e-6 <= change <= high + 1e-6
 
 

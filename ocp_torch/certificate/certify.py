@@ -12,6 +12,7 @@ import torch
 from torch import nn
 
 from ocp_torch.bounds import Bounds
+from ocp_torch.calculus import CHUNK
 from ocp_torch.certificate.assumptions import Met, check_assumptions
 from ocp_torch.certificate.certificate import Certificate, Run
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
@@ -23,7 +24,7 @@ from ocp_torch.certificate.recorded import certify_recorded
 from ocp_torch.certificate.regularity import largest_jump
 from ocp_torch.certificate.rigorous import RigorousBound, proved_lower
 from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.certificate.sides import CHUNK, LowerSide, lower_side, upper_side
+from ocp_torch.certificate.sides import LowerSide, lower_side, upper_side
 from ocp_torch.certificate.stage import fit_closed_loop
 from ocp_torch.certificate.wellposed import WellPosed, check_problem
 from ocp_torch.control_laws import CLOSED, ControlLaw, admissible_density, control_laws, occupation_density, zero_law
@@ -78,7 +79,7 @@ def certify_fields(
     few = replicated_samples(problem, max(1, settings.points // part), count, seed, divergences=True)
     if has_value:
         sets = replicated_samples(problem, settings.points, count, seed, divergences=False)
-        lower = lower_side(problem, fields.value, sets, bounds.M, settings.ascents)
+        lower = lower_side(problem, fields.value, sets, bounds.M, settings.ascents, settings.mollifies(bounds))
     proved, proof_notes = proved_lower(problem, fields.value, lower) if settings.rigorous and lower else (None, [])
     posed = check_problem(problem, sets if has_value else few)
     laws = control_laws(occupation, problem, fields, bounds)
@@ -230,7 +231,7 @@ def searches_of(
     lower: LowerSide | None, stage: ClosedLoopBounds | None, proved: RigorousBound | None = None
 ) -> list[str]:
     """How each supremum was found."""
-    found = {f"sup Q of {lower.theta:.4g} V": lower.largest_slack} if lower else {}
+    found = {lower.best.sentence: lower.best.largest} if lower else {}
     if stage is not None:
         found |= {"eps_hi": stage.eps_hi, "eps_lo": stage.eps_lo}
     return ([proved.sentence] if proved else []) + [

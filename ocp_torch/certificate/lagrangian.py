@@ -27,9 +27,9 @@ import torch
 from torch import Tensor
 
 from ocp_torch import formulas
-from ocp_torch.calculus import Field
+from ocp_torch.calculus import CHUNK, Field, chunked_gradient
 from ocp_torch.certificate.estimate import Estimate, integral
-from ocp_torch.certificate.sides import CHUNK, chunked_gradient, slack_function
+from ocp_torch.certificate.shifted import slack_function
 from ocp_torch.extremum import Extremum, minimiser, supremum
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.samples import Samples

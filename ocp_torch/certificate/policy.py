@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from ocp_torch.bounds import Bounds
-from ocp_torch.calculus import Field
+from ocp_torch.calculus import CHUNK, Field
 from ocp_torch.certificate.assumptions import check_assumptions
 from ocp_torch.certificate.black_box import BlackBox
 from ocp_torch.certificate.certificate import Certificate, Run
@@ -23,7 +23,7 @@ from ocp_torch.certificate.estimate import integral, replicated_samples
 from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.performance import simulate_performance
 from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.certificate.sides import CHUNK, lower_side
+from ocp_torch.certificate.sides import lower_side
 from ocp_torch.certificate.stage import fit_closed_loop
 from ocp_torch.certificate.wellposed import check_problem
 from ocp_torch.control_laws import ControlLaw, ValueLaw, zero_law
@@ -61,7 +61,9 @@ def certify_policy(
         problem, law, number, count, seed, value, initial, settings.horizon, settings.tolerance
     )
     number, perf, zero, given, best = settings.trajectories, {}, None, None, None
-    lower = lower_side(problem, value, wide, bounds.M, ascents) if value is not None else None
+    lower = None
+    if value is not None:
+        lower = lower_side(problem, value, wide, bounds.M, ascents, settings.mollifies(bounds))
     if number:
         initial = [integral(s, own(s.x) * s.mu0) for s in wide] if own is not None else None
         given = simulate(law, number, own, initial)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ocp_torch import calculus, formulas
 from ocp_torch.bounds import ESTIMATED, Bounds
+from ocp_torch.calculus import CHUNK, chunked_gradient
 from ocp_torch.certificate.assumptions import Met, check_assumptions
 from ocp_torch.certificate.certificate import Certificate, Run
 from ocp_torch.certificate.estimate import Estimate, integral
@@ -25,7 +26,6 @@ from ocp_torch.certificate.lagrangian import Terms, best_multiples
 from ocp_torch.certificate.raising import raised
 from ocp_torch.certificate.regularity import largest_jump
 from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.certificate.sides import CHUNK, chunked_gradient
 from ocp_torch.certificate.stage import fit_closed_loop
 from ocp_torch.certificate.wellposed import WellPosed
 from ocp_torch.control_cost import PowerCost

@@ -23,7 +23,8 @@ from torch import Tensor, nn
 from ocp_torch.certificate.activations import SERIES
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.network_model import network_model
-from ocp_torch.certificate.sides import LowerSide, slack_function
+from ocp_torch.certificate.shifted import slack_function
+from ocp_torch.certificate.sides import LowerSide
 from ocp_torch.enclosure import contradiction
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.extremum import supremum
@@ -265,9 +266,9 @@ def _conclude(slack, sampled_slack, means, radii, count, theta, seconds, complet
 
 
 def proved_lower(problem: Problem, value: nn.Module, lower: LowerSide) -> tuple[RigorousBound | None, list[str]]:
-    """The proved counterpart of ``lower.shifted``, or a warning that says why there is none."""
+    """The proved counterpart of ``lower.own``, or a warning that says why there is none."""
     why = obstacle(problem, value)
     if why is not None:
         return None, [f"no rigorous lower bound: {why}."]
-    bound = rigorous_lower_bound(problem, value, theta=lower.theta, sampled_slack=lower.largest_slack.value)
+    bound = rigorous_lower_bound(problem, value, theta=lower.own.theta, sampled_slack=lower.own.largest.value)
     return bound, [] if bound else ["no rigorous lower bound: nothing finite was proved within the budget of cells."]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from ocp_torch.bounds import Bounds
 from ocp_torch.certificate.stage import StageSettings
 from ocp_torch.errors import require_choice, require_flag, require_integer, require_number
 
@@ -19,6 +20,7 @@ class CertificateSettings:
     replicates: int = 8  # independent randomised point sets behind each standard error
     trajectories: int = 256  # simulated starts per replicate; 0 skips every simulation
     ascents: int = 32  # local ascents from the worst sampled states
+    mollify: bool | None = None  # average V over neighbours for the bound without M; None: where mu* is unbounded
     occupation_states: int = 144  # where the supremum of the occupation density is looked for; 0 skips it
     rigorous: bool = False  # a lower bound proved over cells, in one and two dimensions: a second, or up to two minutes
     confidence: float = 0.95  # how often an interval covers the truth, by Student's t over the replicates
@@ -31,8 +33,14 @@ class CertificateSettings:
         require_integer("certificate.replicates", self.replicates, 2)
         require_integer("certificate.trajectories", self.trajectories, 0)
         require_integer("certificate.ascents", self.ascents, 1)
+        if self.mollify is not None:
+            require_flag("certificate.mollify", self.mollify)
         require_integer("certificate.occupation_states", self.occupation_states, 0)
         require_flag("certificate.rigorous", self.rigorous)
         require_number("certificate.confidence", self.confidence, above=0.0, at_most=0.999999)
         require_number("certificate.tolerance", self.tolerance, above=0.0)
         require_choice("certificate.horizon", self.horizon, (TRUNCATED, RANDOM))
+
+    def mollifies(self, bounds: Bounds) -> bool:
+        """Whether the bound without `M` is sought among averages of `V` too, for a problem of these ``bounds``."""
+        return bounds.unbounded if self.mollify is None else self.mollify

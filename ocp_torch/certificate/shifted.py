@@ -14,7 +14,9 @@ import torch
 from torch import Tensor
 
 from ocp_torch import calculus, formulas
-from ocp_torch.calculus import Field
+from ocp_torch.calculus import Field, chunked_gradient
+from ocp_torch.certificate.control_variate import integrals
+from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.control_cost import PowerCost
 from ocp_torch.extremum import Extremum, minimiser, supremum
 from ocp_torch.problems.problem import Problem
@@ -29,6 +31,7 @@ class SlackParts:
     """What the slack of every `theta V` at sampled states is made of."""
 
     x: Tensor  # (N, d)
+    initial: Tensor  # (N,) V mu0
     value: Tensor  # (N,) V - grad V . a / rho
     f: Tensor  # (N,)
     push: Tensor  # (N, m) -B^T grad V / rho
@@ -37,19 +40,62 @@ class SlackParts:
     @classmethod
     def of(cls, samples: Samples, value: Tensor, gradient: Tensor, cost: PowerCost, rho: float) -> SlackParts:
         transported = value - formulas.along(samples, gradient) / rho
-        return cls(samples.x, transported, samples.f, -formulas.pull_back(samples, gradient) / rho, cost)
+        push = -formulas.pull_back(samples, gradient) / rho
+        return cls(samples.x, value * samples.mu0, transported, samples.f, push, cost)
 
     @staticmethod
     def join(parts: list[SlackParts]) -> SlackParts:
-        names = ("x", "value", "f", "push")
+        names = ("x", "initial", "value", "f", "push")
         return SlackParts(*(torch.cat([getattr(p, n) for p in parts]) for n in names), parts[0].cost)
-
-    def take(self, index: Tensor) -> SlackParts:
-        return SlackParts(self.x[index], self.value[index], self.f[index], self.push[index], self.cost)
 
     def slack(self, theta: float) -> Tensor:
         """`Q_{theta V}`, ``(N,)``."""
         return theta * self.value - self.f + self.cost.conjugate(theta * self.push)
+
+
+def slack_parts(problem: Problem, value: Field, sets: list[Samples]) -> list[SlackParts]:
+    """The parts on each of ``sets``."""
+    evaluated = [(s, *chunked_gradient(value, s.x)) for s in sets]
+    return [SlackParts.of(s, v, g, problem.control_cost, problem.discount) for s, v, g in evaluated]
+
+
+@dataclass(frozen=True)
+class Shift:
+    """`E[theta W mu0] - sup Q_{theta W}`, for `W` the average of `V` at ``radius``, or `V` itself where that is 0."""
+
+    theta: float
+    largest: Extremum
+    initial: list[float]  # E[W mu0] per set
+    radius: float = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        value: Field,
+        sets: list[Samples],
+        parts: list[SlackParts],
+        ascents: int,
+        radius: float = 0.0,
+    ) -> Shift:
+        """The best multiple of ``value``, whose ``parts`` on ``sets`` are known."""
+        initial = integrals([samples.x for samples in sets], [p.initial for p in parts])
+        theta, largest = best_shift(problem, value, SlackParts.join(parts), sum(initial) / len(initial), ascents)
+        return cls(theta, largest, initial, radius)
+
+    @property
+    def estimate(self) -> Estimate:
+        """The bound; a negative supremum shifts `W` up."""
+        return Estimate.of([self.theta * e - self.largest.value for e in self.initial])
+
+    @property
+    def bound(self) -> float:
+        return self.theta * sum(self.initial) / len(self.initial) - self.largest.value
+
+    @property
+    def sentence(self) -> str:
+        """What the slack is of."""
+        return f"sup Q of {self.theta:.4g} V" + (f", averaged {self.radius:.2g} around," if self.radius else "")
 
 
 def slack_function(problem: Problem, value: Field):

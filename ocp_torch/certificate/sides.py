@@ -5,33 +5,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from ocp_torch import calculus, formulas
-from ocp_torch.calculus import Field
-from ocp_torch.certificate.control_variate import integrals
+from ocp_torch.calculus import CHUNK, Field
 from ocp_torch.certificate.estimate import Estimate, integral
-from ocp_torch.certificate.shifted import SlackParts, best_shift, slack_function
+from ocp_torch.certificate.mollified import mollified_shift
+from ocp_torch.certificate.shifted import Shift, slack_parts
 from ocp_torch.control_laws import Density
-from ocp_torch.extremum import Extremum
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
-
-__all__ = ["CHUNK", "LowerSide", "chunked_gradient", "lower_side", "slack_function", "upper_side"]
-
-# States evaluated at once: what fits the cache is fastest.
-CHUNK = 1024
 
 
 @dataclass(frozen=True)
 class LowerSide:
-    """`F_M` rests on `M`, `shifted` on the supremum of the slack of `theta V`; both on per-set `E[V mu0]`, `E[max(Q, 0)]`."""
+    """`F_M` rests on `M` and the per-set `E[V mu0]` and `E[max(Q, 0)]`; ``own`` and ``best`` on suprema of slack.
+
+    ``own`` is the shifted bound of a multiple of `V` itself, ``best`` that or the one of an average of `V`.
+    """
 
     M: float
     initial: list[float]
     violation: list[float]
-    theta: float
-    largest_slack: Extremum
+    own: Shift
+    best: Shift
 
     @property
     def F_M(self) -> Estimate:
@@ -39,22 +35,20 @@ class LowerSide:
 
     @property
     def shifted(self) -> Estimate:
-        """`E[theta V mu0] - sup Q_{theta V}`; a negative supremum shifts `V` up."""
-        return Estimate.of([self.theta * e - self.largest_slack.value for e in self.initial])
+        return self.best.estimate
 
 
-def lower_side(problem: Problem, value: Field, sets: list[Samples], M: float, ascents: int = 32) -> LowerSide:
-    r"""`F_M(V) = E[V mu0 - M max(Q, 0)]` (section 4.1) and the shifted bound (`ocp_torch.certificate.shifted`)."""
-    violation, started, pieces = [], [], []
-    for samples in sets:
-        v, gradient = chunked_gradient(value, samples.x)
-        parts = SlackParts.of(samples, v, gradient, problem.control_cost, problem.discount)
-        started.append(v * samples.mu0)
-        violation.append(integral(samples, parts.slack(1.0).clamp_min(0.0)))
-        pieces.append(parts)
-    initial = integrals([samples.x for samples in sets], started)
-    theta, largest = best_shift(problem, value, SlackParts.join(pieces), sum(initial) / len(initial), ascents)
-    return LowerSide(M, initial, violation, theta, largest)
+def lower_side(
+    problem: Problem, value: Field, sets: list[Samples], M: float, ascents: int = 32, mollify: bool = False
+) -> LowerSide:
+    r"""`F_M(V) = E[V mu0 - M max(Q, 0)]` (section 4.1) and the shifted bound (`ocp_torch.certificate.shifted`); of averages
+    of `V` too if ``mollify`` (`ocp_torch.certificate.mollified`), which takes many times as long."""
+    parts = slack_parts(problem, value, sets)
+    violation = [integral(s, p.slack(1.0).clamp_min(0.0)) for s, p in zip(sets, parts, strict=True)]
+    own = Shift.of(problem, value, sets, parts, ascents)
+    averaged = mollified_shift(problem, value, sets, ascents) if mollify else None
+    best = averaged if averaged is not None and averaged.bound > own.bound else own
+    return LowerSide(M, own.initial, violation, own, best)
 
 
 def upper_side(
@@ -90,10 +84,3 @@ def _upper_integrands(problem, control_density, occupation, samples: Samples, C_
     mu, derivative = calculus.directional_derivative(occupation, samples.x, samples.a)
     residual = inflow - mu - (mu * div_a + derivative) / rho
     return formulas.primal_integrand(samples, w, mu, residual, cost, C_V), None
-
-
-@torch.no_grad()
-def chunked_gradient(value: Field, x: Tensor, chunk: int = CHUNK) -> tuple[Tensor, Tensor]:
-    """`V` and `grad V` at many states."""
-    pairs = [calculus.value_and_gradient(value, part) for part in x.split(chunk)]
-    return torch.cat([v for v, _ in pairs]), torch.cat([g for _, g in pairs])

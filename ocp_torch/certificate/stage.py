@@ -10,9 +10,8 @@ import torch
 
 from ocp_torch import calculus, formulas
 from ocp_torch.bounds import Bounds
-from ocp_torch.calculus import Field
+from ocp_torch.calculus import CHUNK, Field
 from ocp_torch.certificate.lagrangian import MULTIPLES, Terms
-from ocp_torch.certificate.sides import CHUNK
 from ocp_torch.control_laws import ControlLaw
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.extremum import minimiser

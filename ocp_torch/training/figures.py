@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ocp_torch.bounds import Bounds
 from ocp_torch.certificate.certify import in_float64
-from ocp_torch.certificate.sides import slack_function
+from ocp_torch.certificate.shifted import slack_function
 from ocp_torch.certificate.simulation import rate_at
 from ocp_torch.control_laws import NETWORK, control_laws, occupation_density
 from ocp_torch.extremum import batched

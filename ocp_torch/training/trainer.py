@@ -41,6 +41,7 @@ QUICK = CertificateSettings(
     replicates=4,
     trajectories=16,
     ascents=8,
+    mollify=False,
     occupation_states=0,
     tolerance=5e-4,
     stage=StageSettings(steps=0),
