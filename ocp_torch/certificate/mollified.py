@@ -14,12 +14,14 @@ from torch import Tensor
 
 from ocp_torch import calculus
 from ocp_torch.calculus import Field
-from ocp_torch.certificate.shifted import Shift, slack_parts
+from ocp_torch.certificate.shifted import Shift, SlackParts, slack_parts
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
 
-# Radii that are tried, in turns, until so many in a row are worse than the best; on so many states in all.
-RADII, PATIENCE, TRIALS = tuple(2.0**-k for k in range(8, 3, -1)), 2, 4096
+# Radii, and how many of them are tried on all states at most.
+RADII, TRIALS = tuple(2.0 ** (-0.5 * k) for k in range(15, 8, -1)), 3
+# Before, all are tried on a few of the states, and on the worst for V itself, beside which its averages are worst too.
+FEW, WORST, FEW_ASCENTS = 2048, 2048, 8
 # Directions at most along which neighbours lie, and evaluations of V at most.
 DIRECTIONS, EVALUATIONS = 8, 2**20
 
@@ -58,20 +60,36 @@ class Mollified:
         return [samples.take(slice(0, count)) for samples in sets]
 
 
-def mollified_shift(problem: Problem, value: Field, sets: list[Samples], ascents: int) -> Shift | None:
-    """The shifted bound of ``value`` averaged at the radius that looks best on the first states of ``sets``; `None` where
-    ``value`` itself does."""
-    first = [samples.take(slice(0, max(1, TRIALS // len(sets)))) for samples in sets]
-    best, worse = Shift.of(problem, value, first, slack_parts(problem, value, first), ascents), 0
-    for radius in RADII:
-        tried = _shift(problem, value, radius, first, ascents)
-        best, worse = (tried, 0) if tried.bound > best.bound else (best, worse + 1)
-        if worse == PATIENCE:
+def mollified_shift(
+    problem: Problem, value: Field, sets: list[Samples], parts: list[SlackParts], ascents: int, own: Shift
+) -> Shift:
+    """The best shifted bound that was found of ``value`` averaged; ``own``, that of ``value`` itself, where none is better.
+
+    On few states a bound is too high, never too low: the radius that looks best on few is tried on all, until one tried on
+    all is better than the others look. ``parts`` are those of ``value``.
+    """
+    slack = SlackParts.join(parts).slack(own.theta)
+    worst = Samples.concatenate(sets).take(slack.topk(min(WORST, len(slack))).indices)
+    few = [samples.take(slice(0, max(1, FEW // len(sets)))) for samples in sets]
+    on_few = lambda radius: _shift(problem, value, radius, few, worst, min(ascents, FEW_ASCENTS)).bound
+    looks = {radius: on_few(radius) for radius in RADII}
+    best = own
+    for _ in range(TRIALS):
+        radius = max(looks, key=looks.get)
+        if looks[radius] <= best.bound:
             break
-    return _shift(problem, value, best.radius, sets, ascents) if best.radius else None
+        tried = _shift(problem, value, radius, sets, worst, ascents)
+        best = max(best, tried, key=lambda shift: shift.bound)
+        found = problem.samples(tried.largest.x.unsqueeze(0), divergences=False)
+        worst = Samples.concatenate([worst, found])
+        looks = {r: on_few(r) for r, look in looks.items() if r != radius and look > best.bound}
+        if not looks:
+            break
+    return best
 
 
-def _shift(problem: Problem, value: Field, radius: float, sets: list[Samples], ascents: int) -> Shift:
+def _shift(problem: Problem, value: Field, radius: float, sets: list[Samples], worst: Samples, ascents: int) -> Shift:
     averaged = Mollified(value, problem.dim, radius)
     sets = averaged.fitting(sets)
-    return Shift.of(problem, averaged, sets, slack_parts(problem, averaged, sets), ascents, radius)
+    *parts, beside = slack_parts(problem, averaged, [*sets, worst])
+    return Shift.of(problem, averaged, sets, parts, ascents, radius, beside)

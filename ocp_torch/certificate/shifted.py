@@ -77,10 +77,12 @@ class Shift:
         parts: list[SlackParts],
         ascents: int,
         radius: float = 0.0,
+        beside: SlackParts | None = None,
     ) -> Shift:
-        """The best multiple of ``value``, whose ``parts`` on ``sets`` are known."""
+        """The best multiple of ``value``, whose ``parts`` on ``sets`` are known; the supremum is sought ``beside`` too."""
         initial = integrals([samples.x for samples in sets], [p.initial for p in parts])
-        theta, largest = best_shift(problem, value, SlackParts.join(parts), sum(initial) / len(initial), ascents)
+        everywhere = SlackParts.join(parts if beside is None else [*parts, beside])
+        theta, largest = best_shift(problem, value, everywhere, sum(initial) / len(initial), ascents)
         return cls(theta, largest, initial, radius)
 
     @property

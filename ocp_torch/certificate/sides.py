@@ -46,8 +46,7 @@ def lower_side(
     parts = slack_parts(problem, value, sets)
     violation = [integral(s, p.slack(1.0).clamp_min(0.0)) for s, p in zip(sets, parts, strict=True)]
     own = Shift.of(problem, value, sets, parts, ascents)
-    averaged = mollified_shift(problem, value, sets, ascents) if mollify else None
-    best = averaged if averaged is not None and averaged.bound > own.bound else own
+    best = mollified_shift(problem, value, sets, parts, ascents, own) if mollify else own
     return LowerSide(M, own.initial, violation, own, best)
 
 
