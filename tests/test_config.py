@@ -145,6 +145,7 @@ WRONG = [
     "certificate.replicates=1",
     "certificate.trajectories=-1",
     "certificate.ascents=0",
+    "certificate.mollify=maybe",
     "certificate.stage=3",
     "certificate.stage.steps=-1",
     "certificate.stage.lr=0",

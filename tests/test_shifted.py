@@ -1,6 +1,7 @@
 """The lower bound that needs no `M`: the best multiple of `V`, shifted by the supremum of its slack."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,9 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import zoo
+from ocp_torch.bounds import resolve_bounds
 from ocp_torch.calculus import value_and_gradient
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.mollified import DIRECTIONS, EVALUATIONS, Mollified
+from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.shifted import TOP, SlackParts, climbed, scaled_by, slack_function
 from ocp_torch.certificate.sides import lower_side
 from ocp_torch.problems import Circle
@@ -116,6 +119,20 @@ def test_a_narrow_spike_of_the_slack_is_averaged_out():
     lost = problem.exact_optimum - torch.tensor([plain.shifted.value, averaged.shifted.value])
     assert lost[1] < 0.7 * lost[0]
     assert lost[1] >= -6.0 * averaged.shifted.se
+
+
+@pytest.mark.parametrize(
+    ("mollify", "unbounded", "expected"),
+    [
+        (None, True, True),
+        (None, False, False),
+        (True, False, True),
+        (False, True, False),
+    ],
+)
+def test_averages_are_tried_where_no_M_will_do_or_somebody_says_so(mollify, unbounded, expected):
+    bounds = replace(resolve_bounds(Circle()), unbounded=unbounded)
+    assert CertificateSettings(mollify=mollify).mollifies(bounds) is expected
 
 
 def test_large_sets_are_thinned_to_the_budget():
