@@ -1,10 +1,10 @@
 r"""The shifted bound of `V` averaged over neighbours, whose slack has no narrow spikes.
 
 The slack `Q` is convex in `(V, grad V)` at each state, so that for data that do not vary the slack of an average is at most
-the average of slacks (Jensen); data that vary over the radius `h` add an error of order `h^2` where `grad V` does not, of
-order `h` elsewhere. Networks overshoot beside kinks, in spikes a few thousandths of a turn wide with deep negative slack
-around: averaged, they are gone, and hardly anything else changes. A subsolution mollified is how the theory of viscosity
-solutions proves comparison for convex Hamiltonians (Barron and Jensen, 1990).
+the average of slacks (Jensen); data that vary add an error of order `h^2` in the radius `h` where `V` is smooth, of order
+`h` across kinks. Networks overshoot beside kinks, in spikes a few thousandths of a turn wide with deep negative slack
+around: averaged, they are gone, and hardly anything else changes. That a subsolution mollified is one but for such errors
+is how the theory of viscosity solutions treats convex Hamiltonians (Barron and Jensen, 1990).
 """
 
 from __future__ import annotations
