@@ -18,7 +18,7 @@ from ocp_torch.problems import Arm, Circle, Unicycle
 BETTER = {
     "arm n=2": ("success", True),
     "unicycle": ("success", True),
-    "dubins": ("success", True),
+    "dubins": ("distance", False),
     "pendulum": ("upright", True),
     "kuramoto n=3": ("order_after", True),
     "kuramoto desynchronise": ("order_after", False),

@@ -18,11 +18,11 @@ from ocp_torch.problems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.planar import PlanarVehicle
 from ocp_torch.problems.problem import Problem
 
-STARTS, STEPS = 256, 240
+STARTS, STEPS = 1024, 240
 # The time of a trial in units of 1 / rho; what the discount still sees after it is e^-8.
 TRIAL = 8.0
-# What counts as reached, relative to the arm's length or the period of the plane; as upright, in rad and rad/s; as near.
-REACHED, NEAR = 0.05, 0.25
+# What counts as reached, relative to the arm's length or the period of the plane; as upright, in rad and rad/s.
+REACHED = 0.05
 UPRIGHT = (0.2, 0.5)
 
 
@@ -64,11 +64,10 @@ def _(problem: PlanarVehicle, path: Path) -> dict[str, float]:
 
 @measure.register
 def _(problem: Dubins, path: Path) -> dict[str, float]:
-    """It cannot stop. Success: a mean distance of at most a quarter of the period late on, and never in an obstacle."""
-    away = path.each(problem.distance, path.late()).mean(dim=0)
+    """It cannot stop: the mean distance from the target late on, in metres; and how many were ever in an obstacle."""
+    away = path.each(problem.distance, path.late())
     crossed = (path.each(problem.gap) < 0.0).any(dim=0)
-    near = away <= NEAR * problem.size
-    return {"success": _part(near & ~crossed), "distance": float(away.mean()), "crossed": _part(crossed)}
+    return {"distance": float(away.mean()), "crossed": _part(crossed)}
 
 
 @measure.register(Kuramoto)
