@@ -50,8 +50,11 @@ def fill(config: dict, problem: Problem) -> dict:
     for name in ("model", "trainer", "optimizer", "certificate"):
         require_section(name, config.get(name))
     filled = copy.deepcopy(config)
-    activation, sampler = ACTIVATION, SAMPLER
+    activation, sampler, of_method = ACTIVATION, SAMPLER, {}
     if is_unbounded(problem):
+        if (config.get("method") or {}).get("name") == "pd" and config["trainer"].get("batch") is None:
+            # The larger batch is for the supremum of the slack, which the density player knows nothing of.
+            of_method = {("method", "density_batch"): budget.batch}
         activation, sampler = ACTIVATION if budget.gated else GENTLE_ACTIVATION, GENTLE_SAMPLER
         budget = replace(
             budget,
@@ -72,6 +75,7 @@ def fill(config: dict, problem: Problem) -> dict:
         ("optimizer", "lr"): LEARNING_RATE,
         ("sampler", "name"): sampler,
         ("certificate", "stage", "steps"): budget.stage_steps,
+        **of_method,
     }
     for (*path, name), value in defaults.items():
         # The table's sizes are those of perceptrons; a linear model chooses its own.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -68,6 +68,13 @@ class Samples:
     def take(self, index: Tensor | slice) -> Samples:
         """The samples at the rows ``index``."""
         return Samples(**{k: None if v is None else v[index] for k, v in self._columns()})
+
+    def take_weighted(self, most: int | None = None) -> tuple[Samples, Tensor]:
+        """Those that carry weight, the first ``most`` of them, and their rows; `mean` estimates the same integrals."""
+        rows = self.weight.nonzero().squeeze(-1)
+        part = len(rows) / len(self)
+        chosen = self.take(rows[:most])
+        return replace(chosen, weight=part * chosen.weight, attention=None), rows[:most]
 
     def to(self, like: Tensor) -> Samples:
         """The samples in the precision and on the device of ``like``."""

@@ -1,5 +1,7 @@
 """The augmented saddle: the truth is an equilibrium, whatever the weights; and what is left where divergences are not."""
 
+import math
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -8,6 +10,7 @@ from torch import nn
 
 import zoo
 from ocp_torch.bounds import resolve_bounds
+from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.objectives import primal, saddle
 from ocp_torch.objectives.saddle import AugmentedSaddle, Saddle
@@ -93,6 +96,21 @@ def test_the_density_player_rests_during_the_warm_start_and_asks_for_no_divergen
     assert set(objective.losses(exact_fields(problem), samples)) == {"value"}
     objective.progress = 0.5
     assert objective.needs_divergences
+
+
+def test_the_density_player_works_on_states_that_carry_weight_and_on_so_many_at_most():
+    problem = Manufactured(dim=2)
+    drawn, visited = (Samples.of(problem, scrambled_sobol(n, 2, n, torch.float64)) for n in (96, 32))
+    both = [replace(drawn, weight=4 / 3 * drawn.weight), replace(visited, weight=torch.zeros_like(visited.weight))]
+    batch = Samples.concatenate([replace(s, attention=torch.ones_like(s.f)) for s in both])
+    fields = exact_fields(problem, value=lambda x: 0.1 * torch.sin(2 * math.pi * x[:, 0]))
+    loss = lambda samples, most: saddle(problem, resolve_bounds(problem), warm_start=0.0, density_batch=most).losses(
+        fields, samples
+    )["density"]
+    torch.testing.assert_close(loss(batch, None), loss(drawn, None))
+    torch.testing.assert_close(loss(batch, 40), loss(drawn.take(slice(40)), None))
+    with pytest.raises(InputError, match="method.density_batch is 0"):
+        loss(batch, 0)
 
 
 class WithoutDivergences(Manufactured):

@@ -67,3 +67,12 @@ def test_default_sizes_follow():
     bounded, unbounded = defaults(Torus(2)), defaults(Arm())
     assert unbounded["trainer"]["batch"] > bounded["trainer"]["batch"]
     assert unbounded["model"]["waves"] > bounded["model"]["waves"]
+
+
+def test_the_density_player_keeps_the_ordinary_batch_unless_the_user_chose_one():
+    config = {"model": {}, "optimizer": {}, "certificate": {}, "method": {"name": "pd"}}
+    given = lambda problem, trainer: fill({**config, "trainer": trainer}, problem)["method"].get("density_batch")
+    ordinary = fill({**config, "trainer": {}}, Torus(2))["trainer"]["batch"]
+    assert given(Arm(), {}) == ordinary
+    assert given(Arm(), {"batch": 4096}) is None
+    assert given(Torus(2), {}) is None

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ocp_torch import calculus, control_laws, formulas
 from ocp_torch.bounds import Bounds
-from ocp_torch.errors import require_number
+from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fields
 from ocp_torch.objectives.dual import value_loss
 from ocp_torch.objectives.objective import Objective
@@ -61,7 +61,8 @@ class AugmentedSaddle(Objective):
     game. Against a `V` that is no subsolution yet, `L` is unbounded below in `mu`; `max(l, 0)` is not. With `c = 0` the
     value player ignores a density player that has not arrived yet (the game is then a dual ascent with a best response),
     and nothing is lost at the equilibrium, where `L` is flat in `V`. With ``warm_start`` and `c = 0` the density player
-    even rests for that part of the run: what it would answer to is not there yet.
+    even rests for that part of the run: what it would answer to is not there yet. Then it also learns from ``density_batch``
+    states of each batch at most, of those that carry weight (`m` tangents through `w` make its states expensive).
 
     Convexity: `l` is a perspective plus linear terms, so `max(l, 0)` and `J` are convex in `(w, mu)`, and `c L + k F_M` is
     concave in `V`. For `c = 1` and where `l >= 0` the operator of the game is that of `L`, which is monotone, plus
@@ -72,10 +73,18 @@ class AugmentedSaddle(Objective):
     occupation = control_laws.NETWORK
 
     def __init__(
-        self, problem: Problem, bounds: Bounds, augmentation: float, coupling: float, residual: float, warm_start: float
+        self,
+        problem: Problem,
+        bounds: Bounds,
+        augmentation: float,
+        coupling: float,
+        residual: float,
+        warm_start: float,
+        density_batch: int | None,
     ) -> None:
         super().__init__(problem, bounds)
         self.augmentation, self.coupling, self.residual = augmentation, coupling, residual
+        self.density_batch = density_batch
         self.resting = {"density": warm_start if coupling == 0.0 else 0.0}
 
     @property
@@ -90,6 +99,9 @@ class AugmentedSaddle(Objective):
         of_value = k * value_loss(self, fields, samples, value, slack, self.residual)
         if not self.needs_divergences:
             return {"value": of_value}
+        if self.coupling == 0.0:
+            samples, rows = samples.take_weighted(self.density_batch)
+            value, gradient = value[rows], gradient[rows]
         w, inflow = formulas.controlled_inflow(samples, self.admissible(fields), self.rho)
         mu, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
         running = samples.f * mu + self.cost.perspective(w, mu)
@@ -109,12 +121,15 @@ def saddle(
     coupling: float = 0.0,
     residual: float = 0.3,
     warm_start: float = 0.6,
+    density_batch: int | None = None,
 ) -> Objective:
     """The paper's saddle for ``augmentation = 0``, the augmented one otherwise.
 
     Without divergences of `a` and `B` the augmentation is that of the value player alone, and a note says so. Raises
-    `InputError` for negative weights.
+    `InputError` for negative weights, or a ``density_batch`` below 1.
     """
+    if density_batch is not None:
+        require_integer("method.density_batch", density_batch, 1)
     weight = require_number("method.augmentation", augmentation, at_least=0.0)
     coupling = require_number("method.coupling", coupling, at_least=0.0)
     residual = require_number("method.residual", residual, at_least=0.0)
@@ -122,7 +137,7 @@ def saddle(
     if weight == 0.0:
         return Saddle(problem, bounds)
     if problem.gives_divergences:
-        return AugmentedSaddle(problem, bounds, weight, coupling, residual, warm_start)
+        return AugmentedSaddle(problem, bounds, weight, coupling, residual, warm_start, density_batch)
     objective = Saddle(problem, bounds, weight)
     objective.notes = ("this problem gives no divergences of a and B: pd trains w alone, with mu in closed form.",)
     return objective
