@@ -38,6 +38,8 @@ BUDGETS = (
 
 # Where mu* is unbounded the slack must be small everywhere, not on average: that wants more states at once, and longer.
 LARGE_BATCH, MANY_WAVES, MANY_STEPS = 1024, 64, 1200
+# The larger batch is for the supremum of the slack, of which the density player of pd knows nothing.
+DENSITY_BATCH = 256
 # And no steep spots that nobody visits, but the supremum does: gelu leaves fewer than tanh, independent states fewer than
 # evenly spread ones.
 GENTLE_ACTIVATION, GENTLE_SAMPLER = "gelu", "uniform"
@@ -53,8 +55,7 @@ def fill(config: dict, problem: Problem) -> dict:
     activation, sampler, of_method = ACTIVATION, SAMPLER, {}
     if is_unbounded(problem):
         if (config.get("method") or {}).get("name") == "pd" and config["trainer"].get("batch") is None:
-            # The larger batch is for the supremum of the slack, which the density player knows nothing of.
-            of_method = {("method", "density_batch"): budget.batch}
+            of_method = {("method", "density_batch"): DENSITY_BATCH}
         activation, sampler = ACTIVATION if budget.gated else GENTLE_ACTIVATION, GENTLE_SAMPLER
         budget = replace(
             budget,

@@ -9,7 +9,7 @@ import pytest
 import zoo
 from ocp_torch import calculus, formulas
 from ocp_torch.bounds import OCCUPATION_WEIGHT, resolve_bounds
-from ocp_torch.budgets import fill
+from ocp_torch.budgets import DENSITY_BATCH, fill
 from ocp_torch.certificate import retrained
 from ocp_torch.fields import VALUE, Fields, PeriodicMLP
 from ocp_torch.objectives import Dual
@@ -69,10 +69,9 @@ def test_default_sizes_follow():
     assert unbounded["model"]["waves"] > bounded["model"]["waves"]
 
 
-def test_the_density_player_keeps_the_ordinary_batch_unless_the_user_chose_one():
+def test_the_larger_batch_is_not_for_the_density_player_unless_the_user_chose_it():
     config = {"model": {}, "optimizer": {}, "certificate": {}, "method": {"name": "pd"}}
     given = lambda problem, trainer: fill({**config, "trainer": trainer}, problem)["method"].get("density_batch")
-    ordinary = fill({**config, "trainer": {}}, Torus(2))["trainer"]["batch"]
-    assert given(Arm(), {}) == ordinary
+    assert given(Arm(), {}) == DENSITY_BATCH
     assert given(Arm(), {"batch": 4096}) is None
     assert given(Torus(2), {}) is None

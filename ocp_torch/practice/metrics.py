@@ -18,7 +18,7 @@ from ocp_torch.problems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.planar import PlanarVehicle
 from ocp_torch.problems.problem import Problem
 
-STARTS, STEPS = 1024, 240
+STARTS, STEPS = 512, 240
 # The time of a trial in units of 1 / rho; what the discount still sees after it is e^-8.
 TRIAL = 8.0
 # What counts as reached, relative to the arm's length or the period of the plane; as upright, in rad and rad/s.
