@@ -23,11 +23,13 @@ def names() -> dict[str, str]:
     return {f"ocp_torch/{c.__name__}-v0": name for name, c in PROBLEMS.items() if c.evaluable}
 
 
-def make(problem: str | Problem, **options):
+def make(problem: str | Problem | None = None, **options):
     """The environment of ``problem``, a name in `PROBLEMS` or an instance; ``options`` are arguments of both of them.
 
     Starts are random until ``reset(seed=...)``.
     """
+    if problem is None:
+        raise InputError("problem is missing; give one of your own, as in problem=MyProblem().")
     own = {k: options.pop(k) for k in ENVIRONMENT if k in options}
     own["seed"] = int.from_bytes(os.urandom(4), "little")
     if isinstance(problem, Problem):

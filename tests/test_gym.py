@@ -76,6 +76,8 @@ def test_arguments_reach_the_problem_and_the_environment(gymnasium):
     for wrong in (dict(dims=3), dict(control_bound=-1.0), dict(time_step=0.0)):
         with pytest.raises(InputError, match=next(iter(wrong))):
             gymnasium.make("ocp_torch/Manufactured-v0", **wrong)
+    with pytest.raises(InputError, match="problem is missing"):
+        gymnasium.make("ocp_torch/Problem-v0")
 
 
 def test_episodes_repeat_by_seed_and_differ_without(gymnasium):
