@@ -37,6 +37,8 @@ from ocp_torch.samples import Samples
 # Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
 # a controller that another one clearly beats.
 BASELINE_PART = 4
+# But so few trajectories take hardly longer than a part of them.
+CHEAP = 256
 # What costs `m` tangents through a network at each state, upper sides and residuals, is done on one state in
 # eight, and beyond sixteen dimensions on one in `d / 2`.
 TANGENT_PART = 8
@@ -157,7 +159,7 @@ def simulations(
 ) -> tuple[dict[str, Simulated], Estimate | None]:
     """Performance of each of ``laws``, and of doing nothing.
 
-    A law that is clearly worse than another on a quarter of the trajectories gets no more of them.
+    A law that is clearly worse than another on a quarter of the trajectories gets no more of them, where that saves time.
     """
     if not settings.trajectories:
         return {}, None
@@ -172,7 +174,8 @@ def simulations(
     few = max(2, settings.trajectories // BASELINE_PART)
     initial = lower.initial if lower else None
     judge = lambda law, trajectories: simulate(law, trajectories=trajectories, value=fields.value, initial=initial)
-    found = {name: judge(law, few) for name, law in laws.items()} if len(laws) > 1 else {}
+    pays = len(laws) > 1 and settings.trajectories * settings.replicates > CHEAP
+    found = {name: judge(law, few) for name, law in laws.items()} if pays else {}
     best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
     for name, law in laws.items():
         if name not in found or not found[name].perf.below > best:
@@ -193,7 +196,8 @@ def measured(
         sup_control = max(float(law(samples.x[:4096]).norm(dim=-1).max()) for samples in sets)
     jump = largest_jump(law, problem.dim)
     occupation = a_priori = None
-    if simulated is not None and settings.occupation_states:
+    # Where the problem says that mu* is unbounded there is no M to hold a largest density against.
+    if simulated is not None and settings.occupation_states and problem.occupation_bound != math.inf:
         occupation = estimated_sup_occupation(problem, law, simulated.end_states, settings.occupation_states)
         a_priori = a_priori_sup_occupation(problem, law, sets[0].x[:4096])
     largest_value = simulated.largest_value if simulated is not None else None
