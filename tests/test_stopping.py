@@ -133,6 +133,23 @@ def test_fields_that_became_worse_are_not_handed_out(tmp_path, monkeypatch):
     assert sentence in controller.certificate["warnings"]
 
 
+@pytest.mark.parametrize(
+    ("problem", "last", "handed"), [("arm", 0.09, False), ("arm", 0.3, True), ("circle", 0.09, True)]
+)
+def test_where_averages_are_certified_spikes_in_a_look_decide_nothing(monkeypatch, problem, last, handed):
+    """The last look is bad; averaged, it is as good as the best one, or it is not; without averages it counts as it is."""
+    trainer = small(f"problem={problem}", *WAY)
+    trainer.step = 20
+    trainer.watch.looked(Look(4, 0.1, 1.0, 0.0), trainer.averaged_fields)
+    gaps = {"look": 0.5, "best": 0.1, "last": last}
+    monkeypatch.setattr(trainer, "look", lambda: "look")
+    monkeypatch.setattr(trainer, "_quick", lambda settings, fields=None: "last" if fields is None else "best")
+    monkeypatch.setattr(Look, "at", lambda step, certificate: Look(step, gaps[certificate], 1.0, 0.0))
+    fields, sentence = trainer.choose()
+    assert (fields is not trainer.averaged_fields) == handed
+    assert (sentence is not None) == handed
+
+
 def test_the_last_fields_are_handed_out_unless_they_are_clearly_worse(tmp_path, monkeypatch):
     trainer = small(*WAY)
     tried, made = run(trainer, tmp_path, monkeypatch, lambda t: 0.1 if t.step < 20 else 0.1)
