@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
@@ -98,7 +99,9 @@ def _composed(config_name: str, overrides: list[str]) -> dict:
         known = isinstance(error, HydraException | OmegaConfBaseException)
         # Hydra has no exception of its own for some slips, and does not say where they are.
         reason = " ".join(str(error).split()).rstrip(".")
-        sentence = explain(error, config_name) if known else f"{' '.join(overrides)} cannot be composed: {reason}."
+        sentence = (
+            explain(error, config_name, overrides) if known else f"{' '.join(overrides)} cannot be composed: {reason}."
+        )
         raise InputError(sentence) from None
     finally:
         GlobalHydra.instance().clear()
@@ -117,8 +120,8 @@ def check_sweep(config_name: str, overrides: list[str]) -> None:
     _composed(config_name, [o for o in options[0] if o.startswith(("hydra.", "hydra/"))])
 
 
-def explain(error: Exception, config_name: str) -> str:
-    """Hydra's and OmegaConf's own words as one sentence."""
+def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -> str:
+    """Hydra's and OmegaConf's own words as one sentence; ``overrides`` name the groups that were chosen."""
     text = str(error)
     unknown = re.search(r"Could not find '([\w./-]+)/([^'/]*)'", text)
     if isinstance(error, MissingConfigException) and unknown:
@@ -132,8 +135,7 @@ def explain(error: Exception, config_name: str) -> str:
     override = re.search(r"Could not override '([\w.@/-]+)'", text)
     if isinstance(error, ConfigCompositionException) and override:
         field = override.group(1)
-        known = known_fields(config_name)
-        hint = nearest(field, known)
+        hint = field_hint(field, config_name, overrides)
         return f"{field} is not a field of the configuration{hint}; write +{field}=... to add an argument of your own."
     missing = re.search(r"Missing mandatory value: ([\w.]+)", text)
     if missing:
@@ -144,11 +146,25 @@ def explain(error: Exception, config_name: str) -> str:
     return " ".join(text.split()).rstrip(".") + "."
 
 
+def field_hint(field: str, config_name: str, overrides: Iterable[str]) -> str:
+    """A bracket with the nearest field of the chosen groups, or, where none is near, with all that the group has."""
+    chosen = tuple(o for o in overrides if (CONFIGS / o.split("=")[0]).is_dir())
+    known = known_fields(config_name, chosen)
+    group, _, last = field.rpartition(".")
+    below = [k.removeprefix(f"{group}.") for k in known if group and k.startswith(f"{group}.")]
+    names = sorted(n for n in below if "." not in n and not n.startswith("_"))
+    if not names:
+        return nearest(field, known)
+    if nearest(last, names):  # names are compared alone: the group before them makes all of them look alike
+        return nearest(field, [f"{group}.{n}" for n in names])
+    return f" ({group} has {', '.join(names)})"
+
+
 @cache
-def known_fields(config_name: str) -> list[str]:
-    """Dotted names of all fields and groups of the default configuration."""
+def known_fields(config_name: str, chosen: tuple[str, ...] = ()) -> list[str]:
+    """Dotted names of all fields and groups of the configuration with these groups ``chosen``, or of the default one."""
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        config = OmegaConf.to_container(compose(config_name), resolve=False)
+        config = OmegaConf.to_container(compose(config_name, list(chosen)), resolve=False)
 
     def names(node: dict, prefix: str = "") -> list[str]:
         own = [f"{prefix}{k}" for k in node]

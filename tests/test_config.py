@@ -185,6 +185,9 @@ def assert_one_sentence(sentence: str):
     [
         ("problem=circel", ("problem", "circel", "did you mean 'circle'?")),
         ("trainer.stepz=3", ("trainer.stepz", "did you mean 'trainer.steps'?")),
+        ("problem=kuramoto problem.dim=6", ("problem.dim", "problem has", "oscillators")),
+        ("problem=kuramoto problem.oscilators=6", ("problem.oscilators", "did you mean 'problem.oscillators'?")),
+        ("trainr.steps=3", ("trainr.steps", "did you mean 'trainer.steps'?")),
         ("averaging.kind=unifrom", ("averaging.kind", "did you mean 'uniform'?")),
         ("+problem.discuont=3", ("problem.discuont", "did you mean 'discount'?")),
         ("+optimizer.player_lr.valeu=1.0e-3", ("optimizer.player_lr", "valeu", "did you mean 'value'?")),
@@ -197,7 +200,7 @@ def assert_one_sentence(sentence: str):
     ],
 )
 def test_a_slip_is_explained_with_what_would_be_right(override, words):
-    sentence = outcome(override)
+    sentence = outcome(*override.split())
     assert_one_sentence(sentence)
     assert all(word in sentence for word in words), sentence
 
