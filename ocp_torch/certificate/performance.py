@@ -84,9 +84,9 @@ def simulate_performance(
     """Perf of ``law`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts.
 
     With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is
-    added. Steps are halved until a trajectory changes by less than ``tolerance``, relative to the answer. ``bias`` is the
-    error of integration (`refined`) plus, where the ``horizon`` is truncated, the discount left there times the rate's
-    supremum as met along the trajectories, with head-room.
+    added. Steps are halved until a trajectory changes by less than ``tolerance``, relative to the answer, or all of them by
+    little beside the standard error. ``bias`` is the error of integration (`refined`) plus, where the ``horizon`` is
+    truncated, the discount left there times the rate's supremum as met along the trajectories, with head-room.
     """
     dim, rho = problem.dim, problem.discount
     random = horizon == RANDOM
@@ -112,11 +112,13 @@ def simulate_performance(
     speed = float(velocity.norm(dim=-1).max())
     steps = max(8, 2 * math.ceil(0.5 * longest * max(rho / 0.4, speed / 0.2)))
     generator = torch.Generator().manual_seed(derive_seed(seed, SIMULATION_REPLICATE))
-    result, end, bias = refined(integrate, mu0, steps, tolerance * size, generator)
+    means = lambda results: (mu0 * results).reshape(replicates, trajectories).mean(dim=1)
+    noise = lambda results: Estimate.of(means(results).tolist()).se
+    result, end, bias = refined(integrate, mu0, steps, tolerance * size, generator, noise)
     if not random:
         with torch.no_grad():
             largest_rate = max(largest_rate, RATE_ROOM * float(dynamics(end)[1].abs().max()))
         bias += math.exp(-rho * longest) * largest_rate * float(mu0.mean())
-    parts = (mu0 * result).reshape(replicates, trajectories).mean(dim=1).tolist()
+    parts = means(result).tolist()
     totals = [part + (initial[r % len(initial)] if initial else 0.0) for r, part in enumerate(parts)]
     return Simulated(Estimate.of(totals, bias=bias), None if random else float((base + result).max()), end)

@@ -20,7 +20,8 @@ Integrate = Callable[[Tensor, int], tuple[Tensor, Tensor]]
 # How often steps are halved at most, and the slowest decay of the changes that is extrapolated.
 MAX_DOUBLINGS = 4
 SLOWEST = 0.8
-# The mean change, as a part of the tolerance for one trajectory, at which nothing needs to be refined.
+# The mean change, as a part of the tolerance for one trajectory or of the answer's standard error, at which nothing needs
+# to be refined; never more than the tolerance itself, as the standard error of a few trajectories means little.
 GOOD_PART = 0.1
 # The trajectories looked at again, blindly, with steps at least so many times finer than at first.
 AUDITED, AUDIT_FACTOR = 64, 4
@@ -78,15 +79,20 @@ def _step(dynamics: Dynamics, x: Tensor, h: tuple) -> tuple[Tensor, tuple[Tensor
 
 
 def refined(
-    integrate: Integrate, weights: Tensor, steps: int, tolerance: float, generator: torch.Generator
+    integrate: Integrate,
+    weights: Tensor,
+    steps: int,
+    tolerance: float,
+    generator: torch.Generator,
+    standard_error: Callable[[Tensor], float] = lambda results: 0.0,
 ) -> tuple[Tensor, Tensor, float]:
     r"""Results and end states of all trajectories, and a bound on the error of the results' mean by ``weights`` ``(N,)``.
 
-    While the mean change is above a tenth of ``tolerance``, trajectories that still change by more than ``tolerance`` on
-    halving the step are halved again: those that cross a jump or a kink of the controller, or slide along one. The error
-    has three parts: the last change of each trajectory; what its slow decay leaves to come (`r/(1-r)` of it, at ratio `r`:
-    a jump makes the order 1, not 4); and, because a trajectory may agree with itself by missing a feature twice, what a
-    random few of all of them change on far finer steps.
+    While the mean change is above ``tolerance``, or a tenth of it and of the ``standard_error`` of the results, those that
+    still change by more than ``tolerance`` on halving the step are halved again: those that cross a jump or a kink of the
+    controller, or slide along one. The error has three parts: the last change of each trajectory; what its slow decay
+    leaves to come (`r/(1-r)` of it, at ratio `r`: a jump makes the order 1, not 4); and, because a trajectory may agree
+    with itself by missing a feature twice, what a random few of all of them change on far finer steps.
     """
     everything = torch.arange(len(weights))
     coarse, _ = integrate(everything, steps // 2)
@@ -95,7 +101,8 @@ def refined(
     taken, finest = torch.full(weights.shape, steps), AUDIT_FACTOR * steps
     for _ in range(MAX_DOUBLINGS):
         active = (change > tolerance).nonzero().squeeze(-1)
-        if not len(active) or float((weights * change * factor).mean()) <= GOOD_PART * tolerance:
+        good = min(tolerance, GOOD_PART * max(tolerance, standard_error(result)))
+        if not len(active) or float((weights * change * factor).mean()) <= good:
             break
         steps *= 2
         finer, end[active] = integrate(active, steps)
