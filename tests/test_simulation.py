@@ -9,7 +9,7 @@ import torch
 import zoo
 from ocp_torch.certificate.assumptions import occupation_along_flow
 from ocp_torch.certificate.performance import SIMULATION_REPLICATE, simulate_performance
-from ocp_torch.certificate.simulation import discounted_integral
+from ocp_torch.certificate.simulation import discounted_integral, refined
 from ocp_torch.samplers import evaluation_points
 
 TURN = 2.0 * math.pi
@@ -114,3 +114,28 @@ def test_the_occupation_density_along_the_exact_flow_is_the_exact_one(problem):
     x = zoo.states(problem, 16, seed=4)
     found = occupation_along_flow(problem, problem.exact_control, x, horizon=12.0 / problem.discount, steps=100)
     torch.testing.assert_close(found, problem.exact_occupation(x), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("order", [1, 2, 4])
+def test_a_standard_error_spares_halvings_and_hides_no_error(order):
+    """Results `1 + c n^-order`, of which the mean's error is known: it stays below the tolerance, and below the bias."""
+    sizes = torch.linspace(0.0, 4.0, 200, dtype=torch.float64)
+    tolerance, taken = 0.1, []
+
+    def integrate(rows, steps):
+        taken.append(len(rows) * steps)
+        return 1.0 + sizes[rows] * steps ** float(-order), torch.zeros(len(rows), 1, dtype=torch.float64)
+
+    def run(standard_error):
+        taken.clear()
+        generator = torch.Generator().manual_seed(0)
+        result, _, bias = refined(
+            integrate, torch.ones_like(sizes), 4, tolerance, generator, lambda results: standard_error
+        )
+        return float(result.mean()) - 1.0, bias, sum(taken)
+
+    (error, bias, work), (noisy_error, noisy_bias, noisy_work) = run(0.0), run(10.0)
+    assert error <= noisy_error <= tolerance
+    assert error <= bias
+    assert noisy_error <= noisy_bias
+    assert noisy_work < work if order == 1 else noisy_work <= work
