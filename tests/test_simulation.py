@@ -116,15 +116,16 @@ def test_the_occupation_density_along_the_exact_flow_is_the_exact_one(problem):
     torch.testing.assert_close(found, problem.exact_occupation(x), rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("order", [1, 2, 4])
+@pytest.mark.parametrize("order", [0.5, 1, 2, 4])
 def test_a_standard_error_spares_halvings_and_hides_no_error(order):
-    """Results `1 + c n^-order`, of which the mean's error is known: it stays below the tolerance, and below the bias."""
+    """Results `1 + c n^-order`, of which the mean's error is known: it stays below the bias, and below the tolerance but
+    for the order 1/2, where halvings run out."""
     sizes = torch.linspace(0.0, 4.0, 200, dtype=torch.float64)
     tolerance, taken = 0.1, []
 
     def integrate(rows, steps):
         taken.append(len(rows) * steps)
-        return 1.0 + sizes[rows] * steps ** float(-order), torch.zeros(len(rows), 1, dtype=torch.float64)
+        return 1.0 + sizes[rows] * steps ** -float(order), torch.zeros(len(rows), 1, dtype=torch.float64)
 
     def run(standard_error):
         taken.clear()
@@ -135,7 +136,8 @@ def test_a_standard_error_spares_halvings_and_hides_no_error(order):
         return float(result.mean()) - 1.0, bias, sum(taken)
 
     (error, bias, work), (noisy_error, noisy_bias, noisy_work) = run(0.0), run(10.0)
-    assert error <= noisy_error <= tolerance
+    assert error <= noisy_error
+    assert noisy_error <= tolerance or order < 1
     assert error <= bias
     assert noisy_error <= noisy_bias
     assert noisy_work < work if order == 1 else noisy_work <= work
