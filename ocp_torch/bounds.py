@@ -9,6 +9,7 @@ import torch
 
 from ocp_torch.errors import require_number
 from ocp_torch.extremum import supremum
+from ocp_torch.needs import GIVEN, GUESSED, SEARCHED
 from ocp_torch.problems.problem import MARGIN, Problem
 
 # Without any knowledge of mu*, M starts at this multiple of sup mu0 and the certificate judges it afterwards.
@@ -16,7 +17,7 @@ OCCUPATION_GUESS = 4.0
 # And where mu* is known to have no bound: what won on flows that contract onto a goal.
 OCCUPATION_WEIGHT = 40.0
 # States a problem is searched at for what it does not say.
-SEARCHED = 2**13
+SURVEYED = 2**13
 
 FROM_CONFIGURATION, FROM_PROBLEM, ESTIMATED = "configuration", "problem", "estimated"
 
@@ -35,6 +36,17 @@ class Bounds:
     sources: dict[str, str]
     warnings: tuple[str, ...] = ()
     unbounded: bool = False
+
+    @property
+    def needs_no_M(self) -> bool:
+        """Whether training aims at the bound without `M`: where `mu*` has no bound, or nobody gave one."""
+        return self.unbounded or self.basis("M") == GUESSED
+
+    def basis(self, name: str) -> str:
+        """Where the constant ``name`` comes from, as what rests on it must say (see `ocp_torch.needs`)."""
+        if self.sources[name] != ESTIMATED:
+            return GIVEN
+        return GUESSED if name == "M" else SEARCHED
 
     def __post_init__(self) -> None:
         for name in ("M", "C_V", "C_u"):
@@ -94,7 +106,7 @@ def state_cost_supremum(problem: Problem) -> float:
     """`sup f`: the problem's own bound, or a sampled and climbed estimate with head-room."""
     if problem.state_cost_bound is not None:
         return problem.state_cost_bound
-    (x,) = problem.survey(SEARCHED, 1, "x")
+    (x,) = problem.survey(SURVEYED, 1, "x")
     return MARGIN * supremum(problem.state_cost, x, differentiable=False).value
 
 
@@ -107,14 +119,14 @@ def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
     total = 2.0 * conjugate * state_cost_supremum(problem)
     if problem.driftless:
         return total ** (1.0 / q), "Proposition 2 of the paper with a sampled sup f"
-    B, a = problem.survey(SEARCHED // 4, 1, "B", "a")
+    B, a = problem.survey(SURVEYED // 4, 1, "B", "a")
     alpha = torch.linalg.pinv(B) @ a.unsqueeze(-1)
     largest = float(alpha.squeeze(-1).norm(dim=-1).max())
     return (total + 2.0**q * (conjugate - 1.0) * largest) ** (1.0 / q), "Proposition 2 with a least-squares alpha"
 
 
 def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
-    (mu0,) = problem.survey(SEARCHED, 1, "mu0")
+    (mu0,) = problem.survey(SURVEYED, 1, "mu0")
     guess = OCCUPATION_WEIGHT if is_unbounded(problem) else OCCUPATION_GUESS
     return guess * float(mu0.max()), f"a guess to train with, {guess:g} times sup mu0"
 

@@ -11,10 +11,10 @@ from ocp_torch.bounds import ESTIMATED, resolve_bounds
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lagrangian import closed_loop_bounds
-from ocp_torch.certificate.raising import raised
 from ocp_torch.config import build_trainer
 from ocp_torch.control_laws import ValueLaw
 from ocp_torch.fields import Fields, PeriodicMLP
+from ocp_torch.needs import GUESSED, SEARCHED
 from ocp_torch.problems import Circle, Manufactured
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.samples import Samples
@@ -71,7 +71,7 @@ def test_an_M_below_sup_mu_is_noticed_and_its_bound_left_out():
 def test_an_unbounded_occupation_density_is_noticed():
     certificate = certificate_of(Circle(discount=0.8))
     assert certificate.gap["lower_from"] == "shifted"
-    assert not certificate.assumptions.hold
+    assert not certificate.counts("F_M")
     assert any("unbounded" in warning for warning in certificate.warnings)
 
 
@@ -83,19 +83,43 @@ class Anonymous(Manufactured):
         self.occupation_bound = self.control_bound = self.value_bound = self.state_cost_bound = None
 
 
-def test_what_nobody_knows_is_estimated_with_a_warning_and_M_raised_to_what_is_met():
-    problem = Anonymous(dim=1, contrast=0.9, seed=3)
-    bounds = resolve_bounds(problem)
+def test_what_nobody_knows_is_estimated_with_a_warning():
+    bounds = resolve_bounds(Anonymous(dim=1, contrast=0.9, seed=3))
     assert set(bounds.sources.values()) == {ESTIMATED}
     assert len(bounds.warnings) == 3
     assert bounds.C_V >= Manufactured(dim=1, contrast=0.9, seed=3).value_bound * 0.9
-    higher = raised(replace(bounds, M=1.1), 1.9)
-    assert higher.M == pytest.approx(1.25 * 1.9)
-    assert raised(bounds, 1.9).M == bounds.M
-    assert raised(resolve_bounds(Manufactured(dim=1), occupation_bound=1.0), 1.9).M == 1.0
-    used = certificate_of(problem, replace(bounds, M=1.1)).assumptions
-    assert used.M == pytest.approx(1.25 * used.estimated_sup_occupation)
-    assert used.estimated_sup_occupation == pytest.approx(1.9, rel=0.05)
+    assert (bounds.basis("M"), bounds.basis("C_V")) == (GUESSED, SEARCHED)
+
+
+def test_a_guessed_M_makes_a_conditional_bound_that_enters_nothing_else():
+    problem = Anonymous(dim=1, contrast=0.9, seed=3)
+    certificate = certificate_of(problem)
+    assert certificate.gap["lower_from"] == "shifted"
+    assert certificate.hold
+    said = certificate.to_dict()
+    assert said["lower"]["F_M"] | {"rests_on": {"M": "guessed"}, "counts": False} == said["lower"]["F_M"]
+    assert said["lower"]["F_M"]["if"] == f"sup mu* <= {certificate.assumptions.M:.4g}"
+    assert said["lower"]["shifted"]["counts"]
+    assert 0.0 < said["gap"]["conditional"] < said["gap"]["simulated"]
+    assert any("a guess: no gap uses it" in warning for warning in said["warnings"])
+
+
+def test_a_guess_that_the_controller_s_density_refutes_makes_no_bound_at_all():
+    problem = Anonymous(dim=1, contrast=0.9, seed=3)
+    certificate = certificate_of(problem, replace(resolve_bounds(problem), M=1.1))
+    assert certificate.assumptions.estimated_sup_occupation == pytest.approx(1.9, rel=0.05)
+    assert certificate.gap["conditional"] is None
+    assert certificate.gap["lower_from"] == "shifted"
+
+
+@pytest.mark.parametrize("basis", ["given", "guessed"])
+def test_an_M_that_was_held_against_nothing_makes_nothing_count(basis):
+    problem = Anonymous(dim=1)
+    given = 10.0 if basis == "given" else None
+    bounds = resolve_bounds(problem, occupation_bound=given)
+    blind = replace(CHEAP, occupation_states=0)
+    assert not certificate_of(problem, bounds, blind).counts("F_M")
+    assert certificate_of(problem, bounds).counts("F_M") == (basis == "given")
 
 
 def rounds_of(*overrides: str):

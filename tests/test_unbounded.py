@@ -10,7 +10,6 @@ import zoo
 from ocp_torch import calculus, formulas
 from ocp_torch.bounds import OCCUPATION_WEIGHT, resolve_bounds
 from ocp_torch.budgets import DENSITY_BATCH, fill
-from ocp_torch.certificate import retrained
 from ocp_torch.fields import VALUE, Fields, PeriodicMLP
 from ocp_torch.objectives import Dual
 from ocp_torch.problems import Arm, Circle, Torus
@@ -24,20 +23,6 @@ def test_which_problems_are_known_to_be_unbounded():
     assert resolve_bounds(Torus(2, discount=0.5)).unbounded
     assert not resolve_bounds(Torus(2)).unbounded
     assert not resolve_bounds(Circle()).unbounded
-
-
-def test_a_further_round_gives_up_a_guess_that_cannot_be_met():
-    guess = resolve_bounds(zoo.Swing())
-    assert retrained(guess, None) == guess
-    assert retrained(guess, 0.5) == guess
-    assert retrained(guess, 6.0).M == pytest.approx(7.5)
-    for hopeless in (float("inf"), 1e3):
-        given_up = retrained(guess, hopeless)
-        assert given_up.unbounded
-        assert "without M" in given_up.warnings[-1]
-        assert retrained(given_up, hopeless) == given_up
-    known = resolve_bounds(Circle())
-    assert retrained(known, 1e3) == known
 
 
 def test_the_weight_of_the_slack_grows_along_a_round():

@@ -1,11 +1,11 @@
 """Bounds, performances and what they assume; needs no trainer."""
 
-from ocp_torch.certificate.certificate import Certificate, Run, table
+from ocp_torch.certificate.certificate import Certificate, Run
 from ocp_torch.certificate.certify import Trained, certify_fields, in_float64
 from ocp_torch.certificate.policy import certify_policy
-from ocp_torch.certificate.raising import retrained
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.stage import StageSettings
+from ocp_torch.certificate.table import table
 
 __all__ = [
     "Certificate",
@@ -16,6 +16,5 @@ __all__ = [
     "certify_fields",
     "certify_policy",
     "in_float64",
-    "retrained",
     "table",
 ]

@@ -3,7 +3,7 @@ r"""The assumptions the bounds rest on, held against what was met under the lear
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import torch
 
@@ -11,6 +11,7 @@ from ocp_torch.bounds import FROM_PROBLEM, Bounds
 from ocp_torch.certificate.occupation import estimated_sup_occupation, occupation_along_flow
 from ocp_torch.certificate.regularity import Jump
 from ocp_torch.certificate.wellposed import WellPosed
+from ocp_torch.needs import GIVEN, GUESSED, SEARCHED, Need
 from ocp_torch.problems.problem import Problem
 
 __all__ = ["Assumptions", "Met", "check_assumptions", "estimated_sup_occupation", "occupation_along_flow"]
@@ -60,18 +61,40 @@ class Assumptions:
     largest_jump: float | None = None
     smallest_state_cost: float | None = None
     initial_mass: float | None = None
+    basis: dict[str, str] = field(default_factory=dict)  # of M and C_V (see `ocp_torch.needs`); given if absent
 
     @property
     def hold(self) -> bool:
-        return all(v for k, v in vars(self).items() if k.endswith("_holds"))
+        """Whether every check passed; a guessed `M`, which nothing that counts rests on, is not among them."""
+        unused = {"occupation_holds"} if self.basis.get("M") == GUESSED else set()
+        return all(v for k, v in vars(self).items() if k.endswith("_holds") and k not in unused)
+
+    def needs(self, name: str) -> tuple[Need, ...]:
+        """What the bound ``name`` rests on, beside a problem that is one; nothing else for simulations and the truth."""
+        found = "what the search found"
+        regular = Need("regular", SEARCHED, "neither a, B nor the controller jumps", self.regular_holds)
+        cost = Need("f", SEARCHED, "f >= 0 everywhere", self.cost_holds)
+        M = Need("M", self.basis.get("M", GIVEN), f"sup mu* <= {_number(self.M)}", self.occupation_holds)
+        C_V = Need("C_V", self.basis.get("C_V", GIVEN), f"sup V <= {_number(self.C_V)}", self.value_holds)
+        slack = Need("sup Q", SEARCHED, f"sup Q is {found}")
+        both = Need("sup |Q_u|", SEARCHED, f"sup |Q_u| is {found}")
+        return {
+            "F_M": (M,),
+            "shifted": (slack,),
+            "rigorous": (),
+            "J": (C_V, cost, regular),
+            "G": (C_V, cost),
+            "lagrangian": (both, regular),
+            "evaluation": (both,),
+        }.get(name, ())
 
     def with_value_bound(self, C_V: float) -> Assumptions:
-        """With a `C_V` that was proved for the controller at hand."""
-        return replace(self, C_V=C_V, value_holds=True, control_holds=True)
+        """With the `C_V` that the suprema found of `V` and its slack prove for the controller at hand."""
+        return replace(self, C_V=C_V, value_holds=True, control_holds=True, basis=self.basis | {"C_V": SEARCHED})
 
     def to_dict(self) -> dict:
         """JSON form; a supremum that grew beyond all numbers is null."""
-        numbers = {k: v for k, v in asdict(self).items() if not k.endswith("_holds")}
+        numbers = {k: v for k, v in asdict(self).items() if not k.endswith("_holds") and k != "basis"}
         finite = {k: v if v is None or math.isfinite(v) else None for k, v in numbers.items()}
         return {**finite, "hold": self.hold}
 
@@ -85,6 +108,8 @@ def check_assumptions(
     M_holds, why = occupation_holds(problem, bounds, met)
     if uses_M and not M_holds:
         warnings.append(f"F_M is not used: {why}.")
+    elif uses_M and bounds.basis("M") == GUESSED:
+        warnings.append(f"F_M is a bound only if sup mu* <= {bounds.M:.4g}, a guess: no gap uses it.")
     value_holds = met.largest_value is None or met.largest_value <= bounds.C_V * (1.0 + 1e-3)
     if uses_C_V and not value_holds:
         warnings.append(
@@ -117,12 +142,14 @@ def check_assumptions(
         largest_jump=met.jump.size if met.jump else None,
         smallest_state_cost=met.problem.smallest_cost if met.problem else None,
         initial_mass=met.problem.mass if met.problem else None,
+        basis={"M": bounds.basis("M"), "C_V": bounds.basis("C_V")},
     )
     return assumptions, warnings
 
 
 def occupation_holds(problem: Problem, bounds: Bounds, met: Met) -> tuple[bool, str]:
-    """Whether `M >= sup mu*` can be believed, and if not, why."""
+    """Whether nothing speaks against `M >= sup mu*`, and what does. An `M` that was given must have been held against the
+    density under the controller, unless the problem knows `mu*` exactly; a guess stays one whatever it was held against."""
     true, estimate = problem.occupation_bound, met.sup_occupation
     if true is not None and math.isinf(true):
         return False, "mu* is unbounded for this problem, so no M is large enough"
@@ -135,19 +162,18 @@ def occupation_holds(problem: Problem, bounds: Bounds, met: Met) -> tuple[bool, 
     if bounds.sources["M"] != FROM_PROBLEM and true is not None and bounds.M < true * (1.0 - TOLERANCE):
         return False, f"M = {bounds.M:.4g} is below this problem's sup mu*, {true:.4g}"
     if estimate is None:
-        return True, ""
+        blind = "was held against no occupation density: certificate.occupation_states is 0, or nothing was simulated"
+        return bounds.basis("M") == GUESSED, f"M = {bounds.M:.4g} {blind}"
     reached = f"the occupation density under the controller reaches about {estimate:.4g}"
     if not math.isfinite(estimate):
         return False, "the occupation density under the controller grows beyond all bounds, so no M can be believed"
     if true is not None and bounds.M >= true:
         return estimate <= DECLARED * bounds.M, f"M = {bounds.M:.4g}, as the problem declares, but {reached}"
-    if met.a_priori_occupation is not None and bounds.M >= met.a_priori_occupation and not _jumps(met):
-        return True, ""
     return (
         estimate * CLEARANCE <= bounds.M,
         f"M = {bounds.M:.4g}, but {reached}, and must stay clearly below M to say that M did not shape it",
     )
 
 
-def _jumps(met: Met) -> bool:
-    return met.jump is not None and met.jump.size > 0.0
+def _number(value: float | None) -> str:
+    return "?" if value is None else f"{value:.4g}"

@@ -1,16 +1,17 @@
-"""The certificate: bounds, performances, standard errors and the assumptions they rest on."""
+"""The certificate: bounds, performances, standard errors and what they rest on."""
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ocp_torch.certificate.assumptions import Assumptions
-from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
+from ocp_torch.needs import GUESSED, Need
 
-SCHEMA = 1
+SCHEMA = 2
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,8 @@ class Certificate:
     ``lower``, ``upper``, ``perf`` and ``baseline`` map the names of `certificate.json` to estimates; ``searches`` says how
     each supremum behind them was found, ``speaks`` whether `J` and `G` are about the controller that is handed out.
     ``confidence`` is the level of the intervals; ``subject`` names the controller in ``perf`` that all this is about, by
-    default the best of them; ``perf_lower`` bounds its performance from below without simulation.
+    default the best of them; ``perf_lower`` bounds its performance from below without simulation. ``contradiction`` is the
+    sentence that says why nothing counts, where two bounds exclude each other.
     """
 
     run: Run
@@ -46,197 +48,174 @@ class Certificate:
     warnings: list[str] = field(default_factory=list)
     searches: list[str] = field(default_factory=list)
     speaks: dict[str, bool] = field(default_factory=dict)
-    confidence: float = 0.95
+    confidence: float = CONFIDENCE
     subject: str | None = None
     perf_lower: dict[str, Estimate | None] = field(default_factory=dict)
+    contradiction: str | None = None
+
+    def needs(self, name: str) -> tuple[Need, ...]:
+        """What the bound ``name`` rests on."""
+        return self.assumptions.needs(name)
+
+    def counts(self, name: str) -> bool:
+        """Whether the bound ``name`` may enter a gap: what it rests on holds, and nothing of it is guessed."""
+        return self.stands and all(need.counts for need in self.needs(name))
+
+    def conditional(self, name: str) -> bool:
+        """Whether the bound ``name`` rests on a guess that nothing refutes: it is one if the guess is right."""
+        needs = self.needs(name)
+        return self.stands and all(n.holds for n in needs) and any(n.basis == GUESSED for n in needs)
+
+    @property
+    def stands(self) -> bool:
+        """Whether the problem is one, and nothing contradicts anything: without that no number counts."""
+        return self.assumptions.problem_holds and self.contradiction is None
 
     @property
     def best_lower(self) -> tuple[str, float] | None:
-        """Name and value of the largest lower bound whose assumptions hold."""
-        sound = self.assumptions.problem_holds
-        usable = {"F_M": sound and self.assumptions.occupation_holds, "shifted": sound, "rigorous": sound}
-        return _best(max, self.lower, usable)
+        """The lower bound that counts with the highest lower end of its interval, and that end."""
+        return self._highest(self.counts)
 
     @property
     def best_upper(self) -> tuple[str, float] | None:
-        """The smallest upper bound of the controller handed out whose assumptions hold; no simulation in it."""
-        known = self.assumptions
-        holds = known.problem_holds and known.value_holds and known.cost_holds
-        usable = {name: holds and self.speaks.get(name, True) for name in ("J", "G")}
-        usable["J"] = usable["J"] and known.regular_holds
-        usable["lagrangian"] = known.problem_holds and known.regular_holds
-        return _best(min, self.upper, {**usable, "evaluation": known.problem_holds})
+        """The bound on the controller handed out that counts with the lowest upper end, and that end; no simulation."""
+        usable = {n: e for n, e in self.upper.items() if self.counts(n) and self.speaks.get(n, True)}
+        return _best(min, {n: self._ends(e)[1] for n, e in usable.items() if known(e)})
 
     @property
     def best_perf(self) -> tuple[str, float] | None:
-        """The controller with the smallest simulated performance (or the ``subject``), and that with its bias and two
-        standard errors."""
+        """The controller handed out and the upper end of its simulated performance, bias included, if that counts."""
+        name = self.controller
+        return None if name is None or not self.stands else (name, self._ends(self.perf[name])[1])
+
+    @property
+    def controller(self) -> str | None:
+        """The controller that all this is about: the ``subject``, or the one with the smallest simulated performance."""
         mine = lambda name: self.subject is None or name == self.subject
-        known = {name: e for name, e in self.perf.items() if e is not None and e.finite and mine(name)}
-        if not known or not self.assumptions.problem_holds:
-            return None
-        name = min(known, key=lambda n: known[n].above)
-        return name, known[name].above
+        best = _best(min, {n: self._ends(e)[1] for n, e in self.perf.items() if known(e) and mine(n)})
+        return None if best is None else best[0]
 
     @property
     def gap(self) -> dict:
-        """Relative distance from the best lower bound to the best upper bound, and to the best simulated performance."""
+        """From the best lower bound that counts to the best upper bound, and to the simulated performance, relative to the
+        lower; between the far ends of their intervals. ``conditional``: what bounds that rest on a guess would make of it."""
         lower, upper, perf = self.best_lower, self.best_upper, self.best_perf
+        supposed = self._highest(self.conditional)
+        both = [g for g in (_relative_gap(supposed, upper), _relative_gap(supposed, perf)) if g is not None]
         return {
             "certified": _relative_gap(lower, upper),
             "simulated": _relative_gap(lower, perf),
+            "conditional": min(both, default=None),
             "lower_from": lower[0] if lower else None,
             "upper_from": upper[0] if upper else None,
         }
 
     @property
     def plain_gap(self) -> float | None:
-        """The simulated gap as measured, without bias and standard errors on top: to decide by, not to claim."""
-        best = self.best_perf
-        return None if best is None else _relative_gap(self.best_lower, (best[0], self.perf[best[0]].value))
+        """The simulated gap between values, without errors on top: to decide by, not to claim."""
+        lower, perf = self.best_lower, self.best_perf
+        if lower is None or perf is None:
+            return None
+        values = self.lower[lower[0]].value, self.perf[perf[0]].value
+        return _relative_gap(*((name, value) for (name, _), value in zip((lower, perf), values, strict=True)))
 
     @property
     def suboptimality(self) -> dict:
         """How much more than `OPT` the controller costs, relative to it: ``at_least`` and ``at_most``, jointly at the
-        level of ``confidence`` (the level of each interval that enters is raised accordingly); `None` where unknown."""
+        level of ``confidence`` (the level of each interval that enters is raised accordingly); `None` where unknown.
+        ``takes`` are the sentences on what else the two rest on."""
         best, lower, upper = self.best_perf, self.best_lower, self.best_upper
-        known = [e for e in self.perf.values() if e is not None and e.finite]
-        level = 1.0 - (1.0 - self.confidence) / (len(known) + 2)
-        none = {"at_least": None, "at_most": None}
+        perfs = [e for e in self.perf.values() if known(e)]
+        level = 1.0 - (1.0 - self.confidence) / (len(perfs) + 2)
+        found = {"at_least": None, "at_most": None, "takes": []}
         if best is None:
-            return none
+            return found
         low, high = self.perf[best[0]].interval(level)
         # Whatever any controller costs, OPT does not exceed it.
-        above = [e.interval(level)[1] for e in known] + ([self.upper[upper[0]].interval(level)[1]] if upper else [])
-        found = dict(none)
+        above = [e.interval(level)[1] for e in perfs] + ([self.upper[upper[0]].interval(level)[1]] if upper else [])
         if min(above) > 0.0:
             found["at_least"] = max(0.0, low / min(above) - 1.0)
         if lower is not None and (under := self.lower[lower[0]].interval(level)[0]) > 0.0:
             found["at_most"] = max(0.0, high / under - 1.0)
+            found["takes"] = [need.sentence for need in self.needs(lower[0])]
         return found
-
-    def without_contradictions(self) -> Certificate:
-        """Itself, or, where `F_M` is above an upper bound on `OPT` by more than chance allows, with `F_M` taken out."""
-        low, sure = self.lower.get("F_M"), 1.0 - (1.0 - self.confidence) / 10.0
-        if low is None or not low.finite or not self.assumptions.occupation_holds:
-            return self
-        above = {name: e.interval(sure)[1] for name, e in self.perf.items() if e is not None and e.finite}
-        best = self.best_upper
-        if best is not None:
-            above[best[0]] = self.upper[best[0]].interval(sure)[1]
-        name = min(above, key=above.get, default=None)
-        if name is None or low.interval(sure)[0] <= above[name]:
-            return self
-        warning = f"F_M is not used: it is above the upper bound {above[name]:.6g} ({name}), so M is too small."
-        assumptions = replace(self.assumptions, occupation_holds=False)
-        return replace(self, assumptions=assumptions, warnings=[*self.warnings, warning])
 
     @property
     def share(self) -> dict:
         """The part of what control can gain over doing nothing that is certainly achieved, by both upper sides."""
         zero = self.baseline.get("zero")
+        least = self._ends(zero)[0] if known(zero) else None
         return {
-            "certified": _share(self.best_lower, self.best_upper, zero),
-            "simulated": _share(self.best_lower, self.best_perf, zero),
+            "certified": _share(self.best_lower, self.best_upper, least),
+            "simulated": _share(self.best_lower, self.best_perf, least),
         }
+
+    @property
+    def hold(self) -> bool:
+        """Whether every check passed and no two bounds contradict each other; a guess that is not used is no matter."""
+        return self.assumptions.hold and self.contradiction is None
 
     def to_dict(self) -> dict:
         """The stable schema of `certificate.json`; what does not apply is null."""
-        level = self.confidence
-        one = lambda e: e.to_dict(level) if e is not None and e.finite else None
-        groups = ("lower", "upper", "perf", "baseline")
-        as_json = {group: {name: one(e) for name, e in getattr(self, group).items()} for group in groups}
+        one = lambda e: e.to_dict(self.confidence) if known(e) else None
+        bound = lambda name, e: None if not known(e) else {**one(e), **self._standing(name)}
         return {
             "schema": SCHEMA,
             **vars(self.run),
             "exact": self.exact,
             "confidence": self.confidence,
-            **as_json,
+            "controller": self.controller,
+            **{side: {n: bound(n, e) for n, e in getattr(self, side).items()} for side in ("lower", "upper")},
+            **{group: {n: one(e) for n, e in getattr(self, group).items()} for group in ("perf", "baseline")},
             "gap": self.gap,
             "share": self.share,
             "suboptimality": self.suboptimality,
             **({"perf_lower": {name: one(e) for name, e in self.perf_lower.items()}} if self.perf_lower else {}),
-            "assumptions": self.assumptions.to_dict(),
+            "assumptions": {**self.assumptions.to_dict(), "hold": self.hold},
+            "contradiction": self.contradiction,
             "warnings": list(self.warnings),
         }
+
+    def _standing(self, name: str) -> dict:
+        """What the bound ``name`` rests on, whether it counts, and what it supposes where it rests on a guess."""
+        supposed = " and ".join(need.condition for need in self.needs(name) if need.basis == GUESSED)
+        counts = self.counts(name) and self.speaks.get(name, True)
+        rests_on = {need.name: need.basis for need in self.needs(name)}
+        return {"rests_on": rests_on, "counts": counts, **({"if": supposed} if supposed else {})}
 
     def save(self, path: Path) -> None:
         """Write `certificate.json`."""
         path.write_text(json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
 
+    def _ends(self, estimate: Estimate) -> tuple[float, float]:
+        return estimate.interval(self.confidence)
 
-def _best(choose, estimates: dict[str, Estimate | None], usable: dict[str, bool]) -> tuple[str, float] | None:
-    known = {n: e.value for n, e in estimates.items() if e is not None and e.finite and usable.get(n, False)}
-    if not known:
+    def _highest(self, usable) -> tuple[str, float] | None:
+        """The lower bound with the highest lower end among those that are ``usable``."""
+        return _best(max, {n: self._ends(e)[0] for n, e in self.lower.items() if known(e) and usable(n)})
+
+
+def known(estimate: Estimate | None) -> bool:
+    """Whether there is a number."""
+    return estimate is not None and estimate.finite
+
+
+def _best(choose, ends: dict[str, float]) -> tuple[str, float] | None:
+    if not ends:
         return None
-    name = choose(known, key=known.get)
-    return name, known[name]
+    name = choose(ends, key=ends.get)
+    return name, ends[name]
 
 
 def _relative_gap(lower: tuple[str, float] | None, upper: tuple[str, float] | None) -> float | None:
-    if lower is None or upper is None or lower[1] <= 0.0:
+    """Relative to the lower bound; `None` where that is not positive, or where the two cross, as errors may make them."""
+    if lower is None or upper is None or lower[1] <= 0.0 or upper[1] < lower[1]:
         return None
     return (upper[1] - lower[1]) / lower[1]
 
 
-def _share(lower, upper, zero: Estimate | None) -> float | None:
-    if lower is None or upper is None or zero is None or not zero.finite:
+def _share(lower: tuple[str, float] | None, upper: tuple[str, float] | None, zero: float | None) -> float | None:
+    if lower is None or upper is None or zero is None or upper[1] < lower[1]:
         return None
-    gain = zero.value - lower[1]
+    gain = zero - lower[1]
     return 1.0 - (upper[1] - lower[1]) / gain if gain > 0.0 and math.isfinite(gain) else None
-
-
-def table(certificate: dict, searches: list[str] = ()) -> str:
-    """The certificate (as a dict of its schema) as a table for the terminal, and how its suprema were found."""
-    exact = certificate["exact"]
-    lines = [f"{certificate['problem']} / {certificate['method']}, seed {certificate['seed']}", ""]
-    covered = f"± {100.0 * certificate['confidence']:.6g} %" if "confidence" in certificate else "± se"
-    header = f"{'':26}{'value':>14}{covered:>11}{'of it bias':>11}" + (f"{'vs OPT':>12}" if exact else "")
-    lines += [header, "-" * len(header)]
-
-    def row(label: str, estimate: dict | None) -> None:
-        if estimate is None:
-            return
-        bias = f"{estimate['bias']:11.1e}" if "bias" in estimate else " " * 11
-        against = f"{100.0 * (estimate['value'] / exact - 1.0):+11.4f}%" if exact else ""
-        half = estimate["interval"][1] - estimate["value"] if "interval" in estimate else estimate["se"]
-        lines.append(f"{label:26}{estimate['value']:14.8f}{half:11.1e}{bias}{against}")
-
-    row("lower: F_M", certificate["lower"]["F_M"])
-    row("lower: shifted", certificate["lower"]["shifted"])
-    row("lower: rigorous", certificate["lower"].get("rigorous"))
-    if exact is not None:
-        lines.append(f"{'OPT (exact)':26}{exact:14.8f}")
-    row("Perf: controller from V", certificate["perf"].get("value"))
-    row("Perf: controller w/mu", certificate["perf"].get("density"))
-    for name, estimate in certificate.get("perf_lower", {}).items():
-        row(f"Perf, at least: {name}", estimate)
-    row("Perf: this controller", certificate["perf"].get("given"))
-    for name, label in (("lagrangian", "Lagrangian"), ("evaluation", "evaluation"), ("G", "G"), ("J", "J")):
-        row(f"upper: {label}", certificate["upper"].get(name))
-    row("Perf: doing nothing", certificate["baseline"]["zero"])
-    lines.append("-" * len(header))
-    gap, share = certificate["gap"], certificate["share"]
-    for kind in ("certified", "simulated"):
-        if gap[kind] is not None:
-            part = f", {100 * share[kind]:.2f}% of the gain over doing nothing" if share[kind] is not None else ""
-            lines.append(f"gap, {kind}: {100.0 * gap[kind]:.4f}%{part}")
-    lines += in_words(certificate)
-    lines += searches
-    lines += [f"warning: {warning}" for warning in certificate["warnings"]]
-    return "\n".join(lines)
-
-
-def in_words(certificate: dict) -> list[str]:
-    """The sub-optimality of the controller as a sentence, if there is anything to say."""
-    found = certificate.get("suboptimality") or {}
-    percent = lambda x: f"{100.0 * x:.3g} %"
-    least, most = found.get("at_least"), found.get("at_most")
-    parts = [f"at most {percent(most)}"] if most is not None else []
-    if least:
-        parts.append(f"at least {percent(least)}")
-    if not parts:
-        return []
-    return [
-        f"the controller is {' and '.join(parts)} worse than the optimum ({percent(certificate['confidence'])} sure)"
-    ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -15,11 +15,11 @@ from ocp_torch.bounds import Bounds
 from ocp_torch.calculus import CHUNK
 from ocp_torch.certificate.assumptions import Met, check_assumptions
 from ocp_torch.certificate.certificate import Certificate, Run
+from ocp_torch.certificate.contradictions import examined
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.occupation import a_priori_sup_occupation, estimated_sup_occupation
 from ocp_torch.certificate.performance import Simulated, simulate_performance
-from ocp_torch.certificate.raising import raised
 from ocp_torch.certificate.recorded import certify_recorded
 from ocp_torch.certificate.regularity import largest_jump
 from ocp_torch.certificate.rigorous import RigorousBound, proved_lower
@@ -104,9 +104,6 @@ def certify_fields(
         stage, notes = certification_stage(problem, trained, fields, bounds, settings, few, lower, best, seed)
         warnings += notes
     met = measured(problem, laws[best], finite.get(best), few, posed, settings)
-    if lower is not None:
-        bounds = raised(bounds, met.sup_occupation)
-        lower = replace(lower, M=bounds.M)
     assumptions, notes = check_assumptions(problem, bounds, met, uses=(has_value, J is not None))
     warnings = list(bounds.warnings) + notes + warnings + proof_notes
     # J bounds the performance of w / mu and G that of w over the mu of Lemma 2: of nothing else.
@@ -139,7 +136,7 @@ def certify_fields(
         speaks=speaks,
         confidence=settings.confidence,
     )
-    return certificate.without_contradictions()
+    return examined(certificate)
 
 
 def require_finite(fields: Fields) -> None:

@@ -14,6 +14,9 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.samplers import evaluation_points
 from ocp_torch.samples import Samples
 
+# How often an interval covers the truth where nobody asks for another level.
+CONFIDENCE = 0.95
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -41,13 +44,13 @@ class Estimate:
 
     @property
     def above(self) -> float:
-        """The value with its bias and two standard errors on top: what a simulated upper side may claim."""
-        return self.value + (self.bias or 0.0) + 2.0 * self.se
+        """The upper end of the interval at `CONFIDENCE`: what an upper side may claim."""
+        return self.interval(CONFIDENCE)[1]
 
     @property
     def below(self) -> float:
-        """The value less its bias and two standard errors."""
-        return self.value - (self.bias or 0.0) - 2.0 * self.se
+        """The lower end of the interval at `CONFIDENCE`."""
+        return self.interval(CONFIDENCE)[0]
 
     def half_width(self, level: float) -> float:
         """Half of the confidence interval at ``level``: Student's t times the standard error, and all of the bias."""
@@ -62,8 +65,9 @@ class Estimate:
     def to_dict(self, level: float | None = None) -> dict:
         """JSON form, with the interval at ``level`` if one is given; fields that do not apply are left out."""
         extra = {k: v for k, v in (("bias", self.bias), ("controller", self.controller)) if v is not None}
-        interval = {} if level is None else {"interval": list(self.interval(level))}
-        return {"value": self.value, "se": self.se, **extra, **interval}
+        if level is not None:
+            extra |= {"half_width": self.half_width(level), "interval": list(self.interval(level))}
+        return {"value": self.value, "se": self.se, **extra}
 
 
 @torch.no_grad()

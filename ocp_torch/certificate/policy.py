@@ -18,7 +18,8 @@ from ocp_torch.calculus import CHUNK, Field
 from ocp_torch.certificate.assumptions import check_assumptions
 from ocp_torch.certificate.black_box import BlackBox
 from ocp_torch.certificate.certificate import Certificate, Run
-from ocp_torch.certificate.certify import BASELINE_PART, TANGENT_PART, in_float64, measured, raised, searches_of
+from ocp_torch.certificate.certify import BASELINE_PART, TANGENT_PART, in_float64, measured, searches_of
+from ocp_torch.certificate.contradictions import examined
 from ocp_torch.certificate.estimate import integral, replicated_samples
 from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.performance import simulate_performance
@@ -77,8 +78,6 @@ def certify_policy(
         # M is about the optimal controller, which the one from V is nearer to than anybody's.
         near = measured(problem, ValueLaw(problem, value), best, few, posed, settings)
         met = replace(met, sup_occupation=near.sup_occupation, a_priori_occupation=near.a_priori_occupation)
-        bounds = raised(bounds, met.sup_occupation)
-        lower = replace(lower, M=bounds.M)
     assumptions, notes = check_assumptions(problem, bounds, met, uses=(value is not None, False))
     coarse = isinstance(law, BlackBox) and law.precision is torch.float32
     if evaluated is not None:
@@ -111,7 +110,7 @@ def certify_policy(
             "lagrangian": smooth.below if smooth else None,
         },
     )
-    return certificate.without_contradictions()
+    return examined(certificate)
 
 
 def evaluate_policy(

@@ -17,13 +17,13 @@ import torch
 from torch import Tensor
 
 from ocp_torch import calculus, formulas
-from ocp_torch.bounds import ESTIMATED, Bounds
+from ocp_torch.bounds import Bounds
 from ocp_torch.calculus import CHUNK, chunked_gradient
 from ocp_torch.certificate.assumptions import Met, check_assumptions
 from ocp_torch.certificate.certificate import Certificate, Run
+from ocp_torch.certificate.contradictions import examined
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.lagrangian import Terms, best_multiples
-from ocp_torch.certificate.raising import raised
 from ocp_torch.certificate.regularity import largest_jump
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.stage import fit_closed_loop
@@ -31,6 +31,7 @@ from ocp_torch.certificate.wellposed import WellPosed
 from ocp_torch.control_cost import PowerCost
 from ocp_torch.control_laws import NETWORK, ControlLaw, control_laws
 from ocp_torch.fields.fields import Fields
+from ocp_torch.needs import SEARCHED
 from ocp_torch.problems.dataset import Dataset
 from ocp_torch.problems.problem import MARGIN
 from ocp_torch.samplers import derive_seed
@@ -76,12 +77,7 @@ def certify_recorded(problem: Dataset, trained, bounds: Bounds, settings: Certif
         jump=None if law is None else largest_jump(law, problem.dim),
         problem=posed(problem),
     )
-    bounds = raised(bounds, sup_occupation)
     F_M = None if fields.value is None else penalised(problem, fields, bounds.M, sets)
-    if F_M is not None and bounds.sources["M"] == ESTIMATED:
-        warnings.append(
-            f"F_M is below OPT only if M = {bounds.M:.4g}, a guess, is at least sup mu*: no sample can show it."
-        )
     if J is not None:
         warnings.append(
             f"J is above the controller's performance if C_V = {C_V:.4g}, by the samples met, bounds its value."
@@ -96,12 +92,14 @@ def certify_recorded(problem: Dataset, trained, bounds: Bounds, settings: Certif
         upper={"J": J if assumptions.regular_holds else None, "G": None, "lagrangian": None},
         perf={"value": None, "density": None},
         baseline={"zero": None},
-        assumptions=replace(assumptions, C_V=C_V if J is not None else None),
+        assumptions=replace(
+            assumptions, C_V=C_V if J is not None else None, basis=assumptions.basis | {"C_V": SEARCHED}
+        ),
         warnings=[*bounds.warnings, *notes, *warnings],
         confidence=settings.confidence,
         subject=kind,
     )
-    return certificate.without_contradictions()
+    return examined(certificate)
 
 
 @torch.no_grad()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ocp_torch.bounds import Bounds
+from ocp_torch.certificate.estimate import CONFIDENCE
 from ocp_torch.certificate.stage import StageSettings
 from ocp_torch.errors import require_choice, require_flag, require_integer, require_number
 
@@ -23,7 +24,7 @@ class CertificateSettings:
     mollify: bool | None = None  # average V over neighbours for the bound without M; None: where mu* is unbounded
     occupation_states: int = 144  # where the supremum of the occupation density is looked for; 0 skips it
     rigorous: bool = False  # a lower bound proved over cells, in one and two dimensions: a second, or up to two minutes
-    confidence: float = 0.95  # how often an interval covers the truth, by Student's t over the replicates
+    confidence: float = CONFIDENCE  # how often an interval covers the truth, by Student's t over the replicates
     tolerance: float = 5e-5  # relative; a trajectory's steps are halved until its cost changes by less
     horizon: str = TRUNCATED  # truncated: bounded tail in `bias`; random: an exponential time, no tail and more noise
     stage: StageSettings = field(default_factory=StageSettings)  # the fit to the closed loop

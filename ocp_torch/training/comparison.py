@@ -151,8 +151,7 @@ def row_of(folder: Path, name: str) -> dict:
             "perf": perf,
             "upper": upper,
             "exact": number(certificate["exact"]),
-            "gap_certified": number(certificate["gap"]["certified"]),
-            "gap_simulated": number(certificate["gap"]["simulated"]),
+            **{f"gap_{kind}": ranked(certificate["gap"][kind]) for kind in ("certified", "simulated")},
             "share": number(certificate["share"]["certified"]),
             "stopped": printable(certificate.get("stopped", "steps")),
             "warnings": len(list(certificate["warnings"])),
@@ -184,6 +183,12 @@ def number(value) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ValueError(f"{value!r} is not a number")
     return value
+
+
+def ranked(value) -> float | None:
+    """A gap to rank by: none where the bounds cross, as older versions wrote them, since one of them is then wrong."""
+    gap = number(value)
+    return gap if gap is not None and gap >= 0.0 else None
 
 
 def progress_of(folder: Path) -> str:

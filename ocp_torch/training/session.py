@@ -111,8 +111,8 @@ def with_warnings(trainer: Trainer, certificate: Certificate, notes: list[str]) 
 
 def _hand_out(trainer: Trainer, certificate: Certificate, fields: Fields, folder: Path) -> str:
     """Write `controller.safetensors` and `certificate.json`; the law that the controller follows."""
-    if certificate.best_perf is not None:
-        kind = certificate.best_perf[0]
+    if certificate.controller is not None:
+        kind = certificate.controller
     elif certificate.subject is not None:
         kind = certificate.subject
     else:

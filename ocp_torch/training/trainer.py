@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from ocp_torch.bounds import ESTIMATED, Bounds
+from ocp_torch.bounds import Bounds
 from ocp_torch.certificate import (
     Certificate,
     CertificateSettings,
@@ -19,7 +19,6 @@ from ocp_torch.certificate import (
     StageSettings,
     Trained,
     certify_fields,
-    retrained,
 )
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
@@ -191,30 +190,20 @@ class Trainer:
                 )
 
     def _wants_another_round(self) -> bool:
-        """Whether rounds are left and the gap is not good yet; never without a lower bound to measure it by.
-
-        An `M` that was a guess and turned out too small is raised for the next round, or given up.
-        """
+        """Whether rounds are left and the gap is not good yet; never without a lower bound to measure it by."""
         if self.round + 1 >= self.settings.rounds or self.fields.value is None or not self.problem.evaluable:
             return False  # without a simulation there is no gap to go by
-        guessed = self.bounds.sources["M"] == ESTIMATED and not self.bounds.unbounded
-        certificate = self.look(occupation_states=CertificateSettings.occupation_states if guessed else 0)
-        better = retrained(self.bounds, certificate.assumptions.estimated_sup_occupation)
-        if better != self.bounds:
-            self.use(better)
-            return True
-        gap = certificate.plain_gap
+        gap = self.look().plain_gap
         return gap is None or gap > self.settings.good_gap
 
     def use(self, bounds: Bounds) -> None:
         """Train and certify with ``bounds`` from now on."""
         self.bounds = self.objective.bounds = bounds
 
-    def look(self, occupation_states: int = 0) -> Certificate:
+    def look(self) -> Certificate:
         """A quick certificate of the averaged fields, on states that neither training nor `certify` uses."""
-        if occupation_states or self._seen is None or self._seen[:2] != (self.step, self.bounds):
-            certificate = self._quick(replace(QUICK, occupation_states=occupation_states))
-            self._seen = (self.step, self.bounds, certificate)
+        if self._seen is None or self._seen[:2] != (self.step, self.bounds):
+            self._seen = (self.step, self.bounds, self._quick(QUICK))
         return self._seen[2]
 
     def _quick(self, settings: CertificateSettings, fields: Fields | None = None) -> Certificate:

@@ -23,18 +23,23 @@ ROUNDING = 1e-4
 
 @dataclass(frozen=True)
 class Look:
-    """What the bounds were at ``step``; ``noise`` is two standard errors of both sides, in the units of ``gap``."""
+    """What the bounds were at ``step``; ``noise`` is half of the intervals of both sides, in the units of ``gap``.
+
+    Where bounds contradict each other nothing counts: such a look has neither a gap nor a performance.
+    """
 
     step: int
-    gap: float | None  # relative, from the lower bound to the simulated performance
-    perf: float | None  # simulated, with its bias and two standard errors
+    gap: (
+        float | None
+    )  # relative, from the lower bound to the simulated performance, between the far ends of their intervals
+    perf: float | None  # simulated, the upper end of its interval
     noise: float
 
     @classmethod
     def at(cls, step: int, certificate: Certificate) -> Look:
         lower, perf = certificate.best_lower, certificate.best_perf
-        errors = 2.0 * certificate.lower[lower[0]].se if lower else 0.0
-        errors += 2.0 * certificate.perf[perf[0]].se if perf else 0.0
+        errors = certificate.lower[lower[0]].half_width(certificate.confidence) if lower else 0.0
+        errors += certificate.perf[perf[0]].half_width(certificate.confidence) if perf else 0.0
         gap = certificate.gap["simulated"]
         unit = lower[1] if gap is not None else perf[1] if perf else 1.0
         return cls(step, gap, perf[1] if perf else None, errors / abs(unit) if unit else 0.0)
@@ -107,9 +112,10 @@ def hopeless(problem: Problem, bounds: Bounds, certificate: Certificate, seed: i
     lower, zero, perf = certificate.best_lower, certificate.baseline.get("zero"), certificate.best_perf
     trained = [e for e in certificate.lower.values() if e is not None]
     constant = best_constant(problem, bounds, seed) if trained else None
-    if constant is not None and certificate.assumptions.occupation_holds:
-        if lower is None or lower[1] + 2.0 * certificate.lower[lower[0]].se < constant - ROUNDING * abs(constant):
-            value = f"{lower[1]:.6g}" if lower else "not finite"
+    if constant is not None and certificate.counts("F_M"):
+        estimate = certificate.lower[lower[0]] if lower else None
+        if estimate is None or estimate.above < constant - ROUNDING * abs(constant):
+            value = f"{estimate.value:.6g}" if estimate else "not finite"
             notes.append(f"the lower bound, {value}, is worse than {constant:.6g}, that of the best constant V.")
     if perf is not None and zero is not None and zero.finite and perf[1] > zero.above:
         notes.append("the best controller is worse than doing nothing.")

@@ -1,0 +1,66 @@
+"""A certificate as a table for the terminal, and in words."""
+
+from __future__ import annotations
+
+
+def table(certificate: dict, searches: list[str] = ()) -> str:
+    """The certificate (as a dict of its schema) as a table for the terminal, and how its suprema were found."""
+    exact = certificate["exact"]
+    lines = [f"{certificate['problem']} / {certificate['method']}, seed {certificate['seed']}", ""]
+    covered = f"± {100.0 * certificate['confidence']:.6g} %" if "confidence" in certificate else "± se"
+    header = f"{'':26}{'value':>14}{covered:>11}{'of it bias':>11}" + (f"{'vs OPT':>12}" if exact else "")
+    lines += [header, "-" * len(header)]
+
+    def row(label: str, estimate: dict | None) -> None:
+        if estimate is None:
+            return
+        bias = f"{estimate['bias']:11.1e}" if "bias" in estimate else " " * 11
+        against = f"{100.0 * (estimate['value'] / exact - 1.0):+11.4f}%" if exact else ""
+        half = estimate["interval"][1] - estimate["value"] if "interval" in estimate else estimate["se"]
+        lines.append(f"{label:26}{estimate['value']:14.8f}{half:11.1e}{bias}{against}")
+
+    for name in ("F_M", "shifted", "rigorous"):
+        bound = certificate["lower"].get(name)
+        row(f"lower: {name}{', if' if bound and 'if' in bound else ''}", bound)
+    if exact is not None:
+        lines.append(f"{'OPT (exact)':26}{exact:14.8f}")
+    row("Perf: controller from V", certificate["perf"].get("value"))
+    row("Perf: controller w/mu", certificate["perf"].get("density"))
+    for name, estimate in certificate.get("perf_lower", {}).items():
+        row(f"Perf, at least: {name}", estimate)
+    row("Perf: this controller", certificate["perf"].get("given"))
+    for name, label in (("lagrangian", "Lagrangian"), ("evaluation", "evaluation"), ("G", "G"), ("J", "J")):
+        row(f"upper: {label}", certificate["upper"].get(name))
+    row("Perf: doing nothing", certificate["baseline"]["zero"])
+    lines.append("-" * len(header))
+    gap, share = certificate["gap"], certificate["share"]
+    for kind in ("certified", "simulated"):
+        if gap[kind] is not None:
+            part = f", {100 * share[kind]:.2f}% of the gain over doing nothing" if share[kind] is not None else ""
+            lines.append(f"gap, {kind}: {100.0 * gap[kind]:.4f}%{part}")
+    if gap.get("conditional") is not None:
+        lines.append(f"gap, if {supposed(certificate)}: {100.0 * gap['conditional']:.4f}%, which rests on a guess")
+    lines += in_words(certificate)
+    lines += searches
+    lines += [f"warning: {warning}" for warning in certificate["warnings"]]
+    return "\n".join(lines)
+
+
+def in_words(certificate: dict) -> list[str]:
+    """The sub-optimality of the controller as a sentence, if there is anything to say."""
+    found = certificate.get("suboptimality") or {}
+    percent = lambda x: f"{100.0 * x:.3g} %"
+    least, most = found.get("at_least"), found.get("at_most")
+    parts = [f"at most {percent(most)}"] if most is not None else []
+    if least:
+        parts.append(f"at least {percent(least)}")
+    if not parts:
+        return []
+    taken = "".join(f", taking {sentence}" for sentence in found.get("takes", ()))
+    sure = percent(certificate["confidence"])
+    return [f"the controller is {' and '.join(parts)} worse than the optimum ({sure} sure of the sampling{taken})"]
+
+
+def supposed(certificate: dict) -> str:
+    """What the lower bounds of a certificate (as a dict of its schema) that rest on guesses suppose."""
+    return " and ".join(dict.fromkeys(b["if"] for b in certificate["lower"].values() if b and "if" in b))
