@@ -225,7 +225,7 @@ def certification_stage(
         return None, [f"the certification stage failed: {error}"]
     fitted = in_float64(fitted)
     loop = ClosedLoop(problem, control_laws(trained.occupation, problem, fields, bounds)[kind])
-    loop_sets = [Samples.concatenate([Samples.of(loop, x) for x in s.x.split(CHUNK)]) for s in sets]
+    loop_sets = [Samples.concatenate([Samples.of(loop, p.x, weight=p.weight) for p in s.split(CHUNK)]) for s in sets]
     value = fields.value if fields.value is not None else fitted.value
     initial = lower.initial if lower is not None else None
     return closed_loop_bounds(loop, value, fitted.log_occupation, loop_sets, settings.ascents, kind, initial), []

@@ -129,7 +129,7 @@ def evaluate_policy(
         return None, None
     fitted = in_float64(fit_closed_loop(problem, law, None, network, bounds, settings.stage, seed))
     loop = ClosedLoop(problem, law)
-    sets = [Samples.concatenate([Samples.of(loop, x) for x in s.x.split(CHUNK)]) for s in few]
+    sets = [Samples.concatenate([Samples.of(loop, p.x, weight=p.weight) for p in s.split(CHUNK)]) for s in few]
     with torch.no_grad():
         initial = [integral(s, fitted.value(s.x) * s.mu0) for s in wide]
     found = closed_loop_bounds(loop, fitted.value, fitted.log_occupation, sets, settings.ascents, GIVEN, initial)

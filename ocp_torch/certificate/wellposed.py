@@ -10,6 +10,7 @@ from torch import Tensor
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.errors import InputError
 from ocp_torch.extremum import supremum
+from ocp_torch.mixtures import worth
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samplers import scrambled_sobol
 from ocp_torch.samples import Samples
@@ -20,6 +21,8 @@ PROBES, MOST_SEAMS = 256, 32
 ROUNDING, SEAM_STEP, SEAM_JUMP = 1e-6, 1e-9, 1e-5
 # How far the sampled mass of mu0 may be from 1, beside its confidence interval at that level.
 MASS_TOLERANCE, MASS_LEVEL = 1e-4, 0.9999
+# What the states' masses must be worth, as a part of as many equal ones: below, a few states carry mu0 and no mass is known.
+LEAST_WORTH = 0.02
 
 
 @dataclass(frozen=True)
@@ -63,10 +66,19 @@ def check_problem(problem: Problem, sets: list[Samples]) -> WellPosed:
     positive = least >= -ROUNDING * abs(mass.value)
     if not positive:
         warnings.append(f"no bound is used: the initial density falls to {least:.3g}, but must not be negative.")
+    carried = worth(torch.cat([s.weight * s.mu0 for s in sets]).clamp_min(0.0))
     whole = abs(mass.value - 1.0) <= MASS_TOLERANCE + mass.half_width(MASS_LEVEL)
     if not whole:
-        warnings.append(f"no bound is used: the initial density integrates to {mass.value:.4g}, but must to 1.")
-    sound = not shifted and positive and whole
+        warnings.append(
+            f"no bound is used: the initial density integrates to {mass.value:.4g} over what a search found of it, but must "
+            "to 1."
+        )
+    elif carried < LEAST_WORTH:
+        warnings.append(
+            "no bound is used: hardly any sampled state carries mass of the initial density, which is too narrow for its "
+            f"integral to be known (all states are worth as much as {100.0 * carried:.2g} % of them)."
+        )
+    sound = not shifted and positive and whole and carried >= LEAST_WORTH
     return WellPosed(sound, nonnegative, not {"a", "B"} & set(seams), smallest, mass.value, warnings)
 
 
