@@ -56,3 +56,38 @@ class NarrowStart(Problem):
     @property
     def idle(self) -> float:
         return 1.0 + self.mean_wave(lambda c: self.discount / (self.discount - TURN * 1j * c))
+
+
+class JumpSink(Problem):
+    """`dx = u` carried by a drift into the plane `x_1 = at`, at which it jumps from `speed` to `-speed`, or changes within
+    ``width``; in more dimensions only where `|x_2 - 1/2| < patch`, if a patch is given, with smooth edges."""
+
+    def __init__(
+        self, dim: int = 1, width: float = 0.0, at: float = 0.3, speed: float = 0.4, patch: float | None = None
+    ):
+        super().__init__(dim=dim)
+        self.width, self.at, self.speed, self.patch = width, at, speed, patch
+        self.state_cost_bound = self.value_bound = 1.0
+
+    def state_cost(self, x):
+        """1 but for a smooth dip to 0 beside the sink."""
+        return 1.0 - (-0.5 * (short_way(x[:, 0], self.at + 0.2) / 0.05).square()).exp()
+
+    def drift(self, x):
+        r = short_way(x[:, 0], self.at)
+        turn = (r / self.width).tanh() if self.width else torch.where(r > 0.0, 1.0, -1.0).to(x)
+        first = -self.speed * turn * (math.pi * r).cos().square()
+        if self.patch is not None:
+            first = first * (-((short_way(x[:, 1], 0.5) / self.patch) ** 4)).exp()
+        return torch.cat([first.unsqueeze(-1), torch.zeros_like(x[:, 1:])], dim=-1)
+
+
+class JumpingMatrix(Problem):
+    """`dx = B(x) u` in which each column of `B` is halved where its coordinate is between 0.2 and 0.6."""
+
+    def state_cost(self, x):
+        return 1.0 - 0.5 * (TURN * x).cos().mean(dim=-1)
+
+    def control_matrix(self, x):
+        y = x.remainder(1.0)
+        return torch.diag_embed(torch.where((y > 0.2) & (y < 0.6), 0.5, 1.0).to(x))

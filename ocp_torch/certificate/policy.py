@@ -80,6 +80,9 @@ def certify_policy(
         bounds = raised(bounds, met.sup_occupation)
         lower = replace(lower, M=bounds.M)
     assumptions, notes = check_assumptions(problem, bounds, met, uses=(value is not None, False))
+    if evaluated is not None and evaluated.hidden is not None:
+        notes.append(f"J and the Lagrangian bound are not used: {evaluated.hidden.sentence}.")
+        assumptions = replace(assumptions, regular_holds=False)
     coarse = isinstance(law, BlackBox) and law.precision is torch.float32
     if evaluated is not None:
         assumptions = assumptions.with_value_bound(evaluated.C_V)
