@@ -14,11 +14,14 @@ from ocp_torch.bounds import resolve_bounds
 from ocp_torch.errors import InputError, require_choice, require_number
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samplers import derive_seed
+from ocp_torch.starts import drawn_starts, start_law
 
 # Branch of the seed tree for initial states of episodes, beside those of training.
 EPISODE_STREAM = 4
 # Rejections at most for one start: `mu0` has mean 1, so that a bound of its supremum is met soon.
 MOST_TRIES = 10_000
+# Where `mu0` is narrow episodes start at one of so many draws from it.
+DRAWN_STARTS = 4096
 # By default a control is held for this part of the discount time `1 / rho`, and an episode takes so many of them.
 HELD, LENGTH = 0.1, 5.0
 # Coordinates drawn, as hands of clocks.
@@ -82,6 +85,8 @@ def _environment_class() -> type:
             self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (problem.control_dim,), np.float32)
             self.generator = torch.Generator().manual_seed(derive_seed(seed, EPISODE_STREAM))
             candidates = torch.rand(4096, problem.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+            narrow = not start_law(problem).is_uniform
+            self._drawn = drawn_starts(problem, DRAWN_STARTS, derive_seed(seed, EPISODE_STREAM)) if narrow else None
             self._ceiling = 1.05 * float(problem.initial_density(candidates).max())
             self._weight = -math.expm1(-problem.discount * time_step)
             self.x, self.elapsed = torch.full((1, problem.dim), 0.5, dtype=torch.float64), 0.0
@@ -91,6 +96,10 @@ def _environment_class() -> type:
             if seed is not None:
                 self.generator.manual_seed(derive_seed(seed, EPISODE_STREAM))
             self.elapsed = 0.0
+            if self._drawn is not None:
+                row = torch.randint(len(self._drawn), (1,), generator=self.generator)
+                self.x = self._drawn[row]
+                return observe(self.x), {"state": self.x[0].numpy()}
             for _ in range(MOST_TRIES):
                 self.x = torch.rand(1, self.problem.dim, dtype=torch.float64, generator=self.generator)
                 level = torch.rand((), dtype=torch.float64, generator=self.generator)

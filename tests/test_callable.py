@@ -172,6 +172,11 @@ def test_what_goes_wrong_is_named_with_the_state(name):
     assert "\n" not in str(caught.value)
 
 
+def test_a_drift_that_is_zero_at_the_seam_does_not_jump_there():
+    oracle = lambda x: (np.ones(len(x)), -0.3 * np.sin(TURN * x), np.ones((len(x), 1, 1)))
+    assert Callable(oracle, dim=1).dim == 1
+
+
 @given(st.floats(0.55, 0.999))
 def test_an_exception_met_later_is_traced_to_its_state(limit):
     oracle = raises_beyond(2.0)

@@ -9,6 +9,8 @@ import torch
 import zoo
 from ocp_torch.bounds import resolve_bounds
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
+from ocp_torch.certificate.estimate import replicated_samples
+from ocp_torch.certificate.wellposed import check_problem
 from ocp_torch.control_laws import NETWORK
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
@@ -168,6 +170,38 @@ def test_a_cost_that_jumps_at_the_seam_is_said_and_allowed():
     certificate = certified(Seam(), value=lambda x: 0.0 * x[:, 0])
     assert certificate.best_lower is not None
     assert any("passes from 1 to 0" in w for w in certificate.warnings)
+
+
+class Odd(Circle):
+    """A drift that is 0 at the seam, as smooth as can be."""
+
+    def __init__(self, size: float = 1.0) -> None:
+        super().__init__()
+        self.size = size
+
+    def drift(self, x):
+        return -self.size * (2.0 * torch.pi * x).sin()
+
+
+class SeamDrift(Circle):
+    """Jumps at the seam by a ten-thousandth of its largest value."""
+
+    def drift(self, x):
+        return (2.0 * torch.pi * x).sin() + 1e-4 * x.remainder(1.0)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
+def test_a_function_that_is_zero_at_the_seam_does_not_jump_there(size):
+    problem = Odd(size)
+    posed = check_problem(problem, replicated_samples(problem, 256, 2, 0, divergences=False))
+    assert posed.smooth_seam
+    assert posed.warnings == []
+
+
+def test_a_small_jump_of_the_drift_at_the_seam_is_seen():
+    problem = SeamDrift()
+    posed = check_problem(problem, replicated_samples(problem, 256, 2, 0, divergences=False))
+    assert not posed.smooth_seam
 
 
 def test_weights_that_are_not_numbers():

@@ -122,8 +122,8 @@ def check_assumptions(
     if jumps:
         at = [round(c, 4) for c in met.jump.x[:6].tolist()] + (["..."] if len(met.jump.x) > 6 else [])
         warnings.append(
-            f"J and the Lagrangian bound are not used: the controller jumps by {met.jump.size:.3g}, at x = {at} "
-            "for one, and they need one without jumps."
+            f"J and the Lagrangian bound are not used: the {met.jump.what} {met.jump.verb} by {met.jump.size:.3g}, at "
+            f"x = {at} for one, and they need all to be without jumps."
         )
     assumptions = Assumptions(
         bounds.M if uses_M else None,

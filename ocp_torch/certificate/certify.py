@@ -90,10 +90,10 @@ def certify_fields(
     warnings: list[str] = []
     finite = {name: s for name, s in simulated.items() if s.perf.finite}
     best = min(finite, key=lambda n: finite[n].perf.above, default=next(iter(laws)))
-    J = G = None
+    J = G = hidden = None
     if has_density and problem.gives_divergences:
         mu = occupation_density(occupation, problem, fields, bounds)
-        J, G = upper_side(problem, admissible_density(occupation, problem, fields, bounds), mu, few, bounds.C_V)
+        J, G, hidden = upper_side(problem, admissible_density(occupation, problem, fields, bounds), mu, few, bounds.C_V)
         with torch.no_grad():
             vanishes = any(bool((mu(samples.x[:4096]) <= 0.0).any()) for samples in few)
         if best == "density" and vanishes:
@@ -108,6 +108,12 @@ def certify_fields(
     warnings = list(bounds.warnings) + notes + warnings + proof_notes
     # J bounds the performance of w / mu and G that of w over the mu of Lemma 2: of nothing else.
     speaks = {"J": best == "density", "G": best == "density" and occupation == CLOSED and assumptions.value_holds}
+    if met.jump.in_problem or not posed.smooth_seam:
+        G = None
+    hidden = hidden or (stage.hidden if stage is not None else None)
+    if hidden is not None:
+        warnings.append(f"J, G and the Lagrangian bound are not used: {hidden.sentence}.")
+        assumptions, J, G = replace(assumptions, regular_holds=False), None, None
     if not assumptions.regular_holds:
         # On a jump the divergence is not what the stage sees: a wrong number is not shown at all.
         stage = None
@@ -191,7 +197,9 @@ def measured(
     """What the assumptions are held against, under the controller ``law``."""
     with torch.no_grad():
         sup_control = max(float(law(samples.x[:4096]).norm(dim=-1).max()) for samples in sets)
-    jump = largest_jump(law, problem.dim)
+    states = torch.cat([samples.x[:256] for samples in sets])
+    near = states if simulated is None else torch.cat([states, simulated.end_states[:4096]])
+    jump = largest_jump(law, problem.dim, problem=problem, near=near)
     occupation = a_priori = None
     # Where the problem says that mu* is unbounded there is no M to hold a largest density against.
     if simulated is not None and settings.occupation_states and problem.occupation_bound != math.inf:
@@ -222,7 +230,7 @@ def certification_stage(
         return None, [f"the certification stage failed: {error}"]
     fitted = in_float64(fitted)
     loop = ClosedLoop(problem, control_laws(trained.occupation, problem, fields, bounds)[kind])
-    loop_sets = [Samples.concatenate([Samples.of(loop, x) for x in s.x.split(CHUNK)]) for s in sets]
+    loop_sets = [Samples.concatenate([Samples.of(loop, p.x, weight=p.weight) for p in s.split(CHUNK)]) for s in sets]
     value = fields.value if fields.value is not None else fitted.value
     initial = lower.initial if lower is not None else None
     return closed_loop_bounds(loop, value, fitted.log_occupation, loop_sets, settings.ascents, kind, initial), []

@@ -18,9 +18,11 @@ from ocp_torch.fields.spectrum import STATES, standardised, waves_of
 WAVES, CHUNK = 96, 8192
 
 
-def integrals(states: list[Tensor], values: list[Tensor]) -> list[float]:
-    """The mean of each of ``values`` ``(N,)`` over its set of uniform ``states`` ``(N, d)``, with the noise of plane waves
-    taken off."""
+def integrals(states: list[Tensor], values: list[Tensor], weights: list[Tensor] | None = None) -> list[float]:
+    """The mean of each of ``values`` ``(N,)`` over its set of ``states`` ``(N, d)``, with the noise of plane waves taken off
+    where the states are uniform; else ``weights`` ``(N,)`` are one over their density, and no wave explains a narrow peak."""
+    if weights is not None and any(bool((w != 1.0).any()) for w in weights):
+        return [float((w * v).mean()) for w, v in zip(weights, values, strict=True)]
     plain = [float(v.mean()) for v in values]
     if len(states) < 2:
         return plain

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ocp_torch.certificate.student import t_factor
 from ocp_torch.problems.problem import Problem
-from ocp_torch.samplers import evaluation_points
 from ocp_torch.samples import Samples
+from ocp_torch.starts import evaluation_law
 
 # How often an interval covers the truth where nobody asks for another level.
 CONFIDENCE = 0.95
@@ -72,9 +72,11 @@ class Estimate:
 
 @torch.no_grad()
 def replicated_samples(problem: Problem, count: int, replicates: int, seed: int, divergences: bool) -> list[Samples]:
-    """``replicates`` independent scrambled Sobol sets of ``count`` states with the problem's data, in float64."""
-    sets = [evaluation_points(count, problem.dim, r, seed) for r in range(replicates)]
-    return [Samples.of(problem, x, divergences=divergences) for x in sets]
+    """``replicates`` independent scrambled Sobol sets of ``count`` states with the problem's data, in float64; weighted, with
+    more states where `mu0` or `f` is large on a small set."""
+    law = evaluation_law(problem)
+    sets = [law.draw(count, r, seed) for r in range(replicates)]
+    return [Samples.of(problem, x, divergences=divergences, weight=weight) for x, weight in sets]
 
 
 def integral(samples: Samples, integrand: Tensor) -> float:

@@ -29,6 +29,7 @@ from torch import Tensor
 from ocp_torch import formulas
 from ocp_torch.calculus import CHUNK, Field, chunked_gradient
 from ocp_torch.certificate.estimate import Estimate, integral
+from ocp_torch.certificate.hidden import Flux, Hidden, hidden_divergence
 from ocp_torch.certificate.shifted import slack_function
 from ocp_torch.extremum import Extremum, minimiser, supremum
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -50,6 +51,7 @@ class ClosedLoopBounds:
     residual: float  # E[|r|]
     below: Estimate  # of Perf(u) from below: 2. with the signs turned
     sandwich: tuple[Estimate, Estimate]  # E[V mu0] - eps_lo <= Perf(u) <= E[V mu0] + eps_hi, by 1. alone
+    hidden: Hidden | None = None  # a divergence that the residual does not see: only the sandwich stands then
 
 
 def closed_loop_bounds(
@@ -67,7 +69,7 @@ def closed_loop_bounds(
     """
     values = [_integrands(loop, value, log_occupation, samples) for samples in sets]
     states = torch.cat([samples.x for samples in sets])
-    slack_all = torch.cat([slack for *_, slack in values])
+    slack_all = torch.cat([slack for *_, slack, _ in values])
     top = _climbed(value, torch.cat([v for v, *_ in values]), states, ascents)
     slack = slack_function(loop, value)
     eps_lo = _climbed(slack, slack_all, states, ascents)
@@ -98,6 +100,7 @@ def closed_loop_bounds(
         mean_residual,
         Estimate.of(below),
         (Estimate.of(low), Estimate.of(high)),
+        hidden_divergence([flux for *_, flux in values]),
     )
 
 
@@ -140,12 +143,13 @@ def best_multiples(terms: list[Terms], bound: Callable[[Terms, float], float]) -
 
 @torch.no_grad()
 def _integrands(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples):
-    """`V`, `mu Q_u`, `r` and `Q_u` at the states of ``samples``."""
+    """`V`, `mu Q_u`, `r` and `Q_u` at the states of ``samples``, and the flux `mu g_u`."""
     v, gradient = chunked_gradient(value, samples.x)
     slack = formulas.hjb_slack(samples, v, gradient, loop.control_cost, loop.discount)
     pairs = [formulas.drifting_loss(part, log_occupation, loop.discount) for part in samples.split(CHUNK)]
     mu, spent = torch.cat([m for m, _ in pairs]), torch.cat([s for _, s in pairs])
-    return v, mu * slack, samples.mu0 - spent, slack
+    flux = Flux(samples.x, samples.weight, spent - mu, mu.unsqueeze(-1) * samples.a / loop.discount)
+    return v, mu * slack, samples.mu0 - spent, slack, flux
 
 
 def _climbed(function, values: torch.Tensor, states: torch.Tensor, ascents: int) -> Extremum:

@@ -23,8 +23,9 @@ from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSetting
 from ocp_torch.certificate.simulation import Dynamics, discounted_integral, rate_at, refined
 from ocp_torch.control_laws import ControlLaw, ValueLaw
 from ocp_torch.problems.problem import Problem
-from ocp_torch.samplers import derive_seed, evaluation_points
+from ocp_torch.samplers import derive_seed
 from ocp_torch.samples import Samples
+from ocp_torch.starts import initial_points
 
 # A kink of V is met at the start of a trajectory or never, and what is late counts little: early steps are shorter.
 GRADING = 2.0
@@ -64,10 +65,13 @@ def _dynamics(problem: Problem, law: ControlLaw, value: Field | None) -> Dynamic
     return dynamics
 
 
-def starting_points(trajectories: int, dim: int, replicates: int, seed: int) -> Tensor:
-    """The starts of all replicates, one after the other, ``(replicates * trajectories, dim)``."""
-    sets = [evaluation_points(trajectories, dim, SIMULATION_REPLICATE + r, seed) for r in range(replicates)]
-    return torch.cat(sets)
+def starting_points(
+    problem: Problem, trajectories: int, replicates: int, seed: int, extra: int = 0
+) -> tuple[Tensor, Tensor]:
+    """The starts of all replicates, one after the other, ``(replicates * trajectories, d + extra)``, and the mass of `mu0`
+    that each stands for (see `initial_points`)."""
+    sets = [initial_points(problem, trajectories, SIMULATION_REPLICATE + r, seed, extra) for r in range(replicates)]
+    return torch.cat([x for x, _ in sets]), torch.cat([mass for _, mass in sets])
 
 
 def simulate_performance(
@@ -81,7 +85,7 @@ def simulate_performance(
     horizon: str = TRUNCATED,
     tolerance: float = CertificateSettings.tolerance,
 ) -> Simulated:
-    """Perf of ``law`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts.
+    """Perf of ``law`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts, near `mu0`.
 
     With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is
     added. Steps are halved until a trajectory changes by less than ``tolerance``, relative to the answer, or all of them by
@@ -90,9 +94,8 @@ def simulate_performance(
     """
     dim, rho = problem.dim, problem.discount
     random = horizon == RANDOM
-    points = starting_points(trajectories, dim + random, replicates, seed)
+    points, mass = starting_points(problem, trajectories, replicates, seed, extra=int(random))
     x0 = points[:, :dim]
-    mu0 = problem.initial_density(x0)
     dynamics = _dynamics(problem, law, value)
     with torch.no_grad():
         velocity, rate = dynamics(x0)
@@ -100,7 +103,7 @@ def simulate_performance(
     if not (torch.isfinite(velocity).all() and torch.isfinite(rate).all()):
         return Simulated(Estimate(math.nan, math.nan), math.nan, x0)
     # By the slack's definition `V - Q_u = f + R(u) + grad V . g / rho`: the answer's size also where `E[V mu0]` is far off.
-    size = max(float((mu0 * (base + rate)).mean().abs()), LEAST * float((mu0 * problem.state_cost(x0)).mean()), 1e-12)
+    size = max(float((mass * (base + rate)).mean().abs()), LEAST * float((mass * problem.state_cost(x0)).mean()), 1e-12)
     largest_rate = RATE_ROOM * float(rate.abs().max())
     if random:
         times = -torch.log1p(-points[:, dim]) / rho
@@ -112,13 +115,13 @@ def simulate_performance(
     speed = float(velocity.norm(dim=-1).max())
     steps = max(8, 2 * math.ceil(0.5 * longest * max(rho / 0.4, speed / 0.2)))
     generator = torch.Generator().manual_seed(derive_seed(seed, SIMULATION_REPLICATE))
-    means = lambda results: (mu0 * results).reshape(replicates, trajectories).mean(dim=1)
+    means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
     noise = lambda results: Estimate.of(means(results).tolist()).se
-    result, end, bias = refined(integrate, mu0, steps, tolerance * size, generator, noise)
+    result, end, bias = refined(integrate, mass, steps, tolerance * size, generator, noise)
     if not random:
         with torch.no_grad():
             largest_rate = max(largest_rate, RATE_ROOM * float(dynamics(end)[1].abs().max()))
-        bias += math.exp(-rho * longest) * largest_rate * float(mu0.mean())
+        bias += math.exp(-rho * longest) * largest_rate * float(mass.mean())
     parts = means(result).tolist()
     totals = [part + (initial[r % len(initial)] if initial else 0.0) for r, part in enumerate(parts)]
     return Simulated(Estimate.of(totals, bias=bias), None if random else float((base + result).max()), end)

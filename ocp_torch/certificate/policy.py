@@ -79,6 +79,9 @@ def certify_policy(
         near = measured(problem, ValueLaw(problem, value), best, few, posed, settings)
         met = replace(met, sup_occupation=near.sup_occupation, a_priori_occupation=near.a_priori_occupation)
     assumptions, notes = check_assumptions(problem, bounds, met, uses=(value is not None, False))
+    if evaluated is not None and evaluated.hidden is not None:
+        notes.append(f"J and the Lagrangian bound are not used: {evaluated.hidden.sentence}.")
+        assumptions = replace(assumptions, regular_holds=False)
     coarse = isinstance(law, BlackBox) and law.precision is torch.float32
     if evaluated is not None:
         assumptions = assumptions.with_value_bound(evaluated.C_V)
@@ -128,7 +131,7 @@ def evaluate_policy(
         return None, None
     fitted = in_float64(fit_closed_loop(problem, law, None, network, bounds, settings.stage, seed))
     loop = ClosedLoop(problem, law)
-    sets = [Samples.concatenate([Samples.of(loop, x) for x in s.x.split(CHUNK)]) for s in few]
+    sets = [Samples.concatenate([Samples.of(loop, p.x, weight=p.weight) for p in s.split(CHUNK)]) for s in few]
     with torch.no_grad():
         initial = [integral(s, fitted.value(s.x) * s.mu0) for s in wide]
     found = closed_loop_bounds(loop, fitted.value, fitted.log_occupation, sets, settings.ascents, GIVEN, initial)

@@ -80,7 +80,7 @@ class Shift:
         beside: SlackParts | None = None,
     ) -> Shift:
         """The best multiple of ``value``, whose ``parts`` on ``sets`` are known; the supremum is sought ``beside`` too."""
-        initial = integrals([samples.x for samples in sets], [p.initial for p in parts])
+        initial = integrals([s.x for s in sets], [p.initial for p in parts], [s.weight for s in sets])
         everywhere = SlackParts.join(parts if beside is None else [*parts, beside])
         theta, largest = best_shift(problem, value, everywhere, sum(initial) / len(initial), ascents)
         return cls(theta, largest, initial, radius)

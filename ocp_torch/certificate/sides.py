@@ -3,12 +3,14 @@ r"""The two sides of the certificate that need no simulation: `F_M` and the shif
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 
 from ocp_torch import calculus, formulas
 from ocp_torch.calculus import CHUNK, Field
 from ocp_torch.certificate.estimate import Estimate, integral
+from ocp_torch.certificate.hidden import Flux, Hidden, hidden_divergence
 from ocp_torch.certificate.mollified import mollified_shift
 from ocp_torch.certificate.shifted import Shift, slack_parts
 from ocp_torch.control_laws import Density
@@ -50,26 +52,38 @@ def lower_side(
     return LowerSide(M, own.initial, violation, own, best)
 
 
+class UpperSide(NamedTuple):
+    """`J`, `G` where there is no drift, and a divergence that neither sees, if one was found: they stand without."""
+
+    J: Estimate
+    G: Estimate | None
+    hidden: Hidden | None
+
+
 def upper_side(
     problem: Problem, control_density: Field, occupation: Density, sets: list[Samples], C_V: float
-) -> tuple[Estimate, Estimate | None]:
+) -> UpperSide:
     r"""`J(w, mu) = E[(f + R(w/mu)) mu + C_V max(mu0 - mu - div(a mu + B w)/rho, 0)]` and, without drift, `G = min_mu J`.
 
     `OPT <= J` for every `w` and `mu >= 0` once `C_V >= sup V*`; `Perf(w/mu) <= J` once `C_V >= sup V^u` (Proposition 6).
     """
-    J, G = [], []
+    J, G, fluxes = [], [], []
     for samples in sets:
         parts = [_upper_integrands(problem, control_density, occupation, s, C_V) for s in samples.split(CHUNK)]
-        J.append(integral(samples, torch.cat([j for j, _ in parts])))
+        J.append(integral(samples, torch.cat([j for j, *_ in parts])))
         if problem.driftless:
-            G.append(integral(samples, torch.cat([g for _, g in parts])))
-    return Estimate.of(J), Estimate.of(G) if G else None
+            G.append(integral(samples, torch.cat([g for _, g, *_ in parts])))
+        moved = (torch.cat(columns) / problem.discount for columns in list(zip(*parts, strict=True))[2:])
+        fluxes.append(Flux(samples.x, samples.weight, *moved))
+    return UpperSide(Estimate.of(J), Estimate.of(G) if G else None, hidden_divergence(fluxes))
 
 
 @torch.no_grad()
 def _upper_integrands(problem, control_density, occupation, samples: Samples, C_V: float):
+    """The integrands of `J` and, without drift, `G`; `div(a mu + B w)` and `a mu + B w`."""
     cost, rho = problem.control_cost, problem.discount
     w, inflow = formulas.controlled_inflow(samples, control_density, rho)
+    spread, pushed = rho * (samples.mu0 - inflow), torch.einsum("ndm,nm->nd", samples.B, w)
     if problem.driftless:
         mu = occupation(samples.x)
         # An infinite mu stands still at no cost where f = 0: the closed minimum has that limit, J needs the number.
@@ -78,8 +92,9 @@ def _upper_integrands(problem, control_density, occupation, samples: Samples, C_
             formulas.primal_integrand(samples, w, torch.where(torch.isfinite(mu), mu, 1.0), inflow - mu, cost, C_V),
             cost.primal_minimum(w, samples.f, C_V, inflow),
         )
-        return J, cost.primal_minimum(w, samples.f, C_V, inflow)
+        return J, cost.primal_minimum(w, samples.f, C_V, inflow), spread, pushed
     div_a, _ = samples.require_divergences("J")
     mu, derivative = calculus.directional_derivative(occupation, samples.x, samples.a)
-    residual = inflow - mu - (mu * div_a + derivative) / rho
-    return formulas.primal_integrand(samples, w, mu, residual, cost, C_V), None
+    drifted = mu * div_a + derivative
+    J = formulas.primal_integrand(samples, w, mu, inflow - mu - drifted / rho, cost, C_V)
+    return J, None, spread + drifted, pushed + mu.unsqueeze(-1) * samples.a

@@ -10,6 +10,7 @@ from torch import Tensor
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.errors import InputError
 from ocp_torch.extremum import supremum
+from ocp_torch.mixtures import worth
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samplers import scrambled_sobol
 from ocp_torch.samples import Samples
@@ -20,6 +21,8 @@ PROBES, MOST_SEAMS = 256, 32
 ROUNDING, SEAM_STEP, SEAM_JUMP = 1e-6, 1e-9, 1e-5
 # How far the sampled mass of mu0 may be from 1, beside its confidence interval at that level.
 MASS_TOLERANCE, MASS_LEVEL = 1e-4, 0.9999
+# What the states' masses must be worth, as a part of as many equal ones: below, a few states carry mu0 and no mass is known.
+LEAST_WORTH = 0.02
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,8 @@ def check_problem(problem: Problem, sets: list[Samples]) -> WellPosed:
         if not all(bool(torch.isfinite(getattr(samples, name)).all()) for samples in sets):
             raise InputError(f"{_NAMES[name]} is not finite at a sampled state; it must be finite on the whole torus.")
     warnings: list[str] = []
-    shifted, seams = _periods(problem), _seams(problem)
+    sizes = {name: max(float(getattr(samples, name).abs().max()) for samples in sets) for name in _NAMES}
+    shifted, seams = _periods(problem, sizes), _seams(problem, sizes)
     for name, size in shifted.items():
         warnings.append(
             f"no bound is used: {_NAMES[name]} is not periodic, it changes by {size:.3g} when whole numbers are added to x."
@@ -63,42 +67,52 @@ def check_problem(problem: Problem, sets: list[Samples]) -> WellPosed:
     positive = least >= -ROUNDING * abs(mass.value)
     if not positive:
         warnings.append(f"no bound is used: the initial density falls to {least:.3g}, but must not be negative.")
+    carried = worth(torch.cat([s.weight * s.mu0 for s in sets]).clamp_min(0.0))
     whole = abs(mass.value - 1.0) <= MASS_TOLERANCE + mass.half_width(MASS_LEVEL)
     if not whole:
-        warnings.append(f"no bound is used: the initial density integrates to {mass.value:.4g}, but must to 1.")
-    sound = not shifted and positive and whole
+        warnings.append(
+            f"no bound is used: the initial density integrates to {mass.value:.4g} over what a search found of it, but must "
+            "to 1."
+        )
+    elif carried < LEAST_WORTH:
+        warnings.append(
+            "no bound is used: hardly any sampled state carries mass of the initial density, which is too narrow for its "
+            f"integral to be known (all states are worth as much as {100.0 * carried:.2g} % of them)."
+        )
+    sound = not shifted and positive and whole and carried >= LEAST_WORTH
     return WellPosed(sound, nonnegative, not {"a", "B"} & set(seams), smallest, mass.value, warnings)
 
 
 _NAMES = {"f": "state_cost", "a": "drift", "B": "control_matrix", "mu0": "initial_density"}
 
 
-def _differences(problem: Problem, x: Tensor, y: Tensor, tolerance: float) -> dict[str, float]:
-    """The largest difference of each function between rows of ``x`` and ``y``, where it is above rounding."""
+def _differences(problem: Problem, x: Tensor, y: Tensor, tolerance: float, sizes: dict[str, float]) -> dict[str, float]:
+    """The largest difference of each function between rows of ``x`` and ``y``, where it is above that part of its largest
+    value anywhere: at the seam a function that is odd is nearly 0."""
     here, there = (Samples.of(problem, z, divergences=False) for z in (x, y))
     found = {}
     for name in _NAMES:
         left, right = getattr(here, name), getattr(there, name)
         size = float((left - right).abs().max())
-        if not size <= tolerance * max(float(left.abs().max()), float(right.abs().max())):
+        if not size <= tolerance * max(sizes[name], float(left.abs().max()), float(right.abs().max())):
             found[name] = size
     return found
 
 
-def _periods(problem: Problem) -> dict[str, float]:
+def _periods(problem: Problem, sizes: dict[str, float]) -> dict[str, float]:
     x = scrambled_sobol(PROBES, problem.dim, 2, torch.float64)
     whole = torch.randint(-2, 4, x.shape, generator=torch.Generator().manual_seed(0)).to(x)
-    return _differences(problem, x, x + whole, ROUNDING)
+    return _differences(problem, x, x + whole, ROUNDING, sizes)
 
 
-def _seams(problem: Problem) -> dict[str, float]:
+def _seams(problem: Problem, sizes: dict[str, float]) -> dict[str, float]:
     found: dict[str, float] = {}
     for i in range(min(problem.dim, MOST_SEAMS)):
         after = scrambled_sobol(PROBES // 4, problem.dim, 3 + i, torch.float64)
         after[:, i] = SEAM_STEP
         before = after.clone()
         before[:, i] = 1.0 - SEAM_STEP
-        for name, size in _differences(problem, after, before, SEAM_JUMP).items():
+        for name, size in _differences(problem, after, before, SEAM_JUMP, sizes).items():
             found[name] = max(size, found.get(name, 0.0))
     return found
 

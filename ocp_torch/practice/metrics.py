@@ -17,6 +17,7 @@ from ocp_torch.problems.pendulum import Pendulum
 from ocp_torch.problems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.planar import PlanarVehicle
 from ocp_torch.problems.problem import Problem
+from ocp_torch.starts import drawn_starts, start_law
 
 STARTS, STEPS = 512, 240
 # The time of a trial in units of 1 / rho; what the discount still sees after it is e^-8.
@@ -88,7 +89,7 @@ def _(problem: Pendulum, path: Path) -> dict[str, float]:
 def metrics(problem: Problem, law: Law, seed: int = 0, starts: int = STARTS) -> dict | None:
     """``controller``, ``zero`` and ``classical`` (where there is one), each with its numbers and mean discounted ``cost``.
 
-    All from the same uniform admissible ``starts``, for ``duration`` in the problem's unit of time; `None` for a problem
+    All from the same ``starts`` (`random_starts`), for ``duration`` in the problem's unit of time; `None` for a problem
     without numbers of its own. Statistics, not bounds: a part `p` has the standard error `sqrt(p (1 - p) / starts)`.
     """
     if measure.dispatch(type(problem)) is measure.dispatch(Problem):
@@ -111,7 +112,10 @@ def _within_limit(problem: Problem, law: Law) -> Law:
 
 
 def random_starts(problem: Problem, count: int, seed: int) -> Tensor:
-    """``count`` uniform admissible starts, ``(count, d)`` float64; all states where hardly any is admissible."""
+    """``count`` starts, ``(count, d)`` float64: drawn from `mu0` where that is narrow; else uniform admissible ones, or all
+    where hardly any is admissible."""
+    if not start_law(problem).is_uniform:
+        return drawn_starts(problem, count, seed)
     generator = torch.Generator().manual_seed(seed)
     x = torch.rand(64 * count, problem.dim, generator=generator, dtype=torch.float64)
     fair = x[admissible(problem, x)]

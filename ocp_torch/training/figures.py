@@ -18,7 +18,8 @@ from ocp_torch.control_laws import NETWORK, control_laws, occupation_density
 from ocp_torch.extremum import batched
 from ocp_torch.fields import Fields
 from ocp_torch.problems import Problem
-from ocp_torch.samplers import derive_seed, evaluation_points
+from ocp_torch.samplers import derive_seed
+from ocp_torch.starts import initial_points
 
 LINE_POINTS, MAP_POINTS = 400, 80
 # Of the simulated occupation density: bins a coordinate by dimension, starts, steps of a trajectory, branch of the seeds.
@@ -61,12 +62,12 @@ def simulated_occupation(
     Starts weigh `mu0`; their number and the bins are few enough for a fraction of a second.
     """
     bins = BINS[problem.dim]
-    points = evaluation_points(STARTS, problem.dim + 1, 0, derive_seed(seed, FIGURE_STREAM))
+    points, start_mass = initial_points(problem, STARTS, 0, derive_seed(seed, FIGURE_STREAM), extra=1)
     x0, times = points[:, :-1], -torch.log1p(-points[:, -1]) / problem.discount
     _, end = rate_at(lambda x: (problem.velocity(x, law(x)), x[:, 0]), x0, problem.discount, times, FIGURE_STEPS)
     cell = lambda x: ((x * bins).long().clamp(0, bins - 1) * bins ** torch.arange(problem.dim)).sum(dim=-1)
     mass = torch.zeros(bins**problem.dim, dtype=torch.float64)
-    mass.index_add_(0, cell(end), problem.initial_density(x0))
+    mass.index_add_(0, cell(end), start_mass)
     density = mass * bins**problem.dim / STARTS
     return lambda x: density[cell(x.remainder(1.0))]
 

@@ -1,0 +1,97 @@
+r"""Does the divergence that sampled states see integrate to what the flux says? If not, some of it is hidden between them.
+
+On a torus `E[phi div F] + E[F . grad phi] = 0` for every smooth `phi`, as long as `div F` is a function. Where `F` jumps, or
+changes within a layer narrower than the distances between states, what pointwise divergences miss is what the sum differs
+from 0 by. Here `phi` are plane waves, the constant among them: `E[r] = E[mu0] - E[mu]` for every Liouville residual `r`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ocp_torch.certificate.student import t_factor
+
+# Waves along each of the first axes, and in random directions.
+ALONG, MOST_AXES, RANDOM, LARGEST = (1, 2, 3, 4, 6, 8, 12), 8, 24, 4
+# Groups of states whose scatter gives the standard error, at least; how rarely all tests together may err.
+GROUPS, LEVEL = 32, 1e-4
+# Differences below that part of the mean size of what is added up come from rounding and difference quotients.
+MATERIAL = 1e-5
+
+
+@dataclass(frozen=True)
+class Flux:
+    """`div F` ``(N,)`` as seen at weighted states, and `F` ``(N, d)`` itself, both over `rho`."""
+
+    x: Tensor
+    weight: Tensor
+    divergence: Tensor
+    flux: Tensor
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """A divergence that is not seen: its ``size``, as mass per discount time against one wave, and about where."""
+
+    size: float
+    x: Tensor
+
+    @property
+    def sentence(self) -> str:
+        at = [round(c, 2) for c in self.x[:6].tolist()] + (["..."] if len(self.x) > 6 else [])
+        return (
+            f"sampled states do not see {100.0 * self.size:.2g} % of the mass that the flux moves, near x = {at} if in one "
+            "place: a jump, or a layer too narrow for them"
+        )
+
+
+@torch.no_grad()
+def hidden_divergence(fluxes: list[Flux]) -> Hidden | None:
+    """What the sets of ``fluxes`` together do not see, if it is more than chance and rounding explain."""
+    waves = _waves(fluxes[0].x.shape[1])
+    parts = max(1, math.ceil(GROUPS / len(fluxes)))
+    # Consecutive points of a Sobol sequence are spread evenly, every other one of them is not.
+    groups = [
+        Flux(*columns)
+        for f in fluxes
+        for columns in zip(*(c.chunk(parts) for c in (f.x, f.weight, f.divergence, f.flux)), strict=True)
+    ]
+    found = torch.stack([_against(waves, group) for group in groups])  # (groups, waves), complex
+    sizes = torch.stack([_sizes(waves, f) for f in fluxes]).mean(dim=0)
+    tests = torch.cat([found.real, found.imag], dim=1)
+    mean, error = tests.mean(dim=0), tests.std(dim=0) / math.sqrt(len(groups))
+    allowed = t_factor(1.0 - LEVEL / tests.shape[1], len(groups) - 1) * error + MATERIAL * sizes.repeat(2)
+    excess = torch.where(allowed > 0.0, mean.abs() / allowed.clamp_min(1e-300), 0.0)
+    if len(groups) < 2 or not float(excess.max()) > 1.0:
+        return None
+    worst = int(excess.argmax())
+    states = torch.cat([f.x for f in fluxes])[:4096]
+    shape = (torch.polar(torch.ones(()).to(states), TURN * states @ waves.T) * found.mean(dim=0)).real.sum(dim=1)
+    return Hidden(float(mean[worst].abs()), states[int(shape.abs().argmax())].remainder(1.0))
+
+
+TURN = 2.0 * math.pi
+
+
+def _against(waves: Tensor, f: Flux) -> Tensor:
+    """`E[e^{-2 pi i k . x} (div F - 2 pi i k . F)]`: 0 for each wave ``(K,)`` where nothing is hidden."""
+    phi = torch.polar(torch.ones(()).to(f.x), -TURN * f.x @ waves.T)
+    terms = phi * torch.complex(f.divergence.unsqueeze(-1).expand(-1, len(waves)), -TURN * f.flux @ waves.T)
+    return (f.weight.unsqueeze(-1) * terms).mean(dim=0)
+
+
+def _sizes(waves: Tensor, f: Flux) -> Tensor:
+    seen = (f.weight * f.divergence.abs()).mean()
+    return seen + (f.weight.unsqueeze(-1) * TURN * (f.flux @ waves.T).abs()).mean(dim=0)
+
+
+def _waves(dim: int) -> Tensor:
+    """Whole vectors ``(K, d)``: 0, some along the axes, some at random."""
+    axes = torch.eye(dim, dtype=torch.float64)[:MOST_AXES]
+    along = [k * axes for k in ALONG]
+    draw = torch.randint(-LARGEST, LARGEST + 1, (RANDOM, dim), generator=torch.Generator().manual_seed(0)).to(axes)
+    return torch.cat([torch.zeros(1, dim, dtype=torch.float64), *along, draw]).unique(dim=0)
