@@ -12,9 +12,9 @@ from ocp_torch.extremum import supremum
 from ocp_torch.needs import GIVEN, GUESSED, SEARCHED
 from ocp_torch.problems.problem import MARGIN, Problem
 
-# Without any knowledge of mu*, M starts at this multiple of sup mu0 and the certificate judges it afterwards.
+# Without any knowledge of mu*, M is this multiple of sup mu0 on recorded data, where there is no bound without M.
 OCCUPATION_GUESS = 4.0
-# And where mu* is known to have no bound: what won on flows that contract onto a goal.
+# And where training aims at the bound without M: what won on flows that contract onto a goal.
 OCCUPATION_WEIGHT = 40.0
 # States a problem is searched at for what it does not say.
 SURVEYED = 2**13
@@ -26,7 +26,7 @@ FROM_CONFIGURATION, FROM_PROBLEM, ESTIMATED = "configuration", "problem", "estim
 class Bounds:
     """`M >= sup mu*`, `C_V >= sup V*`, `C_u >= sup |u*|` and, per name, its source.
 
-    Where ``unbounded``, no `M` is thought to be large enough: it is but a weight of training, which then aims at the bound
+    Where ``unbounded``, no `M` is known to be large enough: it is but a weight of training, which then aims at the bound
     that needs none.
     """
 
@@ -39,7 +39,7 @@ class Bounds:
 
     @property
     def needs_no_M(self) -> bool:
-        """Whether training aims at the bound without `M`: where `mu*` has no bound, or nobody gave one."""
+        """Whether the bound without `M` has to carry the lower side: no `M` is large enough, or nobody gave one."""
         return self.unbounded or self.basis("M") == GUESSED
 
     def basis(self, name: str) -> str:
@@ -94,12 +94,16 @@ def resolve_bounds(
             notes.append(
                 f"method.occupation_bound = {chosen['M']:.4g} is below this problem's sup mu*, which is {true}."
             )
-    return Bounds(**chosen, sources=sources, warnings=tuple(notes), unbounded=is_unbounded(problem))
+    return Bounds(**chosen, sources=sources, warnings=tuple(notes), unbounded=is_unbounded(problem, occupation_bound))
 
 
-def is_unbounded(problem: Problem) -> bool:
-    """Whether `mu*` is known to have no bound."""
-    return problem.occupation_bound is not None and math.isinf(problem.occupation_bound)
+def is_unbounded(problem: Problem, occupation_bound: float | None = None) -> bool:
+    """Whether no `M` is known to be large enough: `mu*` has no bound, or neither problem nor user (``occupation_bound``)
+    gives one. A data set has no bound without `M` to aim at instead."""
+    known = problem.occupation_bound
+    if known is None:
+        return occupation_bound is None and problem.evaluable
+    return math.isinf(known)
 
 
 def state_cost_supremum(problem: Problem) -> float:

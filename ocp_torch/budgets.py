@@ -36,7 +36,7 @@ BUDGETS = (
     Budget(inf, modes=1, waves=128, width=128, gated=True, steps=1200, batch=512, good_gap=0.02, stage_steps=800),
 )
 
-# Where mu* is unbounded the slack must be small everywhere, not on average: that wants more states at once, and longer.
+# Where no M is known the slack must be small everywhere, not on average: that wants more states at once, and longer.
 LARGE_BATCH, MANY_WAVES, MANY_STEPS = 1024, 64, 1200
 # The larger batch is for the supremum of the slack, of which the density player of pd knows nothing.
 DENSITY_BATCH = 256
@@ -53,8 +53,9 @@ def fill(config: dict, problem: Problem) -> dict:
         require_section(name, config.get(name))
     filled = copy.deepcopy(config)
     activation, sampler, of_method = ACTIVATION, SAMPLER, {}
-    if is_unbounded(problem):
-        if (config.get("method") or {}).get("name") == "pd" and config["trainer"].get("batch") is None:
+    method = config.get("method") or {}
+    if is_unbounded(problem, method.get("occupation_bound")):
+        if method.get("name") == "pd" and config["trainer"].get("batch") is None:
             of_method = {("method", "density_batch"): DENSITY_BATCH}
         activation, sampler = ACTIVATION if budget.gated else GENTLE_ACTIVATION, GENTLE_SAMPLER
         budget = replace(

@@ -47,23 +47,37 @@ def supremum(
         return Extremum(float("nan"), points[worst], len(points), 0)
     count = min(ascents, len(points))
     best, index = values.topk(count)
-    x = points[index].clone()
+    x, best = climb(function, points[index], best, steps if count else 0, start_step, differentiable)
+    top = int(torch.isnan(best).nonzero()[0]) if torch.isnan(best).any() else int(best.argmax())
+    return Extremum(float(best[top]), x[top].remainder(1.0), len(points), count)
+
+
+def climb(
+    function: Callable[[Tensor], Tensor],
+    x: Tensor,
+    best: Tensor,
+    steps: int = 60,
+    start_step: float = 1e-2,
+    differentiable: bool = True,
+) -> tuple[Tensor, Tensor]:
+    """Where local ascents from ``x`` ``(N, d)``, with values ``best`` ``(N,)``, end, and the values there; they stop at the
+    first NaN that any of them meets, which is then the value of its row."""
     step = torch.full_like(best, start_step)
     generator = torch.Generator(device="cpu").manual_seed(0)
-    for _ in range(steps if count else 0):
+    for _ in range(steps):
         direction = _gradient(function, x) if differentiable else torch.randn(x.shape, generator=generator).to(x)
         direction = direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-30)
         candidate = x + step.unsqueeze(-1) * direction
         with torch.no_grad():
             reached = function(candidate)
-        if torch.isnan(reached).any():
-            return Extremum(float("nan"), candidate[int(torch.isnan(reached).nonzero()[0])], len(points), count)
-        better = reached > best
+        odd = torch.isnan(reached)
+        better = (reached > best) | odd
         x = torch.where(better.unsqueeze(-1), candidate, x)
         best = torch.where(better, reached, best)
+        if odd.any():
+            break
         step = torch.where(better, 1.5 * step, 0.4 * step)
-    top = int(best.argmax())
-    return Extremum(float(best[top]), x[top].remainder(1.0), len(points), count)
+    return x, best
 
 
 def _gradient(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:

@@ -13,9 +13,11 @@ from ocp_torch.bounds import resolve_bounds
 from ocp_torch.calculus import value_and_gradient
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.mollified import DIRECTIONS, EVALUATIONS, Mollified
+from ocp_torch.certificate.recombined import Program, recombined
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.shifted import TOP, SlackParts, climbed, scaled_by, slack_function
 from ocp_torch.certificate.sides import lower_side
+from ocp_torch.fields import PeriodicMLP
 from ocp_torch.problems import Circle
 from ocp_torch.samples import Samples
 
@@ -71,7 +73,7 @@ def test_scaling_never_loses_and_never_passes_the_optimum(name, seed, size):
 def test_averaging_never_loses_and_never_passes_the_optimum(name, seed, size):
     problem = zoo.build(name)
     sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
-    found = lower_side(problem, near(problem, seed, size), sets, 1.0, ascents=8, mollify=True)
+    found = lower_side(problem, near(problem, seed, size), sets, 1.0, ascents=8, search=True)
     assert found.best.bound >= found.own.bound
     assert found.shifted.value <= problem.exact_optimum + 6.0 * found.shifted.se + 1e-9
 
@@ -112,7 +114,7 @@ def test_a_narrow_spike_of_the_slack_is_averaged_out():
     bump = lambda x: torch.exp(-((x[:, 0] - at) / 2e-3).square())
     V = lambda x: problem.exact_value(x) + 2e-3 * bump(x)
     sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
-    plain, averaged = (lower_side(problem, V, sets, 1.0, ascents=8, mollify=m) for m in (False, True))
+    plain, averaged = (lower_side(problem, V, sets, 1.0, ascents=8, search=m) for m in (False, True))
     assert plain.best.radius == 0.0 < averaged.best.radius
     assert "averaged" in averaged.best.sentence
     assert "averaged" not in plain.best.sentence
@@ -130,9 +132,9 @@ def test_a_narrow_spike_of_the_slack_is_averaged_out():
         (False, True, False),
     ],
 )
-def test_averages_are_tried_where_no_M_will_do_or_somebody_says_so(mollify, unbounded, expected):
+def test_functions_made_of_V_are_tried_where_no_M_will_do_or_somebody_says_so(mollify, unbounded, expected):
     bounds = replace(resolve_bounds(Circle()), unbounded=unbounded)
-    assert CertificateSettings(mollify=mollify).mollifies(bounds) is expected
+    assert CertificateSettings(mollify=mollify).searches(bounds) is expected
 
 
 def test_large_sets_are_thinned_to_the_budget():
@@ -180,3 +182,50 @@ def test_where_the_cost_is_negative_nothing_is_scaled():
     found = lower_side(problem, zoo.rough_network(1, 0), sets, 1.0)
     assert found.own.theta == 1.0
     assert found.shifted.value <= problem.exact_optimum - 0.1
+
+
+class Perturbed(PeriodicMLP):
+    """`V*` plus a network: its last layer can take away what it put there."""
+
+    def __init__(self, problem, size: float) -> None:
+        super().__init__(problem.dim, modes=2, width=24, depth=2, activation="tanh", scale=size)
+        self.problem = problem
+        torch.nn.init.normal_(self.head.weight)
+
+    def forward(self, x):
+        return self.problem.exact_value(x) + super().forward(x)
+
+
+def perturbed(problem, size=1e-3, seed=0):
+    torch.manual_seed(seed)
+    return Perturbed(problem, size).double().requires_grad_(False)
+
+
+def test_the_slack_of_a_recombination_is_that_of_its_field():
+    for name in ("manufactured 2-d q=1.5", "circle rho=2"):
+        problem = zoo.build(name)
+        value = perturbed(problem)
+        x = zoo.states(problem, 50)
+        program = Program(problem, value, x)
+        c = 1e-3 * torch.randn(program.basis.shape[1], generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        torch.testing.assert_close(program.slack(c), slack_function(problem, program.field(c))(x).detach())
+        extra = zoo.states(problem, 7, seed=3)
+        program.add(extra)
+        both = torch.cat([x, extra])
+        torch.testing.assert_close(program.slack(c), slack_function(problem, program.field(c))(both).detach())
+
+
+@pytest.mark.parametrize("name", ["manufactured 2-d q=1.5", "manufactured 1-d q=2"])
+def test_a_last_layer_chosen_anew_finds_the_subsolution_that_it_can_represent(name):
+    problem = zoo.build(name)
+    value = perturbed(problem)
+    sets = replicated_samples(problem, 1024, 8, seed=0, divergences=False)
+    found = lower_side(problem, value, sets, 1.0, ascents=8, search=True)
+    lost = problem.exact_optimum - found.own.bound, problem.exact_optimum - found.best.bound
+    assert lost[1] < 0.1 * lost[0]
+    assert lost[1] > -6.0 * found.shifted.se - 1e-9
+    assert "recombined" in found.best.sentence
+
+
+def test_a_field_that_shows_no_features_is_not_recombined():
+    assert recombined(Circle(), Circle().exact_value, seed=0) is None

@@ -213,11 +213,15 @@ def test_certificate_json_has_the_documented_schema_with_numbers_or_null(run):
     folder, config = run
     certificate = json.loads((folder / "certificate.json").read_text())
     groups = {"lower", "upper", "perf", "baseline", "gap", "share", "suboptimality", "assumptions"}
-    assert certificate.keys() == NUMBERS["top"] | groups | {"problem", "method", "exact", "warnings", "stopped"}
+    assert certificate.keys() == NUMBERS["top"] | groups | {
+        *("problem", "method", "exact", "warnings", "stopped", "controller", "contradiction"),
+    }
+    assert certificate["controller"] in ("value", "density", None)
+    assert certificate["contradiction"] is None
     assert certificate["confidence"] == config["certificate"]["confidence"]
     assert certificate["stopped"] == "steps"
     assert all(is_number(certificate[name]) for name in NUMBERS["top"])
-    assert (certificate["schema"], certificate["seed"], certificate["step"]) == (1, 5, 20)
+    assert (certificate["schema"], certificate["seed"], certificate["step"]) == (2, 5, 20)
     assert certificate["samples"] == 20 * 16
     assert certificate["method"] == config["method"]["name"]
     assert certificate["problem"] == config["problem"]["_target_"].rpartition(".")[2].lower()
@@ -225,24 +229,29 @@ def test_certificate_json_has_the_documented_schema_with_numbers_or_null(run):
     for group in ("lower", "upper", "perf", "baseline"):
         assert certificate[group].keys() == NUMBERS[group]
         for name, estimate in certificate[group].items():
-            wanted = {"value", "se", "interval"} | ({"bias"} if group in ("perf", "baseline") else set())
+            wanted = {"value", "se", "half_width", "interval"} | ({"bias"} if group in ("perf", "baseline") else set())
+            wanted |= {"rests_on", "counts"} if group in ("lower", "upper") else set()
             wanted |= {"controller"} if name == "lagrangian" else set()
             if estimate is None:
                 continue
             assert estimate.keys() == wanted, name
             low, high = estimate["interval"]
             assert low <= estimate["value"] <= high
-            assert all(is_number(v) for k, v in estimate.items() if k not in ("controller", "interval")), name
+            words = ("controller", "interval", "rests_on", "counts")
+            assert all(is_number(v) for k, v in estimate.items() if k not in words), name
+            assert set(estimate.get("rests_on", {}).values()) <= {"given", "proved", "searched", "guessed"}
     gap, share, assumptions = (certificate[group] for group in ("gap", "share", "assumptions"))
-    assert gap.keys() == {"certified", "simulated", "lower_from", "upper_from"}
+    assert gap.keys() == {"certified", "simulated", "conditional", "lower_from", "upper_from"}
     assert gap["lower_from"] in (None, "F_M", "shifted")
     assert gap["upper_from"] in (None, "J", "G", "lagrangian")
     assert share.keys() == NUMBERS["share"]
-    assert certificate["suboptimality"].keys() == {"at_least", "at_most"}
+    suboptimality = certificate["suboptimality"]
+    assert suboptimality.keys() == {"at_least", "at_most", "takes"}
+    assert all(isinstance(sentence, str) for sentence in suboptimality.pop("takes"))
     constants = {"M", "C_V", "C_u", "estimated_sup_occupation", "sup_control", "a_priori_sup_occupation"}
     constants |= {"largest_value", "largest_jump", "smallest_state_cost", "initial_mass"}
     assert assumptions.keys() == constants | {"hold"}
-    numbers = [*share.values(), *certificate["suboptimality"].values(), gap["certified"], gap["simulated"]]
+    numbers = [*share.values(), *suboptimality.values(), gap["certified"], gap["simulated"]]
     numbers += [assumptions[name] for name in constants]
     assert all(value is None or is_number(value) for value in numbers)
     assert isinstance(assumptions["hold"], bool)

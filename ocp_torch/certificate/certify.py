@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -81,7 +81,7 @@ def certify_fields(
     few = replicated_samples(problem, max(1, settings.points // part), count, seed, divergences=True)
     if has_value:
         sets = replicated_samples(problem, settings.points, count, seed, divergences=False)
-        lower = lower_side(problem, fields.value, sets, bounds.M, settings.ascents, settings.mollifies(bounds))
+        lower = lower_side(problem, fields.value, sets, bounds.M, settings.ascents, settings.searches(bounds), seed)
     proved, proof_notes = proved_lower(problem, fields.value, lower) if settings.rigorous and lower else (None, [])
     posed = check_problem(problem, sets if has_value else few)
     laws = control_laws(occupation, problem, fields, bounds)

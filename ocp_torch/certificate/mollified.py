@@ -9,6 +9,8 @@ is how the theory of viscosity solutions treats convex Hamiltonians (Barron and 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -79,7 +81,7 @@ def mollified_shift(
         if looks[radius] <= best.bound:
             break
         tried = _shift(problem, value, radius, sets, worst, ascents)
-        best = max(best, tried, key=lambda shift: shift.bound)
+        best = max(best, replace(tried, name=own.name), key=lambda shift: shift.bound)
         found = problem.samples(tried.largest.x.unsqueeze(0), divergences=False)
         worst = Samples.concatenate([worst, found])
         looks = {r: on_few(r) for r, look in looks.items() if r != radius and look > best.bound}

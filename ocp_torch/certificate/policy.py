@@ -64,7 +64,7 @@ def certify_policy(
     number, perf, zero, given, best = settings.trajectories, {}, None, None, None
     lower = None
     if value is not None:
-        lower = lower_side(problem, value, wide, bounds.M, ascents, settings.mollifies(bounds))
+        lower = lower_side(problem, value, wide, bounds.M, ascents, settings.searches(bounds), seed)
     if number:
         initial = [integral(s, own(s.x) * s.mu0) for s in wide] if own is not None else None
         given = simulate(law, number, own, initial)

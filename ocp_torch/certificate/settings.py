@@ -21,7 +21,7 @@ class CertificateSettings:
     replicates: int = 8  # independent randomised point sets behind each standard error
     trajectories: int = 256  # simulated starts per replicate; 0 skips every simulation
     ascents: int = 32  # local ascents from the worst sampled states
-    mollify: bool | None = None  # average V over neighbours for the bound without M; None: where mu* is unbounded
+    mollify: bool | None = None  # recombine and average V for the bound without M; None: where there is no M
     occupation_states: int = 144  # where the supremum of the occupation density is looked for; 0 skips it
     rigorous: bool = False  # a lower bound proved over cells, in one and two dimensions: a second, or up to two minutes
     confidence: float = CONFIDENCE  # how often an interval covers the truth, by Student's t over the replicates
@@ -42,6 +42,6 @@ class CertificateSettings:
         require_number("certificate.tolerance", self.tolerance, above=0.0)
         require_choice("certificate.horizon", self.horizon, (TRUNCATED, RANDOM))
 
-    def mollifies(self, bounds: Bounds) -> bool:
-        """Whether the bound without `M` is sought among averages of `V` too, for a problem of these ``bounds``."""
-        return bounds.unbounded if self.mollify is None else self.mollify
+    def searches(self, bounds: Bounds) -> bool:
+        """Whether the bound without `M` is sought among functions made of `V` too, for a problem of these ``bounds``."""
+        return bounds.needs_no_M if self.mollify is None else self.mollify

@@ -67,6 +67,7 @@ class Shift:
     largest: Extremum
     initial: list[float]  # E[W mu0] per set
     radius: float = 0.0
+    name: str = "V"
 
     @classmethod
     def of(
@@ -97,7 +98,9 @@ class Shift:
     @property
     def sentence(self) -> str:
         """What the slack is of."""
-        return f"sup Q of {self.theta:.4g} V" + (f", averaged {self.radius:.2g} around," if self.radius else "")
+        return f"sup Q of {self.theta:.4g} {self.name}" + (
+            f", averaged {self.radius:.2g} around," if self.radius else ""
+        )
 
 
 def slack_function(problem: Problem, value: Field):

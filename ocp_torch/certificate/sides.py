@@ -2,7 +2,7 @@ r"""The two sides of the certificate that need no simulation: `F_M` and the shif
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -12,6 +12,7 @@ from ocp_torch.calculus import CHUNK, Field
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.hidden import Flux, Hidden, hidden_divergence
 from ocp_torch.certificate.mollified import mollified_shift
+from ocp_torch.certificate.recombined import recombined
 from ocp_torch.certificate.shifted import Shift, slack_parts
 from ocp_torch.control_laws import Density
 from ocp_torch.problems.problem import Problem
@@ -22,7 +23,7 @@ from ocp_torch.samples import Samples
 class LowerSide:
     """`F_M` rests on `M` and the per-set `E[V mu0]` and `E[max(Q, 0)]`; ``own`` and ``best`` on suprema of slack.
 
-    ``own`` is the shifted bound of a multiple of `V` itself, ``best`` that or the one of an average of `V`.
+    ``own`` is the shifted bound of a multiple of `V` itself, ``best`` that or the one of a function made of `V`.
     """
 
     M: float
@@ -41,14 +42,31 @@ class LowerSide:
 
 
 def lower_side(
-    problem: Problem, value: Field, sets: list[Samples], M: float, ascents: int = 32, mollify: bool = False
+    problem: Problem,
+    value: Field,
+    sets: list[Samples],
+    M: float,
+    ascents: int = 32,
+    search: bool = False,
+    seed: int = 0,
 ) -> LowerSide:
-    r"""`F_M(V) = E[V mu0 - M max(Q, 0)]` (section 4.1) and the shifted bound (`ocp_torch.certificate.shifted`); of averages
-    of `V` too if ``mollify`` (`ocp_torch.certificate.mollified`), which takes many times as long."""
+    r"""`F_M(V) = E[V mu0 - M max(Q, 0)]` (section 4.1) and the shifted bound (`ocp_torch.certificate.shifted`).
+
+    With ``search`` the latter is sought among functions made of `V` too, which takes many times as long: with its last
+    layer chosen anew (`recombined`, on states of ``seed``), and averages over neighbours of the better of the two
+    (`mollified`).
+    """
     parts = slack_parts(problem, value, sets)
     violation = [integral(s, p.slack(1.0).clamp_min(0.0)) for s, p in zip(sets, parts, strict=True)]
-    own = Shift.of(problem, value, sets, parts, ascents)
-    best = mollified_shift(problem, value, sets, parts, ascents, own) if mollify else own
+    own = best = Shift.of(problem, value, sets, parts, ascents)
+    if search:
+        other = recombined(problem, value, seed)
+        if other is not None:
+            others = slack_parts(problem, other, sets)
+            tried = replace(Shift.of(problem, other, sets, others, ascents), name="V recombined")
+            if tried.bound > own.bound:
+                value, parts, best = other, others, tried
+        best = mollified_shift(problem, value, sets, parts, ascents, best)
     return LowerSide(M, own.initial, violation, own, best)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from torch import Tensor, nn
 
@@ -69,3 +71,14 @@ class PeriodicMLP(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         out = self.shift + self.scale * self.head(self.body(self.embedding(x)))
         return out.squeeze(-1) if self.scalar else out
+
+    def features(self, x: Tensor) -> Tensor:
+        """What the last layer combines, ``(N, width)``, in the units of the field: `shifted_by` adds multiples of them."""
+        return self.scale * self.body(self.embedding(x))
+
+    def shifted_by(self, weights: Tensor) -> PeriodicMLP:
+        """A copy whose one output has ``weights`` ``(width,)`` times the features added."""
+        other = copy.deepcopy(self)
+        with torch.no_grad():
+            other.head.weight += weights.to(other.head.weight)
+        return other

@@ -12,7 +12,7 @@ from ocp_torch.objectives.objective import Objective
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
 
-# Where `mu*` is unbounded: the part of `M` that a round starts with, and the part of the round in which it grows.
+# Where no `M` is known: the part of `M` that a round starts with, and the part of the round in which it grows.
 LEAST_WEIGHT, GROWTH = 1.0 / 20.0, 0.7
 
 
@@ -23,7 +23,7 @@ class Dual(Objective):
     `Q = 0` almost everywhere there; unlike the hinge it has a gradient on both sides of the solution. The paper's dual is
     ``residual = 0``.
 
-    Where `mu*` is unbounded (`Bounds.unbounded`) no `F_M` is a bound, and what is certified is `E[V mu0] - sup Q`. A large
+    Where no `M` is known to be large enough (`Bounds.unbounded`) what is certified is `E[V mu0] - sup Q`. A large
     `M` keeps the supremum small; but from the start it ends in subsolutions far below `V*`, which have no gradient. So `M`
     grows along a round: first `V` is too high, and then comes down until it is feasible.
     """

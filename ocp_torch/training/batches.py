@@ -16,7 +16,7 @@ from ocp_torch.samplers import derive_seed
 from ocp_torch.samples import Samples
 
 VISITS_STREAM = 9
-# The part of a batch that is visited states, where `mu*` is unbounded and nobody said otherwise.
+# The part of a batch that is visited states, where no `M` is known and nobody said otherwise.
 VISITED = 0.25
 # At least a tenth of a batch is for the integrals.
 MOST = 0.9

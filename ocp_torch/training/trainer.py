@@ -45,7 +45,7 @@ QUICK = CertificateSettings(
     tolerance=5e-4,
     stage=StageSettings(steps=0),
 )
-AVERAGED = replace(QUICK, mollify=None)
+SEARCHED = replace(QUICK, mollify=None)
 # Looks choose between fields; on a branch of states of their own they cannot flatter the certificate of their choice.
 LOOK_STREAM = 5
 STEPS, TARGET_GAP, MAX_SECONDS, NOT_FINITE = "steps", "target_gap", "max_seconds", "not_finite"
@@ -228,10 +228,10 @@ class Trainer:
         if best is None or best.step == self.step:
             return self.averaged_fields, None
         fields, final = self.best_fields(), Look.at(self.step, self.look())
-        if best.better_than(final, sure=True) and AVERAGED.mollifies(self.bounds):
+        if best.better_than(final, sure=True) and SEARCHED.searches(self.bounds):
             # Spikes of the slack come and go from look to look; the certificate's averages of V know nothing of them.
-            best = Look.at(best.step, self._quick(AVERAGED, fields))
-            final = Look.at(self.step, self._quick(AVERAGED))
+            best = Look.at(best.step, self._quick(SEARCHED, fields))
+            final = Look.at(self.step, self._quick(SEARCHED))
         if not best.better_than(final, sure=True):
             return self.averaged_fields, None
         return fields, (
