@@ -23,6 +23,7 @@ from ocp_torch.certificate.performance import Simulated, simulate_performance
 from ocp_torch.certificate.recorded import certify_recorded
 from ocp_torch.certificate.regularity import largest_jump
 from ocp_torch.certificate.rigorous import RigorousBound, proved_lower
+from ocp_torch.certificate.scan import odd_states
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.sides import LowerSide, lower_side, upper_side
 from ocp_torch.certificate.stage import fit_closed_loop
@@ -81,7 +82,10 @@ def certify_fields(
     few = replicated_samples(problem, max(1, settings.points // part), count, seed, divergences=True)
     if has_value:
         sets = replicated_samples(problem, settings.points, count, seed, divergences=False)
-        lower = lower_side(problem, fields.value, sets, bounds.M, settings.ascents, settings.searches(bounds), seed)
+        odd = odd_states(problem, settings.scanned(problem), seed)
+        lower = lower_side(
+            problem, fields.value, sets, bounds.M, settings.ascents, settings.searches(bounds), seed, odd
+        )
     proved, proof_notes = proved_lower(problem, fields.value, lower) if settings.rigorous and lower else (None, [])
     posed = check_problem(problem, sets if has_value else few)
     laws = control_laws(occupation, problem, fields, bounds)

@@ -9,6 +9,7 @@ is how the theory of viscosity solutions treats convex Hamiltonians (Barron and 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -63,15 +64,22 @@ class Mollified:
 
 
 def mollified_shift(
-    problem: Problem, value: Field, sets: list[Samples], parts: list[SlackParts], ascents: int, own: Shift
+    problem: Problem,
+    value: Field,
+    sets: list[Samples],
+    parts: list[SlackParts],
+    ascents: int,
+    own: Shift,
+    beside: Sequence[Samples] = (),
 ) -> Shift:
     """The best shifted bound that was found of ``value`` averaged; ``own``, that of ``value`` itself, where none is better.
 
     On few states a bound is too high, never too low: the radius that looks best on few is tried on all, until one tried on
-    all is better than the others look. ``parts`` are those of ``value``.
+    all is better than the others look. ``parts`` are those of ``value``; suprema are sought ``beside`` too.
     """
     slack = SlackParts.join(parts).slack(own.theta)
     worst = Samples.concatenate(sets).take(slack.topk(min(WORST, len(slack))).indices)
+    worst = Samples.concatenate([worst, *beside])
     few = [samples.take(slice(0, max(1, FEW // len(sets)))) for samples in sets]
     on_few = lambda radius: _shift(problem, value, radius, few, worst, min(ascents, FEW_ASCENTS)).bound
     looks = {radius: on_few(radius) for radius in RADII}
@@ -94,4 +102,4 @@ def _shift(problem: Problem, value: Field, radius: float, sets: list[Samples], w
     averaged = Mollified(value, problem.dim, radius)
     sets = averaged.fitting(sets)
     *parts, beside = slack_parts(problem, averaged, [*sets, worst])
-    return Shift.of(problem, averaged, sets, parts, ascents, radius, beside)
+    return Shift.of(problem, averaged, sets, parts, ascents, radius, [beside])

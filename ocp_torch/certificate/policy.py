@@ -23,6 +23,7 @@ from ocp_torch.certificate.contradictions import examined
 from ocp_torch.certificate.estimate import integral, replicated_samples
 from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.performance import simulate_performance
+from ocp_torch.certificate.scan import odd_states
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.sides import lower_side
 from ocp_torch.certificate.stage import fit_closed_loop
@@ -64,7 +65,8 @@ def certify_policy(
     number, perf, zero, given, best = settings.trajectories, {}, None, None, None
     lower = None
     if value is not None:
-        lower = lower_side(problem, value, wide, bounds.M, ascents, settings.searches(bounds), seed)
+        odd = odd_states(problem, settings.scanned(problem), seed)
+        lower = lower_side(problem, value, wide, bounds.M, ascents, settings.searches(bounds), seed, odd)
     if number:
         initial = [integral(s, own(s.x) * s.mu0) for s in wide] if own is not None else None
         given = simulate(law, number, own, initial)

@@ -22,7 +22,7 @@ from ocp_torch.samplers import derive_seed, scrambled_sobol
 from ocp_torch.samples import Samples
 
 # Branch of the seed tree for the states that the weights are chosen on, beside those of the certificate.
-STREAM = 8
+STREAM = 11
 # States at most, and numbers kept for them at most (128 MiB of float64).
 STATES, NUMBERS = 8192, 2**24
 # Rounds, L-BFGS iterations in each, ascents between them, and how much less the maximum is smoothed each time: in two

@@ -8,6 +8,7 @@ from ocp_torch.bounds import Bounds
 from ocp_torch.certificate.estimate import CONFIDENCE
 from ocp_torch.certificate.stage import StageSettings
 from ocp_torch.errors import require_choice, require_flag, require_integer, require_number
+from ocp_torch.problems.problem import Problem
 
 # How performance deals with the infinite horizon: stop late and bound the rest, or stop at an exponential time.
 TRUNCATED, RANDOM = "truncated", "random"
@@ -41,6 +42,10 @@ class CertificateSettings:
         require_number("certificate.confidence", self.confidence, above=0.0, at_most=0.999999)
         require_number("certificate.tolerance", self.tolerance, above=0.0)
         require_choice("certificate.horizon", self.horizon, (TRUNCATED, RANDOM))
+
+    def scanned(self, problem: Problem) -> int:
+        """How many states the data of ``problem`` are scanned at for narrow features."""
+        return problem.scan_factor * self.points * self.replicates
 
     def searches(self, bounds: Bounds) -> bool:
         """Whether the bound without `M` is sought among functions made of `V` too, for a problem of these ``bounds``."""

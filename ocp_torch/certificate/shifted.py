@@ -8,6 +8,7 @@ changes nothing.) Where `V` has large slack, at kinks for instance, a `theta` be
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -78,11 +79,11 @@ class Shift:
         parts: list[SlackParts],
         ascents: int,
         radius: float = 0.0,
-        beside: SlackParts | None = None,
+        beside: Sequence[SlackParts] = (),
     ) -> Shift:
         """The best multiple of ``value``, whose ``parts`` on ``sets`` are known; the supremum is sought ``beside`` too."""
         initial = integrals([s.x for s in sets], [p.initial for p in parts], [s.weight for s in sets])
-        everywhere = SlackParts.join(parts if beside is None else [*parts, beside])
+        everywhere = SlackParts.join([*parts, *beside])
         theta, largest = best_shift(problem, value, everywhere, sum(initial) / len(initial), ascents)
         return cls(theta, largest, initial, radius)
 

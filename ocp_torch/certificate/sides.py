@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from ocp_torch import calculus, formulas
 from ocp_torch.calculus import CHUNK, Field
@@ -49,24 +50,27 @@ def lower_side(
     ascents: int = 32,
     search: bool = False,
     seed: int = 0,
+    odd: Tensor | None = None,
 ) -> LowerSide:
     r"""`F_M(V) = E[V mu0 - M max(Q, 0)]` (section 4.1) and the shifted bound (`ocp_torch.certificate.shifted`).
 
     With ``search`` the latter is sought among functions made of `V` too, which takes many times as long: with its last
     layer chosen anew (`recombined`, on states of ``seed``), and averages over neighbours of the better of the two
-    (`mollified`).
+    (`mollified`). Suprema are sought at the states ``odd`` ``(K, d)`` too.
     """
+    beside = [] if odd is None or not len(odd) else [Samples.of(problem, odd, divergences=False)]
+    shift = lambda v, p: Shift.of(problem, v, sets, p, ascents, beside=slack_parts(problem, v, beside))
     parts = slack_parts(problem, value, sets)
     violation = [integral(s, p.slack(1.0).clamp_min(0.0)) for s, p in zip(sets, parts, strict=True)]
-    own = best = Shift.of(problem, value, sets, parts, ascents)
+    own = best = shift(value, parts)
     if search:
         other = recombined(problem, value, seed)
         if other is not None:
             others = slack_parts(problem, other, sets)
-            tried = replace(Shift.of(problem, other, sets, others, ascents), name="V recombined")
+            tried = replace(shift(other, others), name="V recombined")
             if tried.bound > own.bound:
                 value, parts, best = other, others, tried
-        best = mollified_shift(problem, value, sets, parts, ascents, best)
+        best = mollified_shift(problem, value, sets, parts, ascents, best, beside)
     return LowerSide(M, own.initial, violation, own, best)
 
 

@@ -46,6 +46,11 @@ class Callable(Problem):
         self._step = STEPS["float32" if self._oracle.in_float32 else "float64"]
 
     @property
+    def scan_factor(self) -> int:
+        """Few states more where each is a call of its own."""
+        return 0 if self._oracle.one_by_one or self.workers > 1 else 8
+
+    @property
     def driftless(self) -> bool:
         return self._oracle.driftless
 

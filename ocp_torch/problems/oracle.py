@@ -45,7 +45,7 @@ class Oracle:
         self._dim, self._control_dim = dim, control_dim
         self._pool: Workers | None = None
         self._kept: tuple[Tensor, dict] | None = None
-        self._one_by_one = self.driftless = self.gives_mu0 = self.in_float32 = False
+        self.one_by_one = self.driftless = self.gives_mu0 = self.in_float32 = False
         self._understand()
         self._look_at_the_seam()
         if workers > 1:
@@ -62,7 +62,7 @@ class Oracle:
         """As `answers`, but asked anew and not kept."""
         x = at.numpy()
         try:
-            answer = self._pool.map(x, self._one_by_one) if self._pool else asked(self._function, x, self._one_by_one)
+            answer = self._pool.map(x, self.one_by_one) if self._pool else asked(self._function, x, self.one_by_one)
         except InputError:
             raise
         except Exception as error:  # whatever a stranger's code may raise
@@ -80,7 +80,7 @@ class Oracle:
         while len(x) > 1:
             half = x[: len(x) // 2]
             try:
-                asked(self._function, half, self._one_by_one)
+                asked(self._function, half, self.one_by_one)
             except Exception as other:  # whatever a stranger's code may raise
                 x, error = half, other
                 continue
@@ -121,9 +121,9 @@ class Oracle:
     def _understand(self) -> None:
         """Whether it takes batches or single states, and whether its answers depend on the state alone."""
         x = scrambled_sobol(self._dim + 3, self._dim, 0, torch.float64)
-        self._one_by_one = self._form(x.numpy())
+        self.one_by_one = self._form(x.numpy())
         found = self.checked(x)
-        raw = asked(self._function, x[:1].numpy(), self._one_by_one)
+        raw = asked(self._function, x[:1].numpy(), self.one_by_one)
         self.driftless, self.gives_mu0 = raw[1] is None, len(raw) == 4
         self.in_float32 = np.asarray(raw[0]).dtype == np.float32
         again, alone = self.checked(x), self.checked(x[2:3])

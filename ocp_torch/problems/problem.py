@@ -87,6 +87,12 @@ class Problem:
         return torch.ones_like(x[:, 0])
 
     @property
+    def scan_factor(self) -> int:
+        """How many states are scanned for narrow features of the data, for each at which a bound is evaluated. The package's
+        own problems have none narrower than those states show."""
+        return 0 if type(self).__module__.startswith("ocp_torch.") else 32
+
+    @property
     def driftless(self) -> bool:
         """Whether `a = 0`: true exactly when `drift` is not overridden, unless a subclass knows better."""
         return type(self).drift is Problem.drift

@@ -1,0 +1,62 @@
+"""Where a problem's data are odd: states that a few thousand would miss, and at which suprema are then looked for too.
+
+A network varies slowly; what is narrow in a slack comes from `f`, `a` or `B`. They are far cheaper to evaluate than `V` and
+its gradient, so that millions of states can be scanned: a set that takes the part `3 / N` of the torus is met by `N` states
+with 95 % probability. Kept are the states where a column of the data is smallest or largest, and where it differs most from
+its value nearby.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ocp_torch.problems.problem import Problem
+from ocp_torch.samplers import derive_seed
+
+# Branch of the seed tree.
+STREAM = 10
+# States scanned at once, states kept for each column and kind of oddity, and how far off a neighbour is.
+CHUNK, KEPT, NEARBY = 2**16, 16, 0.02
+
+
+@torch.no_grad()
+def odd_states(problem: Problem, count: int, seed: int) -> Tensor:
+    """States ``(K, d)`` in float64 at which the data of ``problem`` are odd, found among ``count`` uniform ones."""
+    pairs = count // 2
+    generator = torch.Generator().manual_seed(derive_seed(seed, STREAM))
+    draw = lambda size: torch.rand(size, problem.dim, generator=generator, dtype=torch.float64)
+    found: dict[str, tuple[Tensor, Tensor]] = {}
+    for start in range(0, pairs, CHUNK):
+        x = draw(min(CHUNK, pairs - start))
+        away = torch.nn.functional.normalize(draw(len(x)) - 0.5)
+        near = (x + NEARBY * away).remainder(1.0)
+        here, there = _columns(problem, x), _columns(problem, near)
+        alone, together = torch.cat([x, near]), torch.cat([x, near], dim=1)
+        values = torch.cat([here, there])
+        found["low"] = _highest(found.get("low"), -values, alone)
+        found["high"] = _highest(found.get("high"), values, alone)
+        found["step"] = _highest(found.get("step"), (here - there).abs(), together)
+    none = draw(0)
+    return torch.cat([none, *(states.reshape(-1, problem.dim) for _, states in found.values())]).unique(dim=0)
+
+
+def _columns(problem: Problem, x: Tensor) -> Tensor:
+    """`f`, `a` and `B` as columns ``(N, 1 + d + d m)``; without those that are the same everywhere by definition."""
+    columns = [problem.state_cost(x).unsqueeze(-1)]
+    if not problem.driftless:
+        columns.append(problem.drift(x))
+    if type(problem).control_matrix is not Problem.control_matrix:
+        columns.append(problem.control_matrix(x).flatten(1))
+    return torch.cat(columns, dim=1)
+
+
+def _highest(kept: tuple[Tensor, Tensor] | None, score: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    """The `KEPT` highest scores of each column so far ``(K, C)``, and the rows of ``x`` that they are of."""
+    top, rows = score.topk(min(KEPT, len(score)), dim=0)
+    states = x[rows]
+    if kept is not None:
+        top, states = torch.cat([kept[0], top]), torch.cat([kept[1], states])
+        top, rows = top.topk(min(KEPT, len(top)), dim=0)
+        states = states.gather(0, rows.unsqueeze(-1).expand(-1, -1, states.shape[-1]))
+    return top, states
