@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from ocp_torch.certificate import Certificate
 from ocp_torch.certificate.assumptions import Assumptions
+from ocp_torch.certificate.contradictions import examined
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.training.trainer import Trainer
 
@@ -13,9 +14,10 @@ LOWER = 0.05  # above any constant's bound on the circle, below what doing nothi
 
 
 def certificate(run, gap: float | None, certified: float | None = None, zero: float = 1.0) -> Certificate:
-    """A lower bound with a simulated performance ``gap`` above it, and an upper bound ``certified`` above it."""
+    """A lower bound with a simulated performance ``gap`` above it, and an upper bound ``certified`` above it; examined for
+    contradictions as those of a run are, since a ``gap`` below 0 is one."""
     above = lambda part: None if part is None else Estimate(LOWER * (1.0 + part), 0.0, 0.0)
-    return Certificate(
+    made = Certificate(
         run=run,
         exact=None,
         lower={"F_M": None if gap is None else Estimate(LOWER, 0.0), "shifted": None},
@@ -24,6 +26,7 @@ def certificate(run, gap: float | None, certified: float | None = None, zero: fl
         baseline={"zero": Estimate(zero, 0.0, 0.0)},
         assumptions=Assumptions(1.0, 1.0, 1.0, None, None, True, True, True),
     )
+    return examined(made)
 
 
 def quick(gap: Callable[[Trainer], float | None], **rest) -> Callable:

@@ -141,10 +141,9 @@ def test_where_averages_are_certified_spikes_in_a_look_decide_nothing(monkeypatc
     trainer = small(f"problem={problem}", *WAY)
     trainer.step = 20
     trainer.watch.looked(Look(4, 0.1, 1.0, 0.0), trainer.averaged_fields)
-    gaps = {"look": 0.5, "best": 0.1, "last": last}
-    monkeypatch.setattr(trainer, "look", lambda: "look")
-    monkeypatch.setattr(trainer, "_quick", lambda settings, fields=None: "last" if fields is None else "best")
-    monkeypatch.setattr(Look, "at", lambda step, certificate: Look(step, gaps[certificate], 1.0, 0.0))
+    with_gap = lambda gap: certificate(trainer.run, gap)
+    monkeypatch.setattr(trainer, "look", lambda: with_gap(0.5))
+    monkeypatch.setattr(trainer, "_quick", lambda settings, fields=None: with_gap(last if fields is None else 0.1))
     fields, sentence = trainer.choose()
     assert (fields is not trainer.averaged_fields) == handed
     assert (sentence is not None) == handed
@@ -270,3 +269,22 @@ def test_weights_that_are_not_finite_are_never_saved(tmp_path):
     with pytest.raises(NonFiniteError, match="not finite at any x: the weights of"):
         trainer.fit(Silent(), tmp_path / "last.pt")
     assert (tmp_path / "last.pt").read_bytes() == good
+
+
+def test_bounds_that_contradict_each_other_stop_nothing_and_choose_nothing(tmp_path, monkeypatch, caplog):
+    """From step 12 on the lower bound is above what the controller costs; the run goes on to its end, hands out the last
+    fields, and says so in log, certificate and controller."""
+    trainer = small(*WAY, "trainer.target_gap=0.02", "trainer.steps=20")
+    with caplog.at_level("WARNING"):
+        tried, made = run(trainer, tmp_path, monkeypatch, lambda t: 0.1 if t.step < 12 else -0.1)
+    ((step, fields),) = tried
+    assert (step, made.run.stopped) == (20, "steps")
+    assert all(torch.equal(t, fields[n]) for n, t in trainer.averaged_fields.state_dict().items())
+    assert trainer.watch.best.step == 4
+    assert sum("contradicted each other at step 12" in line for line in caplog.messages) == 1
+    said = json.loads((tmp_path / "certificate.json").read_text())
+    assert "contradicts" in said["contradiction"]
+    assert (said["gap"]["certified"], said["gap"]["simulated"], said["gap"]["lower_from"]) == (None, None, None)
+    assert not said["lower"]["F_M"]["counts"]
+    assert not said["assumptions"]["hold"]
+    assert load_controller(tmp_path / "controller.safetensors").certificate["contradiction"] == said["contradiction"]

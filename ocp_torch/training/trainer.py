@@ -167,6 +167,9 @@ class Trainer:
         certificate = self.look()
         monitor.evaluated(self, certificate)
         best = self.watch.looked(Look.at(self.step, certificate), self.averaged_fields)
+        if certificate.contradiction is not None:
+            for sentence in self.watch.contradicted(self.step, certificate.contradiction):
+                monitor.noticed(sentence)
         if 2 * self.step >= self.settings.steps and not self.watch.warned:
             for sentence in hopeless(self.problem, self.bounds, certificate, self.seed):
                 self.watch.warned = True
@@ -227,7 +230,10 @@ class Trainer:
         best = self.watch.best
         if best is None or best.step == self.step:
             return self.averaged_fields, None
-        fields, final = self.best_fields(), Look.at(self.step, self.look())
+        seen = self.look()
+        if seen.contradiction is not None:
+            return self.averaged_fields, None  # an earlier look would but hide it
+        fields, final = self.best_fields(), Look.at(self.step, seen)
         if best.better_than(final, sure=True) and SEARCHED.searches(self.bounds):
             # Spikes of the slack come and go from look to look; the certificate's averages of V know nothing of them.
             best = Look.at(best.step, self._quick(SEARCHED, fields))

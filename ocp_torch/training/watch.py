@@ -17,6 +17,7 @@ from ocp_torch.samplers import derive_seed
 GROWN_WEIGHTS, GROWN_LOSS = 100.0, 1e4
 # States on which the bound of the best constant V is computed.
 CONSTANT_STATES, CONSTANT_STREAM = 2**13, 7
+CONTRADICTED = "bounds contradicted each other at step"
 # A lower bound that falls short of it by less is as good: networks round, and both are sampled.
 ROUNDING = 1e-4
 
@@ -93,6 +94,13 @@ class Watch:
                 )
         self.notes += fresh
         return fresh
+
+    def contradicted(self, step: int, sentence: str) -> list[str]:
+        """Take note, once, that bounds contradicted each other at ``step``; the sentence that says so, if it is news."""
+        if any(note.startswith(CONTRADICTED) for note in self.notes):
+            return []
+        self.notes.append(f"{CONTRADICTED} {step}: {sentence}")
+        return self.notes[-1:]
 
     def state_dict(self) -> dict:
         best = asdict(self.best) if self.best else None
