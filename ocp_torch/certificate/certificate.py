@@ -9,8 +9,11 @@ from pathlib import Path
 
 from ocp_torch.certificate.assumptions import Assumptions
 from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.errors import InputError, require_integer, require_number, visible
 
 SCHEMA = 1
+# Of a problem or a method, in characters.
+LONGEST_NAME = 120
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,20 @@ class Run:
     samples: int = 0
     train_seconds: float = 0.0
     stopped: str = "steps"  # why training ended: steps, target_gap, max_seconds or not_finite
+
+    @classmethod
+    def read(cls, certificate: dict) -> Run:
+        """What ``certificate``, as a file has it, says. Raises `InputError` where it does not say it, or absurdly."""
+        said = {name: certificate[name] for name in cls.__dataclass_fields__ if name in certificate}
+        for name in ("problem", "method", *({"stopped"} & said.keys())):
+            if not isinstance(said.get(name), str):
+                raise InputError("the controller's certificate does not say which problem and method it is of.")
+            said[name] = visible(said[name], LONGEST_NAME)
+        for name in {"seed", "step", "samples"} & said.keys():
+            require_integer(f"{name} of the certificate", said[name], 0, maximum=2**63)
+        if "train_seconds" in said:
+            require_number("train_seconds of the certificate", said["train_seconds"], at_least=0.0)
+        return cls(**said)
 
 
 @dataclass(frozen=True)
@@ -189,7 +206,8 @@ def _share(lower, upper, zero: Estimate | None) -> float | None:
 def table(certificate: dict, searches: list[str] = ()) -> str:
     """The certificate (as a dict of its schema) as a table for the terminal, and how its suprema were found."""
     exact = certificate["exact"]
-    lines = [f"{certificate['problem']} / {certificate['method']}, seed {certificate['seed']}", ""]
+    name = lambda key: visible(certificate[key], LONGEST_NAME)
+    lines = [f"{name('problem')} / {name('method')}, seed {certificate['seed']}", ""]
     covered = f"± {100.0 * certificate['confidence']:.6g} %" if "confidence" in certificate else "± se"
     header = f"{'':26}{'value':>14}{covered:>11}{'of it bias':>11}" + (f"{'vs OPT':>12}" if exact else "")
     lines += [header, "-" * len(header)]
@@ -209,8 +227,8 @@ def table(certificate: dict, searches: list[str] = ()) -> str:
         lines.append(f"{'OPT (exact)':26}{exact:14.8f}")
     row("Perf: controller from V", certificate["perf"].get("value"))
     row("Perf: controller w/mu", certificate["perf"].get("density"))
-    for name, estimate in certificate.get("perf_lower", {}).items():
-        row(f"Perf, at least: {name}", estimate)
+    for kind, estimate in certificate.get("perf_lower", {}).items():
+        row(f"Perf, at least: {visible(kind, LONGEST_NAME)}", estimate)
     row("Perf: this controller", certificate["perf"].get("given"))
     for name, label in (("lagrangian", "Lagrangian"), ("evaluation", "evaluation"), ("G", "G"), ("J", "J")):
         row(f"upper: {label}", certificate["upper"].get(name))
@@ -223,7 +241,7 @@ def table(certificate: dict, searches: list[str] = ()) -> str:
             lines.append(f"gap, {kind}: {100.0 * gap[kind]:.4f}%{part}")
     lines += in_words(certificate)
     lines += searches
-    lines += [f"warning: {warning}" for warning in certificate["warnings"]]
+    lines += [f"warning: {visible(warning)}" for warning in certificate["warnings"]]
     return "\n".join(lines)
 
 

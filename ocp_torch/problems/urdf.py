@@ -7,8 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from ocp_torch.errors import InputError
+from ocp_torch.reading import kind, require_file
 
 TURNING, STIFF = ("revolute", "continuous"), "fixed"
+# Text of a description in bytes; meshes lie in files of their own, and are not read.
+LARGEST_URDF = 2**24
 
 
 def read_chain(path: str | Path, tip: str | None) -> list[list[float]]:
@@ -23,8 +26,9 @@ def read_chain(path: str | Path, tip: str | None) -> list[list[float]]:
     except ImportError:
         raise InputError('problem.urdf needs yourdfpy; install it with pip install -e ".[urdf]".') from None
     path = Path(path)
-    if not path.is_file():
+    if kind(path) is None:
         raise InputError(f"problem.urdf is {str(path)!r}, which is not a file.")
+    require_file(path, LARGEST_URDF)
     try:
         nothing = dict.fromkeys(("build_scene_graph", "load_meshes", "build_collision_scene_graph"), False)
         robot = URDF.load(str(path), load_collision_meshes=False, **nothing).robot
