@@ -26,7 +26,7 @@ FILE, FOLDER, OTHER = "file", "folder", "other"
 # No run writes a larger file; a larger one is not read into memory.
 LARGEST_FILE = 2**31
 # More than any certificate, controller or configuration holds: text in bytes, values, levels, digits, bits, characters.
-LARGEST_JSON, LARGEST_YAML = 2**26, 2**20
+LARGEST_JSON, LARGEST_YAML, MOST_OF_YAML = 2**26, 2**20, 2**17
 MOST_VALUES, DEEPEST, LONGEST_NUMBER, MOST_BITS, LONGEST_SCALAR = 2**21, 32, 64, 128, 2**13
 # Of an archive what is read at once at most: its list of parts has 50 bytes and more for each.
 LARGEST_PIECE = 2**20
@@ -134,7 +134,9 @@ def yaml_mapping(text: str) -> dict:
     numbers, lists and mappings."""
     depth = 0
     try:
-        for event in yaml.parse(text, Loader=YAML):
+        for count, event in enumerate(yaml.parse(text, Loader=YAML)):
+            if count > MOST_OF_YAML:
+                raise NotPlain(f"it holds more than {MOST_OF_YAML:,} values")
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if depth > DEEPEST or isinstance(event, yaml.AliasEvent):
                 raise NotPlain("it holds references or nests too deep, which no run's configuration does")
@@ -205,11 +207,12 @@ def _replaced(value: object, data: dict):
         reference = REFERENCE.fullmatch(value) if isinstance(value, str) else None
         if reference is None:
             break
-        value = data
+        found: object = data
         for key in reference[1].split("."):
-            value = value.get(key) if isinstance(value, dict) else None
-    if isinstance(value, dict | list):
-        raise NotPlain(f"it refers to the group {reference[1][:80]!r}; write it out")
+            found = found.get(key) if isinstance(found, dict) else None
+        if isinstance(found, dict | list):
+            break
+        value = found
     return _literal(value)
 
 
