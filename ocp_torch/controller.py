@@ -168,12 +168,9 @@ def _blank(problem: Problem, names: list[str], network: type, options: dict) -> 
 
 def _require_run(path: Path, certificate: object, config: object) -> None:
     """What `evaluate` reads of the run is made of groups of fields."""
-    groups = [
-        certificate,
-        config,
-        *(config.get(name, {}) for name in ("certificate", "trainer") if isinstance(config, dict)),
-    ]
-    if not all(isinstance(group, dict) for group in groups):
+    below = lambda group, name: group.get(name) or {} if isinstance(group, dict) else None
+    effort = below(config, "certificate")
+    if not all(isinstance(g, dict) for g in (certificate, effort, below(effort, "stage"), below(config, "trainer"))):
         raise InputError(f"{path} does not describe the run it came from.")
 
 

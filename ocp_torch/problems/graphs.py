@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -73,10 +74,12 @@ def _read(name: str, path: Path, count: int) -> np.ndarray:
         if path.suffix == ".npy":
             return read_npy(path, (count, count))
         text = read_text(path, LONGEST_NUMBER * count**2)
-        return np.loadtxt(text.splitlines(), ndmin=2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # that there is nothing in it
+            return np.loadtxt(text.splitlines(), ndmin=2)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
-    except (ValueError, EOFError) as error:
+    except (ValueError, EOFError, UserWarning) as error:
         raise InputError(f"{name} = {path} is not a matrix of numbers ({error}).") from None
 
 

@@ -159,7 +159,7 @@ def row_of(folder: Path, name: str) -> dict:
             "stopped": printable(certificate.get("stopped", "steps")),
             "warnings": len(list(certificate["warnings"])),
         }
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
         reason = visible(error if isinstance(error, InputError) else f"{type(error).__name__}: {error}", 200)
         raise InputError(f"its certificate.json is damaged ({reason}).") from None
 

@@ -46,7 +46,9 @@ def settings_for(controller: Controller, config: dict) -> CertificateSettings:
     stage = {k: v for k, v in (config["certificate"].get("stage") or {}).items() if v is not None}
     named = {f"certificate.{k}" for k in changed} | {f"certificate.stage.{k}" for k in stage}
     require_modest_run(config["run"], controller.config, named)
-    return build_certificate_settings({"certificate": {**own, **changed, "stage": {**own.get("stage", {}), **stage}}})
+    return build_certificate_settings(
+        {"certificate": {**own, **changed, "stage": {**(own.get("stage") or {}), **stage}}}
+    )
 
 
 def certify_saved(controller: Controller, settings: CertificateSettings, seed: int | None = None) -> Certificate:

@@ -203,7 +203,7 @@ def result_of(folder: Path, state: dict, config: dict) -> str | None:
         certificate = read_json(folder / "certificate.json")
         done = state.get("ended") and state.get("config") == config and certificate["step"] == state["step"]
         return table(certificate) if done else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError):
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError):
         return None  # what cannot be read is made again
 
 
