@@ -16,6 +16,8 @@ from ocp_torch.reading import opened, zip_file
 
 # Bytes of the header of an array of numbers at most; NumPy itself writes 118.
 LONGEST_HEADER = 1024
+# NumPy's letters for the kinds of numbers that are read.
+REAL, FLAGS = "fiu", "b"
 # What is unpacked from any file, in bytes, and how often its own size from a larger one. Random states hardly compress,
 # and are a part of one in `3 + m` of a recording; the others may be constant.
 FREELY, MOST_TIMES = 2**27, 64
@@ -40,8 +42,8 @@ class Form:
         return self.start + math.prod(self.shape) * self.dtype.itemsize
 
 
-def form_of(file: BinaryIO) -> Form:
-    """The form of the array that begins in ``file``; `ValueError` where it is none, or not one of real numbers."""
+def form_of(file: BinaryIO, kinds: str = REAL) -> Form:
+    """The form of the array that begins in ``file``; `ValueError` where it is none, or not of the ``kinds`` of numbers."""
     begin = file.read(8)
     if len(begin) < 8 or begin[:6] != b"\x93NUMPY" or begin[6] not in (1, 2):
         raise ValueError("is damaged: it is no array of NumPy's")
@@ -58,18 +60,18 @@ def form_of(file: BinaryIO) -> Form:
         raise ValueError("is damaged: its header is not one of NumPy's") from None
     if dtype.hasobject:
         raise ValueError("holds Python objects, which are never read from a file")
-    if dtype.kind not in "fiu" or min(shape, default=0) < 0:
+    if dtype.kind not in kinds or min(shape, default=0) < 0:
         raise ValueError(f"has type {dtype}, but must hold real numbers")
     return Form(tuple(map(int, shape)), dtype, header.tell())
 
 
-def read_npy(path: Path, shape: tuple[int, ...]) -> np.ndarray:
-    """The array of ``shape`` in the file ``path``, in float64; `InputError` for a file that cannot be read, and `ValueError`
-    for another array or none."""
+def read_npy(path: Path, most: int) -> np.ndarray:
+    """The array in the file ``path``, in float64 and of at most ``most`` bytes; `InputError` for a file that cannot be read,
+    and `ValueError` for a larger array or none."""
     with opened(path) as file:
-        form = form_of(file)
-        if form.shape != shape:
-            raise InputError(f"{path} has shape {form.shape}, but must have {shape}.")
+        form = form_of(file, REAL + FLAGS)
+        if form.size > most:
+            raise ValueError(f"has shape {form.shape}, which is too large")
         file.seek(0)
         return np.lib.format.read_array(file, allow_pickle=False, max_header_size=LONGEST_HEADER).astype(np.float64)
 

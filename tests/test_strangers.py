@@ -578,6 +578,11 @@ def test_constant_parts_of_a_recording_are_no_bomb(tmp_path):
     assert (found["B"] == B).all()
 
 
+def test_a_graph_of_flags_is_read_as_before(tmp_path):
+    np.save(tmp_path / "a.npy", ~np.eye(3, dtype=bool))
+    assert Kuramoto(oscillators=3, graph=str(tmp_path / "a.npy")).graph == (1.0 - np.eye(3)).tolist()
+
+
 def test_text_for_a_graph_is_no_larger_than_the_graph(tmp_path):
     (tmp_path / "a.txt").write_text("1 " * 10**7)
     assert "bytes" in refusal(lambda: Kuramoto(oscillators=4, graph=str(tmp_path / "a.txt")), megabytes=50)

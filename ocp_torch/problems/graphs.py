@@ -19,6 +19,8 @@ GRAPHS = ("complete", "ring", "random")
 SUFFIXES = (".npy", ".txt")
 # Characters of a number in a text file, on average, at most.
 LONGEST_NUMBER = 64
+# Bytes of a matrix that is read even where it is larger than it should be, so that its shape can be told.
+LEAST_ROOM = 2**20
 
 
 def adjacency(name: str, value: object, count: int, probability: float, seed: int) -> Tensor:
@@ -72,13 +74,13 @@ def _rows(name: str, value: object, count: int) -> np.ndarray:
 def _read(name: str, path: Path, count: int) -> np.ndarray:
     try:
         if path.suffix == ".npy":
-            return read_npy(path, (count, count))
+            return read_npy(path, max(8 * count**2, LEAST_ROOM))
         text = read_text(path, LONGEST_NUMBER * count**2)
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # that there is nothing in it
             return np.loadtxt(text.splitlines(), ndmin=2)
     except InputError as error:
-        raise InputError(f"{name}: {error}") from None
+        raise InputError(f"{name} cannot be read: {error}") from None
     except (ValueError, EOFError, UserWarning) as error:
         raise InputError(f"{name} = {path} is not a matrix of numbers ({error}).") from None
 
