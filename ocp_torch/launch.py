@@ -98,7 +98,7 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
     own = Path(str(given["hydra.run.dir"])) if "hydra.run.dir" in given else None
     data = composed(config_name, overrides, roots=(own,) if own else ())
     folder = own if data.get("resume") is None else locate(Path(data["resume"]))[0]
-    if folder is not None and "resume" in data:
+    if folder is not None:
         require_unlinked(folder)
     check(data)
     if data.get("resume") is None:

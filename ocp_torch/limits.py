@@ -8,6 +8,7 @@ from ocp_torch.errors import InputError
 MOST_OF_A_PROBLEM, LONGEST_LIST = 128, 256
 # Dotted field of a run -> its largest value: some sixteen times a default.
 MOST = {
+    "trainer.steps": 2**24,
     "trainer.batch": 2**16,
     "trainer.threads": 64,
     "trainer.keep": 100,

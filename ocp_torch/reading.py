@@ -88,7 +88,7 @@ def read_text(path: str | Path, most: int) -> str:
     """The UTF-8 text of an ordinary file of at most ``most`` bytes; `InputError` otherwise."""
     try:
         with opened(path, most) as file:
-            return file.read(most).decode()
+            return (file.read(most) or b"").decode()
     except UnicodeDecodeError:
         raise InputError(f"{path} is damaged: it is not UTF-8 text.") from None
     except OSError as error:

@@ -26,6 +26,8 @@ MAGIC = "ocp_torch-checkpoint"
 LAST, BEST = "last.pt", "best.pt"
 # Bytes of that first line, and of what lists the parts of the rest, at most; how often a number may be seen by tensors.
 LONGEST_HEADER, LARGEST_PICKLE, SHARED = 256, 2**23, 4
+# Bytes that are read at once for the digest.
+PIECE = 2**22
 
 
 def save_checkpoint(path: Path, state: dict, keep: int = 1) -> None:
@@ -74,7 +76,10 @@ def load_checkpoint(path: Path) -> dict:
             raise InputError(f"{path} is not a checkpoint of ocp_torch, or its first bytes are damaged.")
         if words[1] != str(SCHEMA):
             raise InputError(f"{path} has schema {words[1][:20]!r}, but this version of ocp_torch reads {SCHEMA}.")
-        if hashlib.file_digest(file, hashlib.sha256).hexdigest() != words[2]:
+        sha = hashlib.sha256()
+        while piece := file.read(PIECE):
+            sha.update(piece)
+        if sha.hexdigest() != words[2]:
             raise InputError(f"{path} is damaged: its contents do not match the digest it carries.")
         content = _After(file, len(header))
         try:

@@ -33,6 +33,8 @@ FIXED = ("problem", "method", "model", "averaging", "sampler", "seed", "optimize
 def locate(path: Path) -> tuple[Path | None, Path | None]:
     """The run's folder and the checkpoint that ``path`` names: a folder stands for its newest good checkpoint (`None`),
     and a checkpoint that lies in no run's folder has none."""
+    if "${" in str(path):
+        raise InputError(f"resume is {str(path)!r}, which Hydra would take for an interpolation; rename the folder.")
     found = kind(path)
     if found == FOLDER:
         return path, None

@@ -12,6 +12,7 @@ from ocp_torch.certificate import CertificateSettings
 from ocp_torch.config import build_certificate_settings, build_trainer
 from ocp_torch.errors import InputError, require_integer
 from ocp_torch.limits import require_held
+from ocp_torch.reading import require_unlinked
 from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.resume import (
     filled_from,
@@ -73,6 +74,7 @@ def _built(config: dict) -> Trainer:
 
 def train(config: dict, folder: Path) -> None:
     """One run in ``folder``, from wherever it is to its end."""
+    require_unlinked(folder)
     run = prepare(config)
     for note in run.notes:
         log.warning("warning: %s", note)
