@@ -11,14 +11,15 @@ from torch import Tensor
 
 from ocp_torch.bounds import Bounds
 from ocp_torch.control_laws import CLOSED, NETWORK, SADDLE, control_laws
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, notes
 from ocp_torch.fields import MODELS, Fields
+from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE
+from ocp_torch.limits import require_held, require_modest_problem
 from ocp_torch.problems import PROBLEMS, Problem
 from ocp_torch.storage import load_tensors, save_tensors
 
 SCHEMA = 1
-# What a file may ask for, so that a crafted one cannot ask for all memory.
-LARGEST_COUNT = 2**22
+FIELDS = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION)
 
 
 @dataclass
@@ -103,7 +104,7 @@ def load_controller(path: str | Path, problem: Problem | None = None, device: st
 def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None, device: str) -> Controller:
     if metadata["occupation"] not in (None, CLOSED, SADDLE, NETWORK):
         raise InputError(f"{path} names the unknown occupation {metadata['occupation']!r}.")
-    _require_plain_run(path, metadata["certificate"], metadata["config"])
+    _require_run(path, metadata["certificate"], metadata["config"])
     saved = metadata["problem"]
     if problem is None:
         if saved["name"] not in PROBLEMS:
@@ -111,16 +112,20 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
                 f"{path} belongs to the problem {str(saved['name'])[:80]!r}, which is not part of ocp_torch, or calls a "
                 "function of yours; pass it: load_controller(path, problem=MyProblem())."
             )
-        _require_reasonable(path, saved["parameters"])
+        require_modest_problem(path, saved["parameters"], "pass it: load_controller(path, problem=...)")
         problem = PROBLEMS[saved["name"]](**saved["parameters"])
     elif saved["name"] in PROBLEMS and problem_name(problem) != saved["name"]:
         raise InputError(f"{path} belongs to the problem {saved['name']!r}, not to {problem_name(problem)!r}.")
-    model = metadata["model"]
-    _require_reasonable(path, model)
+    model, names = metadata["model"], metadata["fields"]
+    if len(names) > len(FIELDS) or not set(names) <= set(FIELDS) or len(set(names)) < len(names):
+        raise InputError(
+            f"{path} names the fields {names!r:.80}, but must name some of {', '.join(FIELDS)}, each once."
+        )
+    require_held(path, model, sum(t.numel() for t in tensors.values()))
     options = {k: v for k, v in model.items() if k != "name"}
     if model["name"] not in MODELS:
         raise InputError(f"{path} names the unknown model {model['name']!r}; known are {', '.join(MODELS)}.")
-    build = lambda: _blank(problem, metadata["fields"], MODELS[model["name"]], options)
+    build = lambda: _blank(problem, names, MODELS[model["name"]], options)
     with torch.device("meta"):
         # Shapes first, without memory: a crafted size must not be allocated before it is refused.
         shapes = {name: tuple(t.shape) for name, t in build().state_dict().items()}
@@ -129,15 +134,20 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
         raise InputError(
             f"{path} does not fit: its weights are not those of its model on a problem of dimension {problem.dim}."
         )
-    if not all(torch.isfinite(t).all() for t in tensors.values()):
-        raise InputError(f"{path} holds weights that are not finite.")
     if metadata["dtype"] not in ("float32", "float64"):
         raise InputError(f"{path} has dtype {metadata['dtype']!r}, but must have float32 or float64.")
+    other = {str(t.dtype).removeprefix("torch.") for t in tensors.values()} - {metadata["dtype"]}
+    if other:
+        raise InputError(
+            f"{path} holds weights of type {', '.join(sorted(other))}, but must hold {metadata['dtype']} alone."
+        )
+    if not all(torch.isfinite(t).all() for t in tensors.values()):
+        raise InputError(f"{path} holds weights that are not finite.")
     with torch.random.fork_rng(devices=[]):
         fields = build().to(dtype=getattr(torch, metadata["dtype"]))
     fields.load_state_dict(tensors)
     fields = fields.to(device).requires_grad_(False)
-    bounds = Bounds(**{**metadata["bounds"], "warnings": tuple(metadata["bounds"]["warnings"])})
+    bounds = Bounds(**{**metadata["bounds"], "warnings": notes(metadata["bounds"]["warnings"])})
     return Controller(
         problem=problem,
         fields=fields,
@@ -156,20 +166,12 @@ def _blank(problem: Problem, names: list[str], network: type, options: dict) -> 
     return Fields({n: network(dim=problem.dim, outputs=outputs[n], **options) for n in names})
 
 
-def _require_plain_run(path: Path, certificate: object, config: object) -> None:
-    """What `evaluate` reads of the run: groups of fields, and no count that would take all memory."""
-    effort = config.get("certificate", {}) if isinstance(config, dict) else None
-    settings = config.get("trainer", {}) if isinstance(config, dict) else None
-    if not all(isinstance(part, dict) for part in (certificate, effort, settings)):
+def _require_run(path: Path, certificate: object, config: object) -> None:
+    """What `evaluate` reads of the run is made of groups of fields."""
+    below = lambda group, name: group.get(name) or {} if isinstance(group, dict) else None
+    effort = below(config, "certificate")
+    if not all(isinstance(g, dict) for g in (certificate, effort, below(effort, "stage"), below(config, "trainer"))):
         raise InputError(f"{path} does not describe the run it came from.")
-    for group in (effort, effort.get("stage") or {}, {"threads": settings.get("threads", 1)}):
-        _require_reasonable(path, group)
-
-
-def _require_reasonable(path: Path, numbers: dict) -> None:
-    for name, value in numbers.items():
-        if isinstance(value, int) and value > LARGEST_COUNT and name != "seed":
-            raise InputError(f"{path} asks for {name} = {value}, which is beyond anything a run can have had.")
 
 
 def _plain(parameters: dict) -> dict:

@@ -7,9 +7,35 @@ import inspect
 import math
 from collections.abc import Callable, Iterable
 
+# A sentence that quotes more has nothing more to say; and a run that has more to warn of was not written by a run.
+LONGEST, MOST_NOTES = 2000, 200
+
+
+def visible(text: object, most: int = LONGEST, keep: str = "") -> str:
+    """``text`` fit for a terminal: what does not print, but for the signs in ``keep``, as its escape (`\\x1b`), and what is
+    longer than ``most`` without its middle. Names, notes and messages may come from files of strangers."""
+    text = str(text)
+    if len(text) > most:
+        text = f"{text[: 3 * most // 4]} ... {text[-most // 5 :]}"
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in keep else c.encode("unicode_escape").decode() for c in text)
+
+
+def notes(found: object) -> tuple[str, ...]:
+    """The sentences ``found`` in a file, `visible`; `InputError` where it is no list of them, or an endless one."""
+    if not isinstance(found, list | tuple) or len(found) > MOST_NOTES or not all(isinstance(n, str) for n in found):
+        raise InputError(
+            f"the warnings in the file are {visible(found, 80)}, but must be at most {MOST_NOTES} sentences."
+        )
+    return tuple(visible(note) for note in found)
+
 
 class InputError(ValueError):
     """A mistake in what the user asked for; its message is one sentence, fit to be printed without a traceback."""
+
+    def __str__(self) -> str:
+        return visible(super().__str__())
 
 
 class StorageError(InputError):

@@ -32,7 +32,8 @@ from ocp_torch.composition import (
     prepared,
     register_resolvers,
 )
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, visible
+from ocp_torch.reading import require_unlinked
 from ocp_torch.training.checkpoint import LAST
 from ocp_torch.training.resume import adopt, locate
 from ocp_torch.training.signals import Preempted
@@ -44,6 +45,10 @@ FAILED_INPUT, INTERRUPTED = 2, 130
 ASKS = ("--help", "-h", "--info", "-i", "--cfg", "-c", "--hydra-help", "--version", "--shell-completion", "-sc")
 # Jobs of a sweep may run in processes of their own; this file, named in the environment, collects which failed.
 FAILURES = "OCP_TORCH_FAILURES"
+# Where a run goes, as in configs/train.yaml, by the name of its problem and method.
+FRESH = "${{checkout:outputs}}/{}/${{now:%Y-%m-%d_%H-%M-%S-%f}}"
+# A table with its warnings has fewer characters.
+LONGEST_MESSAGE = 2**20
 
 
 def launch(entry: Callable, config_name: str, check: Callable[[dict], object]) -> None:
@@ -53,6 +58,7 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object]) -
     their names and status 2.
     """
     register_resolvers()
+    logging.setLogRecordFactory(Record)
     logging.raiseExceptions = False  # a full disk is told once, not at every line of a log
     # A user's module is found where the command was given, as `python -m` would find it.
     sys.path.insert(0, os.getcwd())
@@ -72,23 +78,37 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object]) -
         sys.exit(INTERRUPTED)
 
 
+class Record(logging.LogRecord):
+    """A message of the log, fit for a terminal whatever names and notes of strangers are in it."""
+
+    def getMessage(self) -> str:
+        return visible(super().getMessage(), LONGEST_MESSAGE, keep="\n")
+
+
 def checked(arguments: list[str], config_name: str, check: Callable[[dict], object]) -> list[str]:
     """The arguments to hand to Hydra: as they are, but for a resume, which goes on in the folder of its run."""
     overrides = [a for a in arguments if not a.startswith("-")]
     if any(a in ("-m", "--multirun") for a in arguments):
         check_sweep(config_name, overrides)
+        root = next((o.value() for o in parsed(overrides) if o.key_or_group == "hydra.sweep.dir"), None)
+        if root is not None:
+            require_unlinked(Path(str(root)), "*")
         return arguments
     given = {o.key_or_group: o.value() for o in parsed(overrides) if not o.is_sweep_override() and not o.is_delete()}
     own = Path(str(given["hydra.run.dir"])) if "hydra.run.dir" in given else None
     data = composed(config_name, overrides, roots=(own,) if own else ())
+    folder = own if data.get("resume") is None else locate(Path(data["resume"]))[0]
+    if folder is not None:
+        require_unlinked(folder)
     check(data)
     if data.get("resume") is None:
         if own is not None and "resume" in data:
             require_fresh(own)
         return arguments
-    folder = locate(Path(data["resume"]))[0]
     if folder is None:
-        return arguments
+        # A checkpoint alone goes on in a folder named after its own problem and method.
+        name = f"{str(data['problem']['_target_']).rpartition('.')[2].lower()}_{data['method']['name']}"
+        return arguments if own is not None else [*arguments, f"hydra.run.dir='{FRESH.format(name)}'"]
     kept = [a for a in arguments if not a.lstrip("+").startswith(("resume=", "hydra.run.dir="))]
     return [*kept, f"resume={quoted(data['resume'])}", f"hydra.run.dir={quoted(folder)}"]
 
@@ -109,12 +129,13 @@ def require_fresh(folder: Path) -> None:
 
 def fail(sentence: str) -> None:
     """Print one sentence and leave with the status of a wrong input."""
-    print(f"error: {sentence}", file=sys.stderr)
+    print(f"error: {visible(sentence)}", file=sys.stderr)
     sys.exit(FAILED_INPUT)
 
 
 def job(task: Callable[[dict, Path], object], config: DictConfig) -> None:
     """Run ``task(config, folder)`` as a Hydra job. In a sweep whatever goes wrong ends its own job only."""
+    logging.setLogRecordFactory(Record)  # the process may be one that a launcher started
     hydra = HydraConfig.get()
     sweeping = hydra.mode == RunMode.MULTIRUN
     folder = Path(hydra.runtime.output_dir)
@@ -149,6 +170,7 @@ def settled(folder: Path, data: dict, make: bool) -> Path:
     own = locate(Path(data["resume"]))[0]
     if own is None or own.resolve() == folder.resolve():
         return folder
+    require_unlinked(own)
     for handler in logging.getLogger().handlers:
         if isinstance(handler, logging.FileHandler):
             handler.close()  # it opens its file again at the next line
@@ -203,7 +225,7 @@ def failures():
 def failed(hydra: DictConfig, reason: str) -> None:
     """Say that a job of a sweep failed, and have it named at the end."""
     name = hydra.job.override_dirname
-    sentence = f"error: job {hydra.job.num} ({name}): {reason}"
+    sentence = visible(f"error: job {hydra.job.num} ({name}): {reason}")
     print(sentence, file=sys.stderr)
     log.debug("%s", sentence)  # to its own train.log as well
     if FAILURES in os.environ:

@@ -8,23 +8,24 @@ numbers ``discount``, ``exponent`` and ``control_limit``. Samples must be indepe
 from __future__ import annotations
 
 import hashlib
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import safe_open
 from safetensors.numpy import save_file
 from torch import Tensor
 
+from ocp_torch.arrays import read_npz
 from ocp_torch.errors import InputError, nearest
+from ocp_torch.reading import kind
 from ocp_torch.samples import Samples
-from ocp_torch.storage import require_readable_size, write_atomically
+from ocp_torch.storage import read_safetensors, write_atomically
 
 REQUIRED = {"x": "Nd", "f": "N", "a": "Nd", "B": "Ndm"}
 OPTIONAL = {"div_a": "N", "div_B": "Nm", "mu0": "N", "density": "N"}
 NUMBERS = ("discount", "exponent", "control_limit")
+KNOWN = (*REQUIRED, *OPTIONAL, *NUMBERS)
 SUFFIXES = (".npz", ".safetensors")
 FEWEST = 100
 # What is read into memory at most, unpacked.
@@ -55,11 +56,9 @@ def read(path: str | Path, wrap: bool = False) -> Recording:
     path = Path(path)
     if path.suffix not in SUFFIXES:
         raise InputError(f"problem.path is {str(path)!r}, but must be a file ending in {' or '.join(SUFFIXES)}.")
-    if not path.is_file():
+    if kind(path) is None:
         raise InputError(f"problem.path is {str(path)!r}, which does not exist.")
-    require_readable_size(path)
-    raw = _read_npz(path) if path.suffix == ".npz" else _read_safetensors(path)
-    arrays = {name: _numeric(path, name, array) for name, array in raw.items()}
+    arrays = read_npz(path, KNOWN, MOST_BYTES) if path.suffix == ".npz" else _read_safetensors(path)
     _require_names(path, arrays)
     numbers = {name: _number(path, name, arrays.pop(name)) for name in NUMBERS if name in arrays}
     _require_shapes(path, arrays)
@@ -90,56 +89,26 @@ def write(path: str | Path, samples: Samples, numbers: dict[str, float | None], 
     write_atomically(path, fill)
 
 
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    if not zipfile.is_zipfile(path):
-        raise InputError(f"{path} is not a whole .npz file: it was cut short, or is of another kind.")
-    found = {}
-    try:
-        with zipfile.ZipFile(path) as archive:
-            total = sum(entry.file_size for entry in archive.infolist())
-        if total > MOST_BYTES:
-            raise InputError(f"{path} unpacks to {total:,} bytes, but at most {MOST_BYTES:,} are read.")
-        with np.load(path, allow_pickle=False) as file:
-            for name in file.files:
-                try:
-                    found[name] = file[name]
-                except ValueError as error:
-                    if "allow_pickle" not in str(error):
-                        raise
-                    raise InputError(
-                        f"{path}: {name} holds Python objects, which are never read from a file."
-                    ) from None
-    except InputError:
-        raise
-    except Exception as error:  # zipfile, zlib and numpy have no one type for damage
-        raise InputError(f"{path} is damaged ({type(error).__name__}: {_first_line(error)}).") from None
-    return found
-
-
 def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
-    try:
-        with safe_open(str(path), framework="pt", device="cpu") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-        return {name: t.double().numpy() if t.is_floating_point() else t.numpy() for name, t in tensors.items()}
-    except Exception as error:  # the library has no one type for damage
-        raise InputError(f"{path} is not a readable safetensors file ({_first_line(error)}).") from None
-
-
-def _numeric(path: Path, name: str, array: object) -> np.ndarray:
-    dtype = getattr(array, "dtype", None)
-    if dtype is None or dtype.kind not in "fiu":
-        raise InputError(f"{path}: {name} has type {dtype}, but must hold real numbers.")
-    return np.asarray(array, dtype=np.float64)
+    tensors, _ = read_safetensors(path, MOST_BYTES)
+    for name, tensor in tensors.items():
+        if tensor.dtype == torch.bool or tensor.is_complex():
+            raise InputError(
+                f"{path}: {name} has type {str(tensor.dtype).removeprefix('torch.')}, but must hold real numbers."
+            )
+    total = 8 * sum(tensor.numel() for tensor in tensors.values())
+    if total > MOST_BYTES:
+        raise InputError(f"{path} unpacks to {total:,} bytes, but at most {MOST_BYTES:,} are read.")
+    return {name: tensor.double().numpy() for name, tensor in tensors.items()}
 
 
 def _require_names(path: Path, arrays: dict) -> None:
-    known = [*REQUIRED, *OPTIONAL, *NUMBERS]
     missing = [name for name in REQUIRED if name not in arrays]
     if missing:
         raise InputError(f"{path} lacks {', '.join(missing)}; a recording holds x, f, a and B.")
     for name in arrays:
-        if name not in known:
-            raise InputError(f"{path} holds {name!r}, which is no array of a recording{nearest(name, known)}.")
+        if name not in KNOWN:
+            raise InputError(f"{path} holds {name!r}, which is no array of a recording{nearest(name, KNOWN)}.")
 
 
 def _number(path: Path, name: str, array: np.ndarray) -> float:
@@ -192,8 +161,11 @@ def _checked(path: Path, arrays: dict[str, np.ndarray], numbers: dict[str, float
         div_B=tensors.get("div_B"),
     )
     _require_law(path, samples, "density" in tensors)
-    digest = hashlib.sha256(b"".join(name.encode() + arrays[name].tobytes() for name in sorted(arrays))).hexdigest()
-    return Recording(samples, numbers, digest, _notes(path, samples))
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(arrays[name]).data)
+    return Recording(samples, numbers, digest.hexdigest(), _notes(path, samples))
 
 
 def _require_law(path: Path, samples: Samples, given: bool) -> None:
@@ -237,7 +209,3 @@ def _notes(path: Path, samples: Samples) -> tuple[str, ...]:
         f"consecutive samples of {path.name} are alike (correlation {correlation:.2g}): they are no independent draws, and "
         "errors and intervals are too small.",
     )
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).splitlines()), "").rstrip(".") or "no message"

@@ -18,10 +18,11 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from ocp_torch.errors import InputError, StorageError
+from ocp_torch.reading import LARGEST_FILE, LARGEST_JSON, NotPlain, json_object, kind, opened
 
 METADATA_KEY, DIGEST_KEY = "ocp_torch", "sha256"
-# No run writes more; a larger file is not read into memory.
-LARGEST_FILE = 2**33
+# More than the header of any controller or recording has, in bytes, and more tensors than a network has.
+LARGEST_HEADER, MOST_TENSORS = LARGEST_JSON, 2**14
 
 
 def write_atomically(path: Path, write: Callable[[Path], None], make_room: Callable[[], None] | None = None) -> None:
@@ -84,7 +85,7 @@ def digest(tensors: dict[str, Tensor], metadata: str) -> str:
     for name in sorted(tensors):
         tensor = tensors[name].detach().cpu().contiguous()
         sha.update(f"{name}:{tensor.dtype}:{tuple(tensor.shape)};".encode())
-        sha.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
+        sha.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return sha.hexdigest()
 
 
@@ -96,37 +97,41 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict) -> None
     write_atomically(path, lambda temporary: save_file(tensors, str(temporary), metadata=header))
 
 
-def require_readable_size(path: Path) -> None:
-    """Raise `InputError` for a file too large to be one of ours."""
-    size = path.stat().st_size
-    if size > LARGEST_FILE:
-        raise InputError(f"{path} has {size:,} bytes, but no file of a run has more than {LARGEST_FILE:,}.")
-
-
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict]:
     """Read what `save_tensors` wrote; runs no code from the file.
 
     Raises `InputError` when the file is missing, is not a safetensors file of ours, or does not match its digest.
     """
-    if not path.is_file():
+    if kind(path) is None:
         raise InputError(f"{path} does not exist; give the path of a controller.safetensors file.")
-    require_readable_size(path)
-    try:
-        with safe_open(str(path), framework="pt", device="cpu") as file:
-            header = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError, RuntimeError, ValueError, MemoryError) as error:
-        raise InputError(
-            f"{path} is not a readable safetensors file ({error}); it is damaged or of another kind."
-        ) from None
+    tensors, header = read_safetensors(path)
     if METADATA_KEY not in header or DIGEST_KEY not in header:
         raise InputError(f"{path} is a safetensors file, but was not written by ocp_torch.")
     if digest(tensors, header[METADATA_KEY]) != header[DIGEST_KEY]:
         raise InputError(f"{path} is damaged: its contents do not match the digest it carries.")
     try:
-        metadata = json.loads(header[METADATA_KEY])
-    except (ValueError, RecursionError):
-        raise InputError(f"{path} is damaged: its metadata is not JSON.") from None
-    if not isinstance(metadata, dict):
-        raise InputError(f"{path} is damaged: its metadata is not a JSON object.")
-    return tensors, metadata
+        return tensors, json_object(header[METADATA_KEY])
+    except NotPlain as error:
+        raise InputError(f"{path} is damaged: in its metadata, {error}.") from None
+
+
+def read_safetensors(path: Path, most: int = LARGEST_FILE) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The tensors and the header's words of a safetensors file of at most ``most`` bytes. Raises `InputError` where it is
+    none, or a crafted one."""
+    with opened(path, most) as file:
+        length = int.from_bytes(file.read(8), "little")
+    if length > LARGEST_HEADER:
+        raise InputError(f"{path} is not a readable safetensors file: its header claims to have {length:,} bytes.")
+    try:
+        with safe_open(str(path), framework="pt", device="cpu") as file:
+            names = list(file.keys())
+            if len(names) > MOST_TENSORS:
+                raise InputError(f"{path} holds {len(names):,} tensors, but at most {MOST_TENSORS:,} are read.")
+            return {name: file.get_tensor(name) for name in names}, file.metadata() or {}
+    except InputError:
+        raise
+    except Exception as error:  # the library has no one type for damage
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise InputError(
+            f"{path} is not a readable safetensors file ({reason}); it is damaged or of another kind."
+        ) from None

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ocp_torch.errors import InputError, nearest
 from ocp_torch.launch import fail
+from ocp_torch.reading import kind
 from ocp_torch.training.comparison import compare
 
 
@@ -14,7 +15,7 @@ def main(arguments: list[str]) -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(__doc__)
         return
-    options = dict(a.split("=", 1) for a in arguments if "=" in a and not Path(a).exists())
+    options = dict(a.split("=", 1) for a in arguments if "=" in a and kind(a) is None)
     for name, value in options.items():
         if name not in ("csv", "plot"):
             raise InputError(
@@ -22,7 +23,7 @@ def main(arguments: list[str]) -> None:
             )
         if not value:
             raise InputError(f"{name} is empty, but must be the file to write.")
-    comparison = compare([Path(a) for a in arguments if "=" not in a or Path(a).exists()])
+    comparison = compare([Path(a) for a in arguments if "=" not in a or kind(a) is not None])
     print(comparison.table())
     for name, save in (("csv", comparison.save_csv), ("plot", comparison.save_plot)):
         if name in options:

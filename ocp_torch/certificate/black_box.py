@@ -73,6 +73,8 @@ class BlackBox:
                 f"the controller gave shape {tuple(out.shape)} for states {tuple(x.shape)}, but must give "
                 f"{(len(x), self.control_dim)}."
             )
+        if out.is_complex():
+            raise InputError("the controller gave complex numbers, but a control is real.")
         return out if out.is_floating_point() else out.double()
 
     def _understood(self, x: Tensor) -> tuple[Callable[[Tensor], object], torch.dtype]:

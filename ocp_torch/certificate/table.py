@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from ocp_torch.certificate.certificate import LONGEST_NAME
+from ocp_torch.errors import visible
+
 
 def table(certificate: dict, searches: list[str] = ()) -> str:
     """The certificate (as a dict of its schema) as a table for the terminal, and how its suprema were found."""
     exact = certificate["exact"]
-    lines = [f"{certificate['problem']} / {certificate['method']}, seed {certificate['seed']}", ""]
+    name = lambda key: visible(certificate[key], LONGEST_NAME)
+    lines = [f"{name('problem')} / {name('method')}, seed {certificate['seed']}", ""]
     covered = f"± {100.0 * certificate['confidence']:.6g} %" if "confidence" in certificate else "± se"
     header = f"{'':26}{'value':>14}{covered:>11}{'of it bias':>11}" + (f"{'vs OPT':>12}" if exact else "")
     lines += [header, "-" * len(header)]
@@ -19,15 +23,15 @@ def table(certificate: dict, searches: list[str] = ()) -> str:
         half = estimate["interval"][1] - estimate["value"] if "interval" in estimate else estimate["se"]
         lines.append(f"{label:26}{estimate['value']:14.8f}{half:11.1e}{bias}{against}")
 
-    for name in ("F_M", "shifted", "rigorous"):
-        bound = certificate["lower"].get(name)
-        row(f"lower: {name}{', if' if bound and 'if' in bound else ''}", bound)
+    for kind in ("F_M", "shifted", "rigorous"):
+        bound = certificate["lower"].get(kind)
+        row(f"lower: {kind}{', if' if bound and 'if' in bound else ''}", bound)
     if exact is not None:
         lines.append(f"{'OPT (exact)':26}{exact:14.8f}")
     row("Perf: controller from V", certificate["perf"].get("value"))
     row("Perf: controller w/mu", certificate["perf"].get("density"))
-    for name, estimate in certificate.get("perf_lower", {}).items():
-        row(f"Perf, at least: {name}", estimate)
+    for kind, estimate in certificate.get("perf_lower", {}).items():
+        row(f"Perf, at least: {visible(kind, LONGEST_NAME)}", estimate)
     row("Perf: this controller", certificate["perf"].get("given"))
     for name, label in (("lagrangian", "Lagrangian"), ("evaluation", "evaluation"), ("G", "G"), ("J", "J")):
         row(f"upper: {label}", certificate["upper"].get(name))
@@ -42,7 +46,7 @@ def table(certificate: dict, searches: list[str] = ()) -> str:
         lines.append(f"gap, if {supposed(certificate)}: {100.0 * gap['conditional']:.4f}%, which rests on a guess")
     lines += in_words(certificate)
     lines += searches
-    lines += [f"warning: {warning}" for warning in certificate["warnings"]]
+    lines += [f"warning: {visible(warning)}" for warning in certificate["warnings"]]
     return "\n".join(lines)
 
 
@@ -56,11 +60,11 @@ def in_words(certificate: dict) -> list[str]:
         parts.append(f"at least {percent(least)}")
     if not parts:
         return []
-    taken = "".join(f", taking {sentence}" for sentence in found.get("takes", ()))
+    taken = "".join(f", taking {sentence}" for sentence in map(visible, found.get("takes", ())))
     sure = percent(certificate["confidence"])
     return [f"the controller is {' and '.join(parts)} worse than the optimum ({sure} sure of the sampling{taken})"]
 
 
 def supposed(certificate: dict) -> str:
     """What the lower bounds of a certificate (as a dict of its schema) that rest on guesses suppose."""
-    return " and ".join(dict.fromkeys(b["if"] for b in certificate["lower"].values() if b and "if" in b))
+    return " and ".join(dict.fromkeys(visible(b["if"]) for b in certificate["lower"].values() if b and "if" in b))

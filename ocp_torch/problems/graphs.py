@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,13 +10,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ocp_torch.arrays import read_npy
 from ocp_torch.errors import InputError, nearest
 from ocp_torch.problems.arguments import require_numbers
+from ocp_torch.reading import read_text
 
 GRAPHS = ("complete", "ring", "random")
 SUFFIXES = (".npy", ".txt")
-# A file larger than the largest problem's matrix as text is no adjacency.
-LARGEST_FILE = 2**26
+# Characters of a number in a text file, on average, at most.
+LONGEST_NUMBER = 64
+# Bytes of a matrix that is read even where it is larger than it should be, so that its shape can be told.
+LEAST_ROOM = 2**20
 
 
 def adjacency(name: str, value: object, count: int, probability: float, seed: int) -> Tensor:
@@ -27,7 +32,7 @@ def adjacency(name: str, value: object, count: int, probability: float, seed: in
     if not isinstance(value, str):
         return _checked(name, _rows(name, value, count), count)
     if Path(value).suffix in SUFFIXES:
-        return _checked(name, _read(name, Path(value)), count)
+        return _checked(name, _read(name, Path(value), count), count)
     if value not in GRAPHS:
         raise InputError(
             f"{name} is {value!r}, but must be {', '.join(GRAPHS)}, a .npy or .txt file, or a list of rows"
@@ -66,17 +71,18 @@ def _rows(name: str, value: object, count: int) -> np.ndarray:
     return np.array([require_numbers(f"{name}[{i}]", row, count) for i, row in enumerate(value)])
 
 
-def _read(name: str, path: Path) -> np.ndarray:
+def _read(name: str, path: Path, count: int) -> np.ndarray:
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise InputError(f"{name} = {path} has {path.stat().st_size} bytes, which is no adjacency matrix.")
         if path.suffix == ".npy":
-            return np.load(path, allow_pickle=False)
-        return np.loadtxt(path, ndmin=2)
-    except OSError as error:
-        raise InputError(f"{name} = {path} cannot be read: {error.strerror or error}.") from None
-    except (ValueError, EOFError):
-        raise InputError(f"{name} = {path} is not a matrix of numbers.") from None
+            return read_npy(path, max(8 * count**2, LEAST_ROOM))
+        text = read_text(path, LONGEST_NUMBER * count**2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # that there is nothing in it
+            return np.loadtxt(text.splitlines(), ndmin=2)
+    except InputError as error:
+        raise InputError(f"{name} cannot be read: {error}") from None
+    except (ValueError, EOFError, UserWarning) as error:
+        raise InputError(f"{name} = {path} is not a matrix of numbers ({error}).") from None
 
 
 def _checked(name: str, matrix: np.ndarray, count: int) -> Tensor:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ocp_torch.errors import InputError, nearest
+from ocp_torch.reading import kind, require_file
 
 
 def resolved(target: str) -> Callable:
@@ -20,8 +21,9 @@ def resolved(target: str) -> Callable:
         raise InputError(f"problem.target is {target!r}, but must be module:function or FILE.py:function.")
     try:
         if source.endswith(".py"):
-            if not Path(source).is_file():
+            if kind(source) is None:
                 raise InputError(f"problem.target names {source}, which does not exist.")
+            require_file(source)
             spec = importlib.util.spec_from_file_location(Path(source).stem, source)
             module = importlib.util.module_from_spec(spec)
             sys.modules.setdefault(Path(source).stem, module)

@@ -7,8 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from ocp_torch.errors import InputError
+from ocp_torch.reading import kind, require_file
 
 TURNING, STIFF = ("revolute", "continuous"), "fixed"
+# Text of a description in bytes; meshes lie in files of their own, and are not read.
+LARGEST_URDF = 2**24
 
 
 def read_chain(path: str | Path, tip: str | None) -> list[list[float]]:
@@ -18,13 +21,14 @@ def read_chain(path: str | Path, tip: str | None) -> list[list[float]]:
     for the tip). Without a ``tip``, the link behind the most turning joints, the farthest of them. Limits of joints are left
     out. Raises `InputError` without yourdfpy, for a file that is no URDF, an unknown tip, and joints that slide on the way.
     """
+    path = Path(path)
+    if kind(path) is None:
+        raise InputError(f"problem.urdf is {str(path)!r}, which is not a file.")
+    require_file(path, LARGEST_URDF)
     try:
         from yourdfpy import URDF
     except ImportError:
         raise InputError('problem.urdf needs yourdfpy; install it with pip install -e ".[urdf]".') from None
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"problem.urdf is {str(path)!r}, which is not a file.")
     try:
         nothing = dict.fromkeys(("build_scene_graph", "load_meshes", "build_collision_scene_graph"), False)
         robot = URDF.load(str(path), load_collision_meshes=False, **nothing).robot

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ocp_torch.errors import InputError
+from ocp_torch.reading import FOLDER, kind
 from ocp_torch.reference.reference import Reference
 from ocp_torch.storage import write_atomically
 
@@ -14,9 +15,9 @@ from ocp_torch.storage import write_atomically
 def require_npz(name: str, value: object) -> Path:
     """``value`` as the path of an NPZ file that can be written; raise `InputError` otherwise."""
     path = Path(str(value))
-    if path.suffix != ".npz" or path.is_dir():
+    if path.suffix != ".npz" or kind(path) == FOLDER:
         raise InputError(f"{name} is {str(value)!r}, but must be a file whose name ends in .npz.")
-    if path.parent.exists() and not path.parent.is_dir():
+    if kind(path.parent) not in (FOLDER, None):
         raise InputError(f"{name} is {str(value)!r}, but {path.parent} is not a folder.")
     return path
 

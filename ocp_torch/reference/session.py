@@ -14,6 +14,7 @@ from ocp_torch.config import build_problem
 from ocp_torch.controller import Controller, problem_name
 from ocp_torch.errors import InputError, require_integer, require_section
 from ocp_torch.problems import Problem
+from ocp_torch.reading import require_unlinked
 from ocp_torch.reference.checks import grid_sides, require_solvable
 from ocp_torch.reference.figure import draw, save_figure
 from ocp_torch.reference.files import require_npz, save_reference
@@ -64,7 +65,9 @@ def prepare(config: dict) -> ReferenceJob:
             raise InputError("problem and run are both given, but the run names its problem; leave problem out.")
         controller = load_run({"run": config["run"], "problem": section})
         problem, path = controller.problem, Path(str(config["run"]))
-        figure = (path if path.is_dir() else path.parent) / "figures" / "reference.png"
+        folder = path if path.is_dir() else path.parent
+        require_unlinked(folder, ("figures",))
+        figure = folder / "figures" / "reference.png"
     sides = grid_sides(problem.dim, config["side"], config["memory"])
     require_solvable(problem, Grid(problem.dim, sides[0]))
     threads = require_integer("threads", config["threads"], 1)

@@ -7,19 +7,27 @@ import hashlib
 import io
 import math
 import os
+import pickle
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError
-from ocp_torch.storage import require_readable_size, write_atomically
+from ocp_torch.errors import InputError, StorageError
+from ocp_torch.reading import LARGEST_FILE, kind, opened, require_plain, zip_file
+from ocp_torch.storage import write_atomically
 
 SCHEMA = 2
 # The file is one line, this word with the schema and a digest, and then what torch.save wrote.
 MAGIC = "ocp_torch-checkpoint"
 LAST, BEST = "last.pt", "best.pt"
+# Bytes of that first line, and of what lists the parts of the rest, at most; how often a number may be seen by tensors.
+LONGEST_HEADER, LARGEST_PICKLE, SHARED = 256, 2**23, 4
+# Bytes that are read at once for the digest.
+PIECE = 2**22
 
 
 def save_checkpoint(path: Path, state: dict, keep: int = 1) -> None:
@@ -31,6 +39,8 @@ def save_checkpoint(path: Path, state: dict, keep: int = 1) -> None:
     buffer = io.BytesIO()
     torch.save(state, buffer)
     content = buffer.getvalue()
+    if len(content) + LONGEST_HEADER > LARGEST_FILE:
+        raise StorageError(f"{path} would have {len(content):,} bytes, but none above {LARGEST_FILE:,} is read back.")
     header = f"{MAGIC} {SCHEMA} {hashlib.sha256(content).hexdigest()}\n".encode()
 
     # Older files move only once the new one is safe: a full disk must not cost one of them.
@@ -57,27 +67,33 @@ def _make_room(path: Path, keep: int) -> None:
 
 def load_checkpoint(path: Path) -> dict:
     """Read what `save_checkpoint` wrote. Raises `InputError` when it is missing, damaged or of another schema."""
-    if not path.is_file():
+    if kind(path) is None:
         raise InputError(f"{path} does not exist; give the path of a checkpoint.")
-    require_readable_size(path)
-    try:
-        header, _, content = path.read_bytes().partition(b"\n")
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from None
-    words = header.decode("ascii", errors="replace").split(" ")
-    if len(words) != 3 or words[0] != MAGIC:
-        raise InputError(f"{path} is not a checkpoint of ocp_torch, or its first bytes are damaged.")
-    if words[1] != str(SCHEMA):
-        raise InputError(f"{path} has schema {words[1][:20]!r}, but this version of ocp_torch reads {SCHEMA}.")
-    if hashlib.sha256(content).hexdigest() != words[2]:
-        raise InputError(f"{path} is damaged: its contents do not match the digest it carries.")
-    try:
-        _require_stored(content)
-        state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-        _require_plain(state)
-    except Exception as error:  # a crafted archive raises whatever its odd part leads to
-        reason = next(iter(str(error).splitlines()), "empty").rstrip(".")
-        raise InputError(f"{path} is not a readable checkpoint ({type(error).__name__}: {reason}).") from None
+    with opened(path) as file:
+        header = file.readline(LONGEST_HEADER)
+        words = header.decode("ascii", errors="replace").rstrip("\n").split(" ")
+        if len(words) != 3 or words[0] != MAGIC or not header.endswith(b"\n"):
+            raise InputError(f"{path} is not a checkpoint of ocp_torch, or its first bytes are damaged.")
+        if words[1] != str(SCHEMA):
+            raise InputError(f"{path} has schema {words[1][:20]!r}, but this version of ocp_torch reads {SCHEMA}.")
+        sha = hashlib.sha256()
+        while piece := file.read(PIECE):
+            sha.update(piece)
+        if sha.hexdigest() != words[2]:
+            raise InputError(f"{path} is damaged: its contents do not match the digest it carries.")
+        content = _After(file, len(header))
+        try:
+            _require_stored(content)
+            state = torch.load(content, map_location="cpu", weights_only=True)
+            require_plain(state, tensors=True)
+            _require_whole(state, content.size)
+        except pickle.UnpicklingError:  # PyTorch's own words tell how to run what the file holds
+            raise InputError(
+                f"{path} is not a readable checkpoint: it holds more than numbers, words and tensors, which is never run."
+            ) from None
+        except Exception as error:  # a crafted archive raises whatever its odd part leads to
+            reason = next(iter(str(error).splitlines()), "empty").rstrip(".")
+            raise InputError(f"{path} is not a readable checkpoint ({type(error).__name__}: {reason}).") from None
     return state
 
 
@@ -104,23 +120,60 @@ def _age(path: Path) -> int:
     return int(suffix) if suffix.isdecimal() else 0
 
 
-def _require_stored(content: bytes) -> None:
-    """A crafted archive could unpack to any size; `torch.save` never compresses."""
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+class _After:
+    """What follows the first ``start`` bytes of an open file, as a file of its own: only what is asked for is in memory."""
+
+    def __init__(self, file: BinaryIO, start: int) -> None:
+        self.file, self.start = file, start
+        self.size = file.seek(0, os.SEEK_END) - start
+        self.seek(0)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self.file.seek(offset + self.start if whence == os.SEEK_SET else offset, whence) - self.start
+
+    def tell(self) -> int:
+        return self.file.tell() - self.start
+
+    def read(self, count: int = -1) -> bytes:
+        return self.file.read(count)
+
+    def readinto(self, buffer) -> int:
+        return self.file.readinto(buffer)
+
+    def seekable(self) -> bool:
+        return True
+
+
+def _require_stored(content: _After) -> None:
+    """A crafted archive could unpack to any size; `torch.save` never compresses. And it is a list of few parts, of which
+    the one that describes the others is small."""
+    with zip_file(content) as archive:
         entries = archive.infolist()
-    if any(e.compress_type != zipfile.ZIP_STORED for e in entries) or sum(e.file_size for e in entries) > len(content):
+    if any(e.compress_type != zipfile.ZIP_STORED for e in entries) or sum(e.file_size for e in entries) > content.size:
         raise ValueError("its parts are compressed")
+    if any(e.filename.endswith(".pkl") and e.file_size > LARGEST_PICKLE for e in entries):
+        raise ValueError("the list of its parts is too long")
+    content.seek(0)
 
 
-def _require_plain(state: object) -> None:
-    """Every tensor holds as many numbers as it claims: none is a small storage seen as a huge one."""
+def _require_whole(state: object, size: int) -> None:
+    """Every tensor of a plain ``state`` holds as many numbers as it claims, none a small storage seen as a huge one; all of
+    them together are hardly more than the ``size`` bytes of the file; and they are real."""
+    claimed = 0
+    for tensor in _tensors(state):
+        own = math.prod(tensor.shape) * tensor.element_size()
+        if tensor.layout != torch.strided or tensor.device.type != "cpu" or tensor.is_quantized or tensor.is_complex():
+            raise ValueError(f"a tensor of shape {tuple(tensor.shape)} is of no kind that a run has")
+        if own > tensor.untyped_storage().nbytes():
+            raise ValueError(f"a tensor of shape {tuple(tensor.shape)} is not all there")
+        claimed += own
+    if claimed > SHARED * size:
+        raise ValueError("its tensors are one and the same many times over")
+
+
+def _tensors(state: object) -> Iterator[Tensor]:
     if isinstance(state, Tensor):
-        claimed = math.prod(state.shape) * state.element_size()
-        if state.layout != torch.strided or claimed > state.untyped_storage().nbytes():
-            raise ValueError(f"a tensor of shape {tuple(state.shape)} is not all there")
-    elif isinstance(state, dict):
-        for value in state.values():
-            _require_plain(value)
-    elif isinstance(state, list | tuple):
-        for value in state:
-            _require_plain(value)
+        yield state
+    elif isinstance(state, dict | list | tuple):
+        for value in state.values() if isinstance(state, dict) else state:
+            yield from _tensors(value)

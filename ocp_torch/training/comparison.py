@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,11 +11,15 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ocp_torch.errors import InputError
+from ocp_torch.certificate.certificate import LONGEST_NAME
+from ocp_torch.errors import InputError, visible
+from ocp_torch.reading import FOLDER, kind, read_json
 from ocp_torch.storage import write_atomically
 from ocp_torch.training.checkpoint import newest
 
-LARGEST_CERTIFICATE = 2**24
+LARGEST_CERTIFICATE = 2**22
+# A number that would take more characters is shown by its leading digits and its size.
+WIDEST = 24
 # Column -> how a number in it is shown.
 COLUMNS = {
     "run": "",
@@ -80,7 +83,7 @@ class Comparison:
             axis.plot([min(known, default=0.0), max(known, default=0.0)], [k, k], color="C0", linewidth=1)
             if row["exact"] is not None:
                 axis.plot(row["exact"], k, "kx", markersize=6)
-        axis.set_yticks(range(len(self.rows)), [row["run"] for row in self.rows])
+        axis.set_yticks(range(len(self.rows)), [row["run"] for row in self.rows], parse_math=False)
         axis.invert_yaxis()
         axis.set(xlabel="lower bound | simulated performance o upper bound | (x: OPT)")
         kind = file.suffix.lower()[1:]
@@ -88,14 +91,15 @@ class Comparison:
 
 
 def shown(value, form: str) -> str:
-    return "-" if value is None else format(value, form)
+    text = "-" if value is None else format(value, form)
+    return text if len(text) <= WIDEST or not isinstance(value, int | float) else f"{value:.6g}"
 
 
 def compare(paths: Iterable[Path]) -> Comparison:
     """All runs in ``paths`` (run folders, or folders of them), sorted by the certified gap, then by the simulated one."""
     folders: list[Path] = []
     for path in paths:
-        if not path.is_dir():
+        if kind(path) != FOLDER:
             raise InputError(f"{path} is not a folder; give runs' folders, or folders that hold some.")
         folders += run_folders(path)
     rows, unfinished = [], {}
@@ -112,7 +116,7 @@ def compare(paths: Iterable[Path]) -> Comparison:
 def run_folders(path: Path) -> list[Path]:
     """``path`` if it is a run's folder, else every run's folder below it."""
     marks = (".hydra", "checkpoints", "certificate.json")
-    if any((path / mark).exists() for mark in marks):
+    if any(kind(path / mark) is not None for mark in marks):
         return [path]
     return sorted({p.parent for mark in marks for p in path.rglob(mark) if "checkpoints" not in p.parent.parts[-1:]})
 
@@ -128,19 +132,17 @@ def named(folders: list[Path]) -> dict[Path, str]:
 
 
 def printable(text: object) -> str:
-    """Names come from files of strangers: nothing in them may steer a terminal."""
-    return "".join(c if c.isprintable() else "?" for c in str(text))[:120]
+    """Names come from files of strangers: nothing in them may steer a terminal, or fill it."""
+    return visible(text, LONGEST_NAME)
 
 
 def row_of(folder: Path, name: str) -> dict:
     """The row of one run. Raises `InputError`, saying why, when it has no certificate that can be read."""
     file = folder / "certificate.json"
-    if not file.exists():
+    if kind(file) is None:
         raise InputError(progress_of(folder))
     try:
-        if file.stat().st_size > LARGEST_CERTIFICATE:
-            raise ValueError("it is too large")
-        certificate = json.loads(file.read_text())
+        certificate = read_json(file, LARGEST_CERTIFICATE)
         lower, perf, upper = (best(certificate, *side) for side in SIDES)
         return {
             "run": name,
@@ -156,8 +158,8 @@ def row_of(folder: Path, name: str) -> dict:
             "stopped": printable(certificate.get("stopped", "steps")),
             "warnings": len(list(certificate["warnings"])),
         }
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-        reason = printable(f"{type(error).__name__}: {error}")
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
+        reason = visible(error if isinstance(error, InputError) else f"{type(error).__name__}: {error}", 200)
         raise InputError(f"its certificate.json is damaged ({reason}).") from None
 
 

@@ -12,8 +12,10 @@ from ocp_torch.config import build_certificate_settings, build_network, build_pr
 from ocp_torch.control_laws import ControlLaw, control_laws
 from ocp_torch.controller import Controller, load_controller
 from ocp_torch.errors import InputError, require_integer
+from ocp_torch.limits import require_modest_run
 from ocp_torch.pictures import animate, require_gif
 from ocp_torch.process import prepare
+from ocp_torch.reading import FOLDER, kind
 from ocp_torch.training.practice import write_metrics
 from ocp_torch.training.settings import MOST_THREADS
 from ocp_torch.training.watch import hopeless
@@ -25,34 +27,35 @@ def load_run(config: dict) -> Controller:
     """The controller of ``config["run"]``, a run's folder or a file; a user's own problem comes from ``config["problem"]``,
     that is from the command line, never from the file."""
     path = Path(str(config["run"]))
-    if not path.exists():
+    found = kind(path)
+    if found is None:
         raise InputError(
             f"run is {str(path)!r}, which does not exist; give a run's folder or its controller.safetensors."
         )
-    if path.is_dir():
+    if found == FOLDER:
         path = path / "controller.safetensors"
     problem = build_problem(config["problem"]) if config["problem"] else None
     return load_controller(path, problem=problem)
 
 
 def settings_for(controller: Controller, config: dict) -> CertificateSettings:
-    """The settings of the controller's own run, with what ``config`` sets in their place."""
+    """The settings of the controller's own run, with what ``config`` sets in their place. Raises `InputError` where the run's
+    own would take more than a file may ask for."""
     own = controller.config["certificate"]
     changed = {k: v for k, v in config["certificate"].items() if v is not None and k != "stage"}
     stage = {k: v for k, v in (config["certificate"].get("stage") or {}).items() if v is not None}
-    return build_certificate_settings({"certificate": {**own, **changed, "stage": {**own.get("stage", {}), **stage}}})
+    named = {f"certificate.{k}" for k in changed} | {f"certificate.stage.{k}" for k in stage}
+    require_modest_run(config["run"], controller.config, named)
+    return build_certificate_settings(
+        {"certificate": {**own, **changed, "stage": {**(own.get("stage") or {}), **stage}}}
+    )
 
 
 def certify_saved(controller: Controller, settings: CertificateSettings, seed: int | None = None) -> Certificate:
     """Print and return the certificate of ``controller``; with its own ``seed`` the numbers are those of its run."""
     threads = controller.config.get("trainer", {}).get("threads", 1)
     prepare(require_integer("trainer.threads", threads, 1, maximum=MOST_THREADS))
-    before = controller.certificate
-    try:
-        run = Run(**{name: before[name] for name in Run.__dataclass_fields__ if name in before})
-    except TypeError:
-        raise InputError("the controller's certificate does not say which problem and method it is of.") from None
-    require_integer("seed", run.seed, 0)
+    run = Run.read(controller.certificate)
     if seed is not None:
         run = Run(**{**vars(run), "seed": require_integer("seed", seed, 0)})
     trained = Trained(controller.fields, controller.occupation, build_network(controller.model))

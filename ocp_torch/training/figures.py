@@ -11,15 +11,18 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from ocp_torch.bounds import Bounds
+from ocp_torch.certificate.certificate import LONGEST_NAME
 from ocp_torch.certificate.certify import in_float64
 from ocp_torch.certificate.shifted import slack_function
 from ocp_torch.certificate.simulation import rate_at
 from ocp_torch.control_laws import NETWORK, control_laws, occupation_density
+from ocp_torch.errors import visible
 from ocp_torch.extremum import batched
 from ocp_torch.fields import Fields
 from ocp_torch.problems import Problem
 from ocp_torch.samplers import derive_seed
 from ocp_torch.starts import initial_points
+from ocp_torch.storage import write_atomically
 
 LINE_POINTS, MAP_POINTS = 400, 80
 # Of the simulated occupation density: bins a coordinate by dimension, starts, steps of a trajectory, branch of the seeds.
@@ -114,17 +117,20 @@ def interval(certificate: dict) -> Figure:
     if certificate["exact"] is not None:
         axis.axvline(certificate["exact"], color="k", linestyle=":", label="OPT")
         axis.legend(loc="upper right")
-    axis.set_yticks(range(len(rows)), [name for name, *_ in rows])
+    # A name may come from a file: its signs are not a formula.
+    axis.set_yticks(range(len(rows)), [visible(name, LONGEST_NAME) for name, *_ in rows], parse_math=False)
     axis.invert_yaxis()
-    axis.set(title=f"{certificate['problem']}, {100 * certificate['confidence']:.4g} % intervals")
+    title = f"{visible(certificate['problem'], LONGEST_NAME)}, {100 * certificate['confidence']:.4g} % intervals"
+    axis.set_title(title, parse_math=False)
     return figure
 
 
 def save(figures: dict[str, Figure], folder: Path) -> None:
     """Write `figures/<name>.png`."""
-    folder.mkdir(parents=True, exist_ok=True)
     for name, figure in figures.items():
-        figure.savefig(folder / f"{name}.png", dpi=120)
+        write_atomically(
+            folder / f"{name}.png", lambda path, figure=figure: figure.savefig(path, dpi=120, format="png")
+        )
 
 
 def _figure(columns: int):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -11,34 +13,44 @@ import torch
 from ocp_torch.controller import Controller, load_controller
 from ocp_torch.errors import InputError, nearest
 from ocp_torch.problems import Problem
+from ocp_torch.reading import FOLDER, kind, require_file
+
+log = logging.getLogger(__name__)
 
 
 def load_law(source: str, problem: Problem) -> Callable | Controller:
-    """The controller the command line names: FILE.py:function, a run's folder or a file of ours, .onnx, or TorchScript."""
+    """The controller the command line names: FILE.py:function, a run's folder or a file of ours, .onnx, or TorchScript.
+
+    A .py file is code, and so is TorchScript: it can write files by itself. Only what is trusted is named here; an .onnx
+    file, like one of ours, can do nothing but compute.
+    """
     path, _, name = str(source).rpartition(":")
     if path.endswith(".py"):
         return _function(Path(path), name)
     path = Path(str(source))
     if path.suffix == ".py":
         raise InputError(f"controller is {source!r}, but must name its function, as in {source}:function.")
-    if not path.exists():
+    found = kind(path)
+    if found is None:
         raise InputError(
             f"controller is {str(source)!r}, which does not exist; give FILE.py:function, a run's folder, a "
-            "controller.safetensors, an .onnx or a TorchScript file."
+            "controller.safetensors, an .onnx or, if you trust it with your files, a TorchScript file."
         )
-    if path.is_dir() or path.suffix == ".safetensors":
+    if found == FOLDER or path.suffix == ".safetensors":
         return load_saved(path, problem)
+    require_file(path)
     return _onnx(path) if path.suffix == ".onnx" else _torchscript(path)
 
 
 def load_saved(path: Path, problem: Problem) -> Controller:
     """A controller of ours, by its file or its run's folder; of the same problem, whatever its parameters were."""
-    return load_controller(path / "controller.safetensors" if path.is_dir() else path, problem=problem)
+    return load_controller(path / "controller.safetensors" if kind(path) == FOLDER else path, problem=problem)
 
 
 def _function(path: Path, name: str) -> Callable:
-    if not path.is_file():
+    if kind(path) is None:
         raise InputError(f"controller names {path}, which does not exist.")
+    require_file(path)
     spec = importlib.util.spec_from_file_location(path.stem, path)
     module = importlib.util.module_from_spec(spec)
     try:
@@ -67,8 +79,18 @@ def _onnx(path: Path) -> Callable:
 
 
 def _torchscript(path: Path) -> Callable:
+    """A program of its own, which may write wherever the user may."""
+    warn_of_code(path)
     try:
         return torch.jit.load(str(path), map_location="cpu").eval()
     except Exception as error:  # the loader has no one type for a bad file
         reason = next(iter(str(error).splitlines()), "").split(". ")[0]
         raise InputError(f"{path} is not a TorchScript file ({reason}).") from None
+
+
+@cache
+def warn_of_code(path: Path) -> None:
+    """Say once what TorchScript can do."""
+    log.warning(
+        "warning: %s is TorchScript, code that can write your files; load it if you trust it, or take ONNX.", path
+    )

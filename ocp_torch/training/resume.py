@@ -8,23 +8,22 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import json
 import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
 
 import yaml
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from ocp_torch.certificate import table
 from ocp_torch.errors import InputError
+from ocp_torch.limits import require_modest_problem, require_modest_run
 from ocp_torch.problems import PROBLEMS
+from ocp_torch.reading import FOLDER, kind, read_json, read_yaml
 from ocp_torch.storage import write_atomically
 from ocp_torch.training.checkpoint import LAST, load_checkpoint, newest
 
-CONFIG, LARGEST_CONFIG, DEEPEST = "config.yaml", 2**20, 32
+CONFIG, AUTO = "config.yaml", "auto"
 OWN_TARGETS = {f"ocp_torch.problems.{c.__name__}" for c in PROBLEMS.values()}
 OWN_TARGETS |= {f"{c.__module__}.{c.__name__}" for c in PROBLEMS.values()}
 # What a checkpoint's tensors belong to; everything else may be set anew at a resume.
@@ -34,9 +33,12 @@ FIXED = ("problem", "method", "model", "averaging", "sampler", "seed", "optimize
 def locate(path: Path) -> tuple[Path | None, Path | None]:
     """The run's folder and the checkpoint that ``path`` names: a folder stands for its newest good checkpoint (`None`),
     and a checkpoint that lies in no run's folder has none."""
-    if path.is_dir():
+    if "${" in str(path):
+        raise InputError(f"resume is {str(path)!r}, which Hydra would take for an interpolation; rename the folder.")
+    found = kind(path)
+    if found == FOLDER:
         return path, None
-    if not path.exists():
+    if found is None:
         raise InputError(f"resume is {str(path)!r}, which does not exist; give a run's folder or a checkpoint.")
     return (path.absolute().parent.parent if path.absolute().parent.name == "checkpoints" else None), path
 
@@ -77,8 +79,11 @@ def saved_configuration(path: Path) -> dict:
             config = read_configuration(start / CONFIG)
             if config.get("resume", "") is None and (start / CONFIG).read_bytes().endswith(b"\n"):
                 return config
-    if folder is not None and (folder / ".hydra" / CONFIG).is_file():
-        return {**read_configuration(folder / ".hydra" / CONFIG), "resume": None}
+    if folder is not None and kind(folder / ".hydra" / CONFIG) is not None:
+        config = read_configuration(folder / ".hydra" / CONFIG)
+        # One that names a run to go on with is that of a resume too: the folder had no configuration before.
+        if config.get("resume") in (None, AUTO):
+            return {**config, "resume": None}
     config = load_state(path)[0].get("config")
     if not isinstance(config, dict):
         raise InputError(f"{path} holds no configuration.")
@@ -87,34 +92,9 @@ def saved_configuration(path: Path) -> dict:
 
 def read_configuration(file: Path) -> dict:
     """A configuration file as plain nested data; runs nothing. Raises `InputError` when it is damaged or crafted."""
-    try:
-        if file.stat().st_size > LARGEST_CONFIG:
-            raise InputError(f"{file} is too large to be a run's configuration.")
-        text = file.read_text()
-        _require_shallow(file, text)
-        data = yaml.safe_load(text)
-        if not isinstance(data, dict):
-            raise InputError(f"{file} is not a run's configuration.")
-        if re.search(r"\$\{[^}]*:", text):
-            raise InputError(
-                f"{file} holds a resolver (a value with ${{name:...}}), which is not run; write the value."
-            )
-        data.pop("hydra", None)
-        return OmegaConf.to_container(OmegaConf.create(data), resolve=True)
-    except (OSError, ValueError, RecursionError, yaml.YAMLError, OmegaConfBaseException) as error:
-        if isinstance(error, InputError):
-            raise
-        reason = " ".join(str(error).split())[:200].rstrip(".")
-        raise InputError(f"{file} is damaged or not a run's configuration ({reason}).") from None
-
-
-def _require_shallow(file: Path, text: str) -> None:
-    """References that unfold to any size, and nesting that takes forever to read, are in no run's configuration."""
-    depth = 0
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if isinstance(event, yaml.AliasEvent) or depth > DEEPEST:
-            raise InputError(f"{file} holds references or nests too deep, which no run's configuration does.")
+    data = read_yaml(file)
+    data.pop("hydra", None)
+    return data
 
 
 def resumed_configuration(composed: dict, named: Iterable[str]) -> dict:
@@ -133,6 +113,7 @@ def resumed_configuration(composed: dict, named: Iterable[str]) -> dict:
             result[section] = {**composed[section], **result[section]}
     for name in named:
         _transplant(result, composed, name.split("."))
+    require_modest_run(path, result, {*named})
     problem = result.get("problem")
     target = problem.get("_target_") if isinstance(problem, dict) else None
     if target not in OWN_TARGETS and not {"problem", "problem._target_"} & set(named):
@@ -140,6 +121,9 @@ def resumed_configuration(composed: dict, named: Iterable[str]) -> dict:
             f"the configuration of {path} names the problem {str(target)[:80]!r}, which is not part of ocp_torch and is not "
             "imported for a file; name it yourself: problem._target_=my_module.MyProblem."
         )
+    if target in OWN_TARGETS and "problem" not in named:
+        given = {k: v for k, v in problem.items() if f"problem.{k}" not in named}
+        require_modest_problem(path, given, "give it yourself, problem.<name>=..., if you want that")
     return result
 
 
@@ -218,10 +202,10 @@ def _differences(one: object, other: object, name: str) -> list[tuple[str, tuple
 def result_of(folder: Path, state: dict, config: dict) -> str | None:
     """The table of a run that has nothing left to do under ``config``, or `None`."""
     try:
-        certificate = json.loads((folder / "certificate.json").read_text())
+        certificate = read_json(folder / "certificate.json")
         done = state.get("ended") and state.get("config") == config and certificate["step"] == state["step"]
         return table(certificate) if done else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError):
         return None  # what cannot be read is made again
 
 

@@ -6,9 +6,13 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
+from torch import Tensor
+
 from ocp_torch.certificate import CertificateSettings
 from ocp_torch.config import build_certificate_settings, build_trainer
 from ocp_torch.errors import InputError, require_integer
+from ocp_torch.limits import require_held
+from ocp_torch.reading import require_unlinked
 from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.resume import (
     filled_from,
@@ -48,10 +52,18 @@ def prepare(config: dict) -> Prepared:
     made = state.get("config") if isinstance(state, dict) else None
     if not isinstance(made, dict):
         raise InputError(f"{checkpoint} is not the state of a run.")
-    trainer = _built(filled_from(config, made))
+    filled = filled_from(config, made)
+    require_held(checkpoint, filled.get("model"), numbers_in(state))
+    trainer = _built(filled)
     require_same_run(trainer.config, made)
     trainer.resume(checkpoint)
     return Prepared(trainer, build_certificate_settings(trainer.config), state, tuple(notes))
+
+
+def numbers_in(state: dict) -> int:
+    """How many weights the fields of a run's ``state`` have."""
+    fields = state.get("fields")
+    return sum(t.numel() for t in fields.values() if isinstance(t, Tensor)) if isinstance(fields, dict) else 0
 
 
 def _built(config: dict) -> Trainer:
@@ -62,14 +74,16 @@ def _built(config: dict) -> Trainer:
 
 def train(config: dict, folder: Path) -> None:
     """One run in ``folder``, from wherever it is to its end."""
+    require_unlinked(folder)
     run = prepare(config)
     for note in run.notes:
         log.warning("warning: %s", note)
+    # What Hydra wrote is what was asked for, not what the run is.
+    if run.state is not None or latest_subfolder(folder) != folder / ".hydra":
+        keep_configuration(folder, config)
     if run.state is not None:
         result = result_of(folder, run.state, run.trainer.config)
         if result is not None:
             log.info("\n%s\n%s is finished; a larger trainer.steps would go on.", result, folder)
             return
-    if run.state is not None or latest_subfolder(folder) != folder / ".hydra":
-        keep_configuration(folder, config)
     run_session(run.trainer, run.certificate_settings, folder)

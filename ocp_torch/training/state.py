@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from ocp_torch.errors import InputError, require_integer, require_number
+from ocp_torch.errors import InputError, notes, require_integer, require_number, visible
 from ocp_torch.training.generators import generator_states, restore_generators
 
 if TYPE_CHECKING:
@@ -66,13 +66,14 @@ def restore(trainer: Trainer, state: dict) -> None:
         setattr(trainer, name, require_number(f"{name} of the checkpoint", state[name], at_least=0.0))
     trainer.pending, trainer.retry = bool(state["pending"]), int(state["retry"])
     bounds = state["bounds"]
-    warnings, unbounded = tuple(map(str, bounds["warnings"])), bool(bounds["unbounded"])
+    warnings, unbounded = notes(bounds["warnings"]), bool(bounds["unbounded"])
     trainer.use(replace(trainer.bounds, M=bounds["M"], warnings=warnings, unbounded=unbounded))
-    trainer.fields.load_state_dict(state["fields"])
-    trainer.average.load_state_dict(state["average"])
-    for name, tensor in (*trainer.fields.state_dict().items(), *trainer.average.state_dict().items()):
-        if not torch.isfinite(tensor).all():
-            raise InputError(f"the checkpoint holds weights that are not finite ({name}).")
+    best = state["watch"]["fields"]
+    for module, weights in ((trainer.fields, state["fields"]), (trainer.average, state["average"])):
+        _require_weights(module, weights)
+        module.load_state_dict(weights)
+    if best is not None:
+        _require_weights(trainer.fields, best)
     if any(_at(state["config"], path) != _at(trainer.config, path) for path in RATES):
         _place_in_round(trainer)
         trainer.stepper.load_state_dict(state["stepper"], moves=_moves(trainer))
@@ -81,6 +82,19 @@ def restore(trainer: Trainer, state: dict) -> None:
     trainer.batches.load_state_dict(state["batches"])
     trainer.watch.load_state_dict(state["watch"])
     restore_generators(state["generators"])
+
+
+def _require_weights(module: torch.nn.Module, weights: dict) -> None:
+    """Raise `InputError` unless ``weights`` are finite numbers of the names, shapes and types of those of ``module``."""
+    own = module.state_dict()
+    if weights.keys() != own.keys():
+        raise InputError("the checkpoint holds weights of other names than those of this run's networks.")
+    for name, tensor in weights.items():
+        if tensor.shape != own[name].shape or tensor.dtype != own[name].dtype:
+            wanted, found = (f"{tuple(t.shape)} {t.dtype}".replace("torch.", "") for t in (own[name], tensor))
+            raise InputError(f"the checkpoint holds weights {found} for {visible(name, 80)}, which must be {wanted}.")
+        if not torch.isfinite(tensor).all():
+            raise InputError(f"the checkpoint holds weights that are not finite ({visible(name, 80)}).")
 
 
 def _at(config: dict, path: tuple[str, ...]):

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ocp_torch.bounds import Bounds
 from ocp_torch.certificate import Certificate
+from ocp_torch.errors import notes
 from ocp_torch.problems import Problem
 from ocp_torch.samplers import derive_seed
 
@@ -110,7 +111,7 @@ class Watch:
     def load_state_dict(self, state: dict) -> None:
         self.best = Look(**state["best"]) if state["best"] else None
         self.fields = copy.deepcopy(state["fields"])
-        self.notes, self.warned = [str(note) for note in state["notes"]], bool(state["warned"])
+        self.notes, self.warned = list(notes(state["notes"])), bool(state["warned"])
         self._start = dict(state["start"])
 
 
