@@ -9,6 +9,7 @@ from pathlib import Path
 from ocp_torch.certificate import CertificateSettings
 from ocp_torch.config import build_certificate_settings, build_trainer
 from ocp_torch.errors import InputError, require_integer
+from ocp_torch.training.closing import missing
 from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.resume import (
     filled_from,
@@ -67,7 +68,10 @@ def train(config: dict, folder: Path) -> None:
         log.warning("warning: %s", note)
     if run.state is not None:
         result = result_of(folder, run.state, run.trainer.config)
-        if result is not None:
+        lacking = missing(folder, run.trainer, run.certificate_settings)
+        if result is not None and lacking is not None:
+            log.info("%s lacks %s; what is missing is made.", folder, lacking)
+        elif result is not None:
             log.info("\n%s\n%s is finished; a larger trainer.steps would go on.", result, folder)
             return
     if run.state is not None or latest_subfolder(folder) != folder / ".hydra":
