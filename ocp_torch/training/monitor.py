@@ -126,9 +126,10 @@ class Monitor(Silent):
     def stopped(self, trainer, why: str, settings: CertificateSettings) -> None:
         """Training stopped, and the certificate is about to be made; says why, and about how long that takes."""
         seconds = rough_seconds(trainer, settings.stage.steps)
-        self.bar.refresh()
+        self.bar.clear()
         rest = f", in about {in_words(seconds)}" if seconds else ""
         log.info("%s; the certificate is next%s", why.rstrip("."), rest)
+        self.bar.refresh()
         self.stages.begin(seconds)
 
     def certifying(self, stage: str) -> None:
