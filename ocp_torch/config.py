@@ -34,6 +34,8 @@ from ocp_torch.training.trainer import Trainer
 
 # Branch of the seed tree for network weights, beside those of the samplers.
 WEIGHTS_STREAM = 2
+# Of all methods; a learning rate may be set for each that the chosen one has.
+PLAYERS = ("value", "density")
 BOUND_FIELDS = ("occupation_bound", "value_bound", "control_bound")
 
 
@@ -116,6 +118,7 @@ def _build_stepper(config: dict, fields: Fields, objective: Objective, steps: in
     options = require_section("optimizer", config["optimizer"])
     player_lr = require_section("optimizer.player_lr", options.pop("player_lr", {}))
     for player, rate in player_lr.items():
+        require_choice("optimizer.player_lr", player, PLAYERS)
         if rate is not None:
             require_choice("optimizer.player_lr", player, objective.players)
     lr = options.pop("lr", None)

@@ -32,7 +32,7 @@ from ocp_torch.composition import (
     prepared,
     register_resolvers,
 )
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, shown
 from ocp_torch.training.checkpoint import LAST
 from ocp_torch.training.resume import adopt, locate
 from ocp_torch.training.signals import Preempted
@@ -75,13 +75,21 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object]) -
 def checked(arguments: list[str], config_name: str, check: Callable[[dict], object]) -> list[str]:
     """The arguments to hand to Hydra: as they are, but for a resume, which goes on in the folder of its run."""
     overrides = [a for a in arguments if not a.startswith("-")]
-    if any(a in ("-m", "--multirun") for a in arguments):
+    sweeping = any(a in ("-m", "--multirun") for a in arguments)
+    for name in ("hydra.sweep.dir",) if sweeping else ("hydra.run.dir",):
+        for value in (o.value() for o in parsed(overrides) if o.key_or_group == name and not o.is_sweep_override()):
+            # What is only known later, such as the time, is below what can be looked at now.
+            require_writable(name, Path(re.split(r"[^/]*\$\{", str(value))[0]))
+    if sweeping:
         check_sweep(config_name, overrides)
         return arguments
     given = {o.key_or_group: o.value() for o in parsed(overrides) if not o.is_sweep_override() and not o.is_delete()}
     own = Path(str(given["hydra.run.dir"])) if "hydra.run.dir" in given else None
     data = composed(config_name, overrides, roots=(own,) if own else ())
-    check(data)
+    try:
+        check(data)
+    except SystemExit as end:  # somebody's module or function would end the run without a word
+        raise InputError(f"the code that the command line names asks Python to exit (status {end.code}).") from None
     if data.get("resume") is None:
         if own is not None and "resume" in data:
             require_fresh(own)
@@ -109,8 +117,33 @@ def require_fresh(folder: Path) -> None:
 
 def fail(sentence: str) -> None:
     """Print one sentence and leave with the status of a wrong input."""
-    print(f"error: {sentence}", file=sys.stderr)
+    print(f"error: {printable(sentence)}", file=sys.stderr)
     sys.exit(FAILED_INPUT)
+
+
+def printable(sentence: str) -> str:
+    """``sentence`` on one line, with no sign in it that a terminal would obey, and no number of hundreds of digits."""
+    line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(sentence.split()))
+    return re.sub(r"\d{40,}", lambda digits: f"{digits[0][:6]}...({len(digits[0])} digits)", line)
+
+
+def require_writable(name: str, folder: Path) -> None:
+    """Raise `InputError` unless files can be written to ``folder``, or to it once it is made; leaves nothing behind."""
+    made: list[Path] = []
+    try:
+        for part in (*reversed(folder.absolute().parents), folder.absolute()):
+            if not part.exists():
+                part.mkdir()
+                made.append(part)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{name} is {shown(str(folder))}, where nothing can be written: {reason}.") from None
+    finally:
+        for part in reversed(made):
+            with contextlib.suppress(OSError):
+                part.rmdir()
 
 
 def job(task: Callable[[dict, Path], object], config: DictConfig) -> None:
