@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterable
-from functools import cache
+from collections.abc import Callable, Iterable
+from functools import cache, partial
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
@@ -29,6 +29,7 @@ from ocp_torch.training.resume import find_run, next_subfolder, resumed_configur
 CHECKOUT = Path(__file__).resolve().parent.parent
 CONFIGS = CHECKOUT / "configs"
 OUTPUTS = CHECKOUT / "outputs"
+MOST_TRIED = 8  # jobs of a sweep that are tried for one value
 EXTRAS = {"hydra/launcher": "parallel"}  # Hydra's plugin groups -> the extra that installs them
 
 
@@ -132,18 +133,58 @@ def require_sections(data: dict, config_name: str) -> dict:
     return data
 
 
-def check_sweep(config_name: str, overrides: list[str]) -> None:
-    """Raise `InputError` where a job of the sweep would not even compose: every value of every field, one at a time."""
+def check_sweep(config_name: str, overrides: list[str], check: Callable[[dict], object]) -> None:
+    """Raise `InputError` where a job of the sweep would not even compose, every value of every field, one at a time; or
+    where ``check`` lets none through that has a value of some kind: words are, and numbers by their sign. What the problem
+    makes of numbers, a sweep may be there to find out."""
     try:
         options = BasicSweeper.split_arguments(parsed(overrides), None)[0]
     except HydraException as error:
         raise InputError(explain(error, config_name)) from None
+    defaults: dict[tuple, dict] = {}
     for one in dict.fromkeys(o for job in options for o in job):
         first = [o for o in next(job for job in options if one in job) if not o.startswith(("hydra.", "hydra/"))]
         chosen = [o for o in first if is_choice(o)]
-        require_kinds(_composed(config_name, first), _composed(config_name, chosen, whole=False))
+        if (key := tuple(chosen)) not in defaults:
+            defaults[key] = _composed(config_name, chosen, whole=False)
+        require_kinds(_composed(config_name, first), defaults[key])
+    ours = [[o for o in job if not o.startswith(("hydra.", "hydra/"))] for job in options]
+    for one in representatives(parsed(overrides)):
+        jobs = [job for job in ours if one in job][:MOST_TRIED]
+        require_one([partial(_checked_job, check, config_name, job) for job in jobs])
     # Hydra's own settings are the same for every job.
     _composed(config_name, [o for o in options[0] if o.startswith(("hydra.", "hydra/"))])
+
+
+def _checked_job(check: Callable[[dict], object], config_name: str, overrides: list[str]) -> None:
+    check(prepared(_composed(config_name, overrides), overrides))
+
+
+def require_one(tries: list[Callable[[], None]]) -> None:
+    """Raise the `InputError` of the first of ``tries`` if all of them raise one."""
+    first: InputError | None = None
+    for attempt in tries:
+        try:
+            return attempt()
+        except InputError as error:
+            first = first or error
+    if first is not None:
+        raise first
+
+
+def representatives(overrides: list[Override]) -> list[str]:
+    """One override for each kind of value that is swept over: each word, and numbers of each type and sign. Fields of the
+    problem and `resume` are left to the jobs."""
+    found: dict[tuple, str] = {}
+    for override in overrides:
+        name = override.key_or_group
+        if not override.is_sweep_override() or name.startswith(("hydra", "problem.", "resume")) or is_choice(name):
+            continue
+        for one in BasicSweeper.split_arguments([override], None)[0]:
+            value = parsed(one)[0].value()
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            found.setdefault((name, type(value), value > 0 if number else str(value)), one[0])
+    return list(found.values())
 
 
 def is_choice(override: str) -> bool:

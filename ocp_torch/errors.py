@@ -16,8 +16,8 @@ class StorageError(InputError):
     """A file that could not be written: no space, no permission. What was there before is untouched."""
 
 
-# No number of a problem or a run is larger: squares of such a one are still finite in single precision's exponents.
-LARGEST = 1e15
+# No number of a problem or a run needs to be larger; single precision ends at 3e38.
+LARGEST = 1e30
 # Of a value that is wrong, no more is repeated.
 LONGEST_SHOWN = 80
 
@@ -64,7 +64,7 @@ def require_number(
         raise InputError(
             f"{name} is {shown(value)}, but must be a finite number{', ' + wanted if any(limits) else ''}."
         )
-    if abs(number) > LARGEST:
+    if at_most is None and abs(number) > LARGEST:
         raise InputError(f"{name} is {number:g}, but must be a number of at most {LARGEST:g} in size.")
     outside = (
         (above is not None and number <= above)

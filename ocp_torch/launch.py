@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import multiprocessing
 import os
@@ -81,7 +82,7 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
             # What is only known later, such as the time, is below what can be looked at now.
             require_writable(name, Path(re.split(r"[^/]*\$\{", str(value))[0]))
     if sweeping:
-        check_sweep(config_name, overrides)
+        check_sweep(config_name, overrides, check)
         return arguments
     given = {o.key_or_group: o.value() for o in parsed(overrides) if not o.is_sweep_override() and not o.is_delete()}
     own = Path(str(given["hydra.run.dir"])) if "hydra.run.dir" in given else None
@@ -131,6 +132,8 @@ def require_writable(name: str, folder: Path) -> None:
     """Raise `InputError` unless files can be written to ``folder``, or to it once it is made; leaves nothing behind."""
     made: list[Path] = []
     try:
+        if len(os.fsencode(folder.absolute())) >= os.pathconf("/", "PC_PATH_MAX"):
+            raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
         for part in (*reversed(folder.absolute().parents), folder.absolute()):
             if not part.exists():
                 part.mkdir()

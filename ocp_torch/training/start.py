@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ocp_torch.certificate import CertificateSettings
+from ocp_torch.certificate.possible import require_possible
 from ocp_torch.config import build_certificate_settings, build_trainer
 from ocp_torch.errors import InputError, require_integer
 from ocp_torch.training.closing import missing
@@ -44,7 +45,7 @@ def prepare(config: dict) -> Prepared:
     path = config.pop("resume", None)
     if path is None:
         trainer = _built(config)
-        return Prepared(trainer, build_certificate_settings(trainer.config))
+        return Prepared(trainer, _certificate_settings(trainer))
     state, checkpoint, notes = load_state(Path(path))
     made = state.get("config") if isinstance(state, dict) else None
     if not isinstance(made, dict):
@@ -52,13 +53,19 @@ def prepare(config: dict) -> Prepared:
     trainer = _built(filled_from(config, made))
     require_same_run(trainer.config, made)
     trainer.resume(checkpoint)
-    return Prepared(trainer, build_certificate_settings(trainer.config), state, tuple(notes))
+    return Prepared(trainer, _certificate_settings(trainer), state, tuple(notes))
 
 
 def _built(config: dict) -> Trainer:
     """The trainer of ``config``: a problem that draws random numbers is met with the same ones in every process."""
     seed_generators(require_integer("seed", config["seed"], 0))
     return build_trainer(config)
+
+
+def _certificate_settings(trainer: Trainer) -> CertificateSettings:
+    settings = build_certificate_settings(trainer.config)
+    require_possible(trainer.problem, settings, trains_value=trainer.fields.value is not None)
+    return settings
 
 
 def train(config: dict, folder: Path) -> None:
