@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterable
-from functools import cache
+from collections.abc import Callable, Iterable
+from functools import cache, partial
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
@@ -23,12 +23,13 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ocp_torch.config import problem_class
-from ocp_torch.errors import InputError, nearest
+from ocp_torch.errors import InputError, nearest, require_flag, require_section, shown
 from ocp_torch.training.resume import find_run, next_subfolder, resumed_configuration
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 CONFIGS = CHECKOUT / "configs"
 OUTPUTS = CHECKOUT / "outputs"
+MOST_TRIED = 8  # jobs of a sweep that are tried for one value
 EXTRAS = {"hydra/launcher": "parallel"}  # Hydra's plugin groups -> the extra that installs them
 
 
@@ -44,9 +45,9 @@ def register_resolvers() -> None:
         OmegaConf.register_new_resolver(name, resolver, replace=True)
 
 
-def plain(config: DictConfig) -> dict:
-    """The configuration as nested plain data, interpolations resolved."""
-    data = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+def plain(config: DictConfig, whole: bool = True) -> dict:
+    """The configuration as nested plain data, interpolations resolved; nothing is missing if it has to be ``whole``."""
+    data = OmegaConf.to_container(config, resolve=True, throw_on_missing=whole)
     data.pop("hydra", None)
     return data
 
@@ -57,6 +58,8 @@ def parsed(overrides: list[str]) -> list[Override]:
         return OverridesParser.create().parse_overrides(overrides)
     except HydraException as error:
         raise InputError(explain(error, "train")) from None
+    except ValueError:  # a number of more digits than Python reads
+        raise InputError("the command line holds a number of thousands of digits, which nothing here takes.") from None
 
 
 def prepared(data: dict, overrides: list[str], roots: tuple[Path, ...] = ()) -> dict:
@@ -89,10 +92,13 @@ def composed(config_name: str, overrides: list[str], roots: tuple[Path, ...] = (
     return prepared(_composed(config_name, overrides), overrides, roots)
 
 
-def _composed(config_name: str, overrides: list[str]) -> dict:
+def _composed(config_name: str, overrides: list[str], whole: bool = True) -> dict:
+    """The composed configuration as plain data; where not the ``whole`` is wanted, what is still missing stays `???`."""
     try:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            return plain(compose(config_name, overrides))
+            require_places(overrides)
+            data = plain(compose(config_name, overrides), whole)
+            return require_sections(data, config_name)
     except (HydraException, OmegaConfBaseException, ValueError, TypeError) as error:
         if isinstance(error, InputError):
             raise
@@ -107,17 +113,94 @@ def _composed(config_name: str, overrides: list[str]) -> dict:
         GlobalHydra.instance().clear()
 
 
-def check_sweep(config_name: str, overrides: list[str]) -> None:
-    """Raise `InputError` where a job of the sweep would not even compose: every value of every field, one at a time."""
+def require_places(overrides: list[str]) -> None:
+    """Raise `InputError` where a field or a group of ours is left out: defaults stand in the configuration alone. A class of
+    a user's own may do without some of the problem's."""
+    for override in parsed(overrides):
+        name = override.key_or_group
+        if override.is_delete() and not name.startswith(("hydra", "problem.", "experiment")):
+            raise InputError(f"~{name} leaves out {name}, which is needed; set it to another value instead.")
+
+
+def require_sections(data: dict, config_name: str) -> dict:
+    """``data``, if each group and field at the top of the configuration has a place in it; else `InputError`."""
+    file = OmegaConf.to_container(OmegaConf.load(CONFIGS / f"{config_name}.yaml"), resolve=False)
+    chosen = [item for entry in file.pop("defaults") if isinstance(entry, dict) for item in entry.items()]
+    groups = [(key.partition("@")[2] or key).split(".")[0] for key, choice in chosen if choice is not None]
+    for name in dict.fromkeys([*groups, *file]):
+        if name not in data and not name.startswith(("hydra", "override ")):
+            raise InputError(f"{name} is missing; give {name}=... on the command line.")
+    return data
+
+
+def check_sweep(config_name: str, overrides: list[str], check: Callable[[dict], object]) -> None:
+    """Raise `InputError` where a job of the sweep would not even compose, every value of every field, one at a time; or
+    where ``check`` lets none through that has a value of some kind: words are, and numbers by their sign. What the problem
+    makes of numbers, a sweep may be there to find out."""
     try:
         options = BasicSweeper.split_arguments(parsed(overrides), None)[0]
     except HydraException as error:
         raise InputError(explain(error, config_name)) from None
+    defaults: dict[tuple, dict] = {}
     for one in dict.fromkeys(o for job in options for o in job):
-        first = next(job for job in options if one in job)
-        _composed(config_name, [o for o in first if not o.startswith(("hydra.", "hydra/"))])
+        first = [o for o in next(job for job in options if one in job) if not o.startswith(("hydra.", "hydra/"))]
+        chosen = [o for o in first if is_choice(o)]
+        if (key := tuple(chosen)) not in defaults:
+            defaults[key] = _composed(config_name, chosen, whole=False)
+        require_kinds(_composed(config_name, first), defaults[key])
+    ours = [[o for o in job if not o.startswith(("hydra.", "hydra/"))] for job in options]
+    for one in representatives(parsed(overrides)):
+        jobs = [job for job in ours if one in job][:MOST_TRIED]
+        require_one([partial(_checked_job, check, config_name, job) for job in jobs])
     # Hydra's own settings are the same for every job.
     _composed(config_name, [o for o in options[0] if o.startswith(("hydra.", "hydra/"))])
+
+
+def _checked_job(check: Callable[[dict], object], config_name: str, overrides: list[str]) -> None:
+    check(prepared(_composed(config_name, overrides), overrides))
+
+
+def require_one(tries: list[Callable[[], None]]) -> None:
+    """Raise the `InputError` of the first of ``tries`` if all of them raise one."""
+    first: InputError | None = None
+    for attempt in tries:
+        try:
+            return attempt()
+        except InputError as error:
+            first = first or error
+    if first is not None:
+        raise first
+
+
+def representatives(overrides: list[Override]) -> list[str]:
+    """One override for each kind of value that is swept over: each word, and numbers of each type and sign. Fields of the
+    problem and `resume` are left to the jobs."""
+    found: dict[tuple, str] = {}
+    for override in overrides:
+        name = override.key_or_group
+        if not override.is_sweep_override() or name.startswith(("hydra", "problem.", "resume")) or is_choice(name):
+            continue
+        for one in BasicSweeper.split_arguments([override], None)[0]:
+            value = parsed(one)[0].value()
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            found.setdefault((name, type(value), value > 0 if number else str(value)), one[0])
+    return list(found.values())
+
+
+def is_choice(override: str) -> bool:
+    """Whether it chooses a file of a group, and sets no field."""
+    return (CONFIGS / override.lstrip("+~").split("=")[0].partition("@")[0]).is_dir()
+
+
+def require_kinds(data: object, default: object, name: str = "") -> None:
+    """Raise `InputError` where a number, a flag or a group of fields of ``default`` is something else in ``data``."""
+    if isinstance(default, dict):
+        for key in default.keys() & require_section(name, data).keys():
+            require_kinds(data[key], default[key], f"{name}.{key}".lstrip("."))
+    elif isinstance(default, bool):
+        require_flag(name, data)
+    elif isinstance(default, int | float) and not (isinstance(data, int | float) and not isinstance(data, bool)):
+        raise InputError(f"{name} is {shown(data)}, but must be a number.")
 
 
 def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -> str:
@@ -135,6 +218,11 @@ def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -
     override = re.search(r"Could not override '([\w.@/-]+)'", text)
     if isinstance(error, ConfigCompositionException) and override:
         field = override.group(1)
+        if is_choice(field):
+            known = ", ".join(sorted(p.stem for p in (CONFIGS / field).glob("*.yaml")))
+            return (
+                f"{field} is a group, not a field: {field}=... takes one of {known}, and {field}.<field>=... a value."
+            )
         hint = field_hint(field, config_name, overrides)
         return f"{field} is not a field of the configuration{hint}; write +{field}=... to add an argument of your own."
     missing = re.search(r"Missing mandatory value: ([\w.]+)", text)
@@ -148,7 +236,7 @@ def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -
 
 def field_hint(field: str, config_name: str, overrides: Iterable[str]) -> str:
     """A bracket with the nearest field of the chosen groups, or, where none is near, with all that the group has."""
-    chosen = tuple(o for o in overrides if (CONFIGS / o.split("=")[0]).is_dir())
+    chosen = tuple(o for o in overrides if is_choice(o))
     known = known_fields(config_name, chosen)
     group, _, last = field.rpartition(".")
     below = [k.removeprefix(f"{group}.") for k in known if group and k.startswith(f"{group}.")]

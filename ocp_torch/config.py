@@ -23,8 +23,11 @@ from ocp_torch.errors import (
     require_section,
 )
 from ocp_torch.fields import MODELS, VALUE, Fields
+from ocp_torch.fields.spectrum import STATES
+from ocp_torch.memory import require_memory
 from ocp_torch.objectives import METHODS, Objective
 from ocp_torch.problems import Problem
+from ocp_torch.problems.problem import MOST_COORDINATES
 from ocp_torch.process import prepare
 from ocp_torch.samplers import SAMPLERS, RowSampler, derive_seed
 from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
@@ -34,6 +37,10 @@ from ocp_torch.training.trainer import Trainer
 
 # Branch of the seed tree for network weights, beside those of the samplers.
 WEIGHTS_STREAM = 2
+# Numbers that a step keeps per unit of a network and state: 6 to 10 were measured, in one and in four dimensions.
+VALUES_PER_UNIT = 5
+# Of all methods; a learning rate may be set for each that the chosen one has.
+PLAYERS = ("value", "density")
 BOUND_FIELDS = ("occupation_bound", "value_bound", "control_bound")
 
 
@@ -56,7 +63,19 @@ def problem_class(target: object) -> type[Problem]:
 def build_problem(section: object) -> Problem:
     """The problem ``_target_`` names, made with the other fields as arguments; any `Problem` subclass will do."""
     options = require_section("problem", section)
-    return call(problem_class(options.pop("_target_", None)), "problem", options)
+    cls = problem_class(options.pop("_target_", None))
+    dim = options.get("dim")
+    if isinstance(dim, int) and 1 <= dim <= MOST_COORDINATES:  # a problem that large may take long to be made
+        _require_room(dim, options.get("control_dim"))
+    problem = call(cls, "problem", options)
+    _require_room(problem.dim, problem.control_dim)
+    return problem
+
+
+def _require_room(dim: int, control_dim: object) -> None:
+    """Raise `InputError` where `B` at the states at which the embedding looks for waves would not fit into the memory."""
+    entries = dim * (control_dim if isinstance(control_dim, int) else dim)
+    require_memory("the number of entries of B, problem.dim times control_dim,", entries, 8.0 * STATES)
 
 
 def build_trainer(config: dict) -> Trainer:
@@ -78,6 +97,7 @@ def build_trainer(config: dict) -> Trainer:
     network = build_network(config["model"])
     fields = Fields.build(problem, objective.fields, network, derive_seed(seed, WEIGHTS_STREAM))
     fields = fields.to(dtype=settings.torch_dtype, device=settings.torch_device)
+    require_memory("trainer.batch", settings.batch, _bytes_per_state(problem, fields, settings))
     stepper = _build_stepper(config, fields, objective, settings.steps)
     average = call(averaged, "averaging", require_section("averaging", config["averaging"]), fields=fields)
     sampler_section = require_section("sampler", config["sampler"])
@@ -95,6 +115,13 @@ def build_trainer(config: dict) -> Trainer:
     return Trainer(
         problem, fields, objective, bounds, stepper, average, batches, settings, network, seed, names, config
     )
+
+
+def _bytes_per_state(problem: Problem, fields: Fields, settings: TrainerSettings) -> float:
+    """What a step keeps of each state of a batch, at least: its samples, and the values of all units with derivatives."""
+    units = sum(p.shape[0] for p in fields.parameters() if p.dim() == 2)
+    samples = 2 * problem.dim + 2  # x, f, a and mu0; a constant B takes no room
+    return settings.torch_dtype.itemsize * (samples + VALUES_PER_UNIT * units)
 
 
 def build_network(model: object) -> Callable[..., nn.Module]:
@@ -116,6 +143,7 @@ def _build_stepper(config: dict, fields: Fields, objective: Objective, steps: in
     options = require_section("optimizer", config["optimizer"])
     player_lr = require_section("optimizer.player_lr", options.pop("player_lr", {}))
     for player, rate in player_lr.items():
+        require_choice("optimizer.player_lr", player, PLAYERS)
         if rate is not None:
             require_choice("optimizer.player_lr", player, objective.players)
     lr = options.pop("lr", None)

@@ -42,14 +42,31 @@ class StorageError(InputError):
     """A file that could not be written: no space, no permission. What was there before is untouched."""
 
 
+# No number of a problem or a run needs to be larger; single precision ends at 3e38.
+LARGEST = 1e30
+# Of a value that is wrong, no more is repeated.
+LONGEST_SHOWN = 80
+
+
+def shown(value: object) -> str:
+    """``value`` as a sentence can hold it: short, and on one line."""
+    if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 64:
+        return f"a whole number of about {int(value.bit_length() * math.log10(2.0)) + 1} digits"
+    try:
+        text = repr(value)
+    except ValueError:  # a list with a number of more digits than Python prints
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
+
+
 def require_integer(name: str, value: object, minimum: int, maximum: int = 2**31 - 1) -> int:
     """Return ``value`` if it is a whole number from ``minimum`` to ``maximum``; raise `InputError` otherwise."""
     if isinstance(value, bool) or not isinstance(value, int):
-        raise InputError(f"{name} is {value!r}, but must be a whole number of at least {minimum}.")
+        raise InputError(f"{name} is {shown(value)}, but must be a whole number of at least {minimum}.")
     if value < minimum:
-        raise InputError(f"{name} is {value}, but must be at least {minimum}.")
+        raise InputError(f"{name} is {shown(value)}, but must be at least {minimum}.")
     if value > maximum:
-        raise InputError(f"{name} is {value:.6g}, but must be at most {maximum}.")
+        raise InputError(f"{name} is {shown(value)}, but must be at most {maximum}.")
     return value
 
 
@@ -61,35 +78,44 @@ def require_number(
     at_least: float | None = None,
     at_most: float | None = None,
 ) -> float:
-    """Return ``value`` as a finite float inside the stated range; raise `InputError` otherwise."""
+    """Return ``value`` as a finite float inside the stated range, or at most `LARGEST` in size; else raise `InputError`."""
     limits = [f"above {above:g}" if above is not None else "", f"at least {at_least:g}" if at_least is not None else ""]
     limits.append(f"at most {at_most:g}" if at_most is not None else "")
     wanted = " and ".join(limit for limit in limits if limit) or "finite"
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{name} is {value!r}, but must be a finite number{', ' + wanted if any(limits) else ''}.")
-    number = float(value)
+    try:
+        number = math.nan if isinstance(value, bool) or not isinstance(value, int | float) else float(value)
+    except OverflowError:  # a whole number that no float can hold
+        number = math.inf
+    if not math.isfinite(number):
+        raise InputError(
+            f"{name} is {shown(value)}, but must be a finite number{', ' + wanted if any(limits) else ''}."
+        )
+    if at_most is None and abs(number) > LARGEST:
+        raise InputError(f"{name} is {number:g}, but must be a number of at most {LARGEST:g} in size.")
     outside = (
         (above is not None and number <= above)
         or (at_least is not None and number < at_least)
         or (at_most is not None and number > at_most)
     )
     if outside:
-        raise InputError(f"{name} is {value:g}, but must be {wanted}.")
+        raise InputError(f"{name} is {number:g}, but must be {wanted}.")
     return number
 
 
 def require_flag(name: str, value: object) -> bool:
     """Return ``value`` if it is a boolean; raise `InputError` otherwise."""
     if not isinstance(value, bool):
-        raise InputError(f"{name} is {value!r}, but must be true or false.")
+        raise InputError(f"{name} is {shown(value)}, but must be true or false.")
     return value
 
 
 def require_choice(name: str, value: object, choices: Iterable[str]) -> str:
     """Return ``value`` if it is one of ``choices``; raise `InputError`, with the nearest name, otherwise."""
     known = sorted(choices)
-    if value not in known:
-        raise InputError(f"{name} is {value!r}, but must be one of {', '.join(known)}{nearest(str(value), known)}.")
+    if not isinstance(value, str) or value not in known:
+        raise InputError(
+            f"{name} is {shown(value)}, but must be one of {', '.join(known)}{nearest(str(value), known)}."
+        )
     return str(value)
 
 
@@ -102,7 +128,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
 def require_section(name: str, value: object) -> dict:
     """Return a copy of ``value`` if it is a group of named fields; raise `InputError` otherwise."""
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        raise InputError(f"{name} is {value!r}, but must be a group of fields.")
+        raise InputError(f"{name} is {shown(value)}, but must be a group of fields.")
     return dict(value)
 
 

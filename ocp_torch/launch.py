@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import multiprocessing
 import os
@@ -32,7 +33,7 @@ from ocp_torch.composition import (
     prepared,
     register_resolvers,
 )
-from ocp_torch.errors import InputError, visible
+from ocp_torch.errors import InputError, shown, visible
 from ocp_torch.reading import require_unlinked
 from ocp_torch.training.checkpoint import LAST
 from ocp_torch.training.resume import adopt, locate
@@ -88,8 +89,13 @@ class Record(logging.LogRecord):
 def checked(arguments: list[str], config_name: str, check: Callable[[dict], object]) -> list[str]:
     """The arguments to hand to Hydra: as they are, but for a resume, which goes on in the folder of its run."""
     overrides = [a for a in arguments if not a.startswith("-")]
-    if any(a in ("-m", "--multirun") for a in arguments):
-        check_sweep(config_name, overrides)
+    sweeping = any(a in ("-m", "--multirun") for a in arguments)
+    for name in ("hydra.sweep.dir",) if sweeping else ("hydra.run.dir",):
+        for value in (o.value() for o in parsed(overrides) if o.key_or_group == name and not o.is_sweep_override()):
+            # What is only known later, such as the time, is below what can be looked at now.
+            require_writable(name, Path(re.split(r"[^/]*\$\{", str(value))[0]))
+    if sweeping:
+        check_sweep(config_name, overrides, check)
         root = next((o.value() for o in parsed(overrides) if o.key_or_group == "hydra.sweep.dir"), None)
         if root is not None:
             require_unlinked(Path(str(root)), "*")
@@ -100,7 +106,10 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
     folder = own if data.get("resume") is None else locate(Path(data["resume"]))[0]
     if folder is not None:
         require_unlinked(folder)
-    check(data)
+    try:
+        check(data)
+    except SystemExit as end:  # somebody's module or function would end the run without a word
+        raise InputError(f"the code that the command line names asks Python to exit (status {end.code}).") from None
     if data.get("resume") is None:
         if own is not None and "resume" in data:
             require_fresh(own)
@@ -128,9 +137,31 @@ def require_fresh(folder: Path) -> None:
 
 
 def fail(sentence: str) -> None:
-    """Print one sentence and leave with the status of a wrong input."""
-    print(f"error: {visible(sentence)}", file=sys.stderr)
+    """Print one sentence, on one line and without numbers of hundreds of digits, and leave with the status of a wrong input."""
+    line = re.sub(r"\d{40,}", lambda digits: f"{digits[0][:6]}...({len(digits[0])} digits)", " ".join(sentence.split()))
+    print(f"error: {visible(line)}", file=sys.stderr)
     sys.exit(FAILED_INPUT)
+
+
+def require_writable(name: str, folder: Path) -> None:
+    """Raise `InputError` unless files can be written to ``folder``, or to it once it is made; leaves nothing behind."""
+    made: list[Path] = []
+    try:
+        if len(os.fsencode(folder.absolute())) >= os.pathconf("/", "PC_PATH_MAX"):
+            raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
+        for part in (*reversed(folder.absolute().parents), folder.absolute()):
+            if not part.exists():
+                part.mkdir()
+                made.append(part)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{name} is {shown(str(folder))}, where nothing can be written: {reason}.") from None
+    finally:
+        for part in reversed(made):
+            with contextlib.suppress(OSError):
+                part.rmdir()
 
 
 def job(task: Callable[[dict, Path], object], config: DictConfig) -> None:

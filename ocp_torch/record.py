@@ -12,6 +12,7 @@ from torch import Tensor
 from ocp_torch import recording
 from ocp_torch.config import build_problem
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
+from ocp_torch.memory import require_memory
 from ocp_torch.problems import Problem
 from ocp_torch.samplers import derive_seed
 from ocp_torch.samples import Samples
@@ -75,6 +76,8 @@ def prepare(config: dict) -> Recorder:
         raise InputError(f"out is {str(out)!r}, but must end in {' or '.join(recording.SUFFIXES)}.")
     divergences = require_flag("divergences", config["divergences"]) and problem.gives_divergences
     count = require_integer("samples", config["samples"], recording.FEWEST, maximum=10**8)
+    d, m = problem.dim, problem.control_dim
+    require_memory("samples", count, 8 * (2 * d + d * m + m + 3))  # x, f, a, B, mu0 and divergences in float64
     seed = require_integer("seed", config["seed"], 0)
     contrast = require_number("contrast", config["contrast"], at_least=0.0, at_most=0.95)
     return Recorder(problem, count, out, seed, divergences, contrast)

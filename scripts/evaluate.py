@@ -5,6 +5,7 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 
+from ocp_torch.certificate.possible import require_possible
 from ocp_torch.launch import job, launch
 from ocp_torch.pictures import require_gif
 from ocp_torch.training.evaluation import animated, certify_saved, load_run, settings_for
@@ -14,7 +15,9 @@ def check(config: dict):
     controller = load_run(config)
     if config["animation"] is not None:
         require_gif(controller.problem, config["animation"])
-    return controller, settings_for(controller, config)
+    settings = settings_for(controller, config)
+    require_possible(controller.problem, settings, trains_value=controller.fields.value is not None)
+    return controller, settings
 
 
 def evaluate(config: dict, folder) -> None:

@@ -20,6 +20,7 @@ from ocp_torch.benchmark.rl import RLContender
 from ocp_torch.bounds import Bounds, resolve_bounds
 from ocp_torch.budgets import fill
 from ocp_torch.certificate import CertificateSettings
+from ocp_torch.certificate.possible import require_possible
 from ocp_torch.config import build_certificate_settings, build_problem, build_trainer
 from ocp_torch.errors import InputError, call, require_choice, require_integer, require_section
 from ocp_torch.problems import Problem
@@ -78,7 +79,9 @@ def build(config: dict) -> tuple[Problem, Bounds, list, list[int], CertificateSe
         names = [name for name in names if name != "kernel_primal"]
     made = [contender(name, config, problem, bounds) for name in names]
     training = {group: config[group] for group in TRAINING}
-    return problem, bounds, made, seeds, build_certificate_settings(fill(training, problem))
+    certificate = build_certificate_settings(fill(training, problem))
+    require_possible(problem, certificate)
+    return problem, bounds, made, seeds, certificate
 
 
 def contest(config: dict, folder: Path, say: Callable[[str], None] = log.info) -> list[Curve]:

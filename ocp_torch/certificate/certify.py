@@ -20,6 +20,7 @@ from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.occupation import a_priori_sup_occupation, estimated_sup_occupation
 from ocp_torch.certificate.performance import Simulated, simulate_performance
+from ocp_torch.certificate.progress import Progress, silent
 from ocp_torch.certificate.recorded import certify_recorded
 from ocp_torch.certificate.regularity import largest_jump
 from ocp_torch.certificate.rigorous import RigorousBound, proved_lower
@@ -65,13 +66,20 @@ def in_float64(fields: Fields) -> Fields:
 
 
 def certify_fields(
-    problem: Problem, trained: Trained, bounds: Bounds, settings: CertificateSettings, run: Run
+    problem: Problem,
+    trained: Trained,
+    bounds: Bounds,
+    settings: CertificateSettings,
+    run: Run,
+    progress: Progress = silent,
 ) -> Certificate:
     """The certificate of ``trained`` fields, on states that no training sampler draws.
 
-    Both controllers are simulated; the better one is handed out, and the certification stage speaks of that one.
+    Both controllers are simulated; the better one is handed out, and the certification stage speaks of that one. Each
+    stage's name is given to ``progress`` as it begins.
     """
     require_finite(trained.fields)
+    progress("bounds")
     if not problem.evaluable:
         return certify_recorded(problem, trained, bounds, settings, run)
     fields, occupation = in_float64(trained.fields), trained.occupation
@@ -86,9 +94,13 @@ def certify_fields(
         lower = lower_side(
             problem, fields.value, sets, bounds.M, settings.ascents, settings.searches(bounds), seed, odd
         )
+    if settings.rigorous:
+        progress("proof")
     proved, proof_notes = proved_lower(problem, fields.value, lower) if settings.rigorous and lower else (None, [])
     posed = check_problem(problem, sets if has_value else few)
     laws = control_laws(occupation, problem, fields, bounds)
+    if settings.trajectories:
+        progress("simulation")
     simulated, zero = simulations(problem, laws, fields, lower, settings, seed)
     stage = None
     warnings: list[str] = []
@@ -105,8 +117,10 @@ def certify_fields(
                 "mu is 0 at sampled states, where w / mu is not regular: J and G may miss what it costs there."
             )
     if settings.stage.steps:
+        progress("closed-loop fit")
         stage, notes = certification_stage(problem, trained, fields, bounds, settings, few, lower, best, seed)
         warnings += notes
+    progress("assumptions")
     met = measured(problem, laws[best], finite.get(best), few, posed, settings)
     assumptions, notes = check_assumptions(problem, bounds, met, uses=(has_value, J is not None))
     warnings = list(bounds.warnings) + notes + warnings + proof_notes

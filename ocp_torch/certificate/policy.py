@@ -23,6 +23,7 @@ from ocp_torch.certificate.contradictions import examined
 from ocp_torch.certificate.estimate import integral, replicated_samples
 from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.performance import simulate_performance
+from ocp_torch.certificate.progress import Progress, silent
 from ocp_torch.certificate.scan import odd_states
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.sides import lower_side
@@ -45,10 +46,12 @@ def certify_policy(
     bounds: Bounds,
     settings: CertificateSettings,
     run: Run,
+    progress: Progress = silent,
 ) -> Certificate:
     """The certificate of ``law``; with ``value`` (float64), any `V`, also how far from optimal it is at most.
 
-    ``network`` makes the networks for `V^u` and `mu^u`. Raises `InputError` where the law fails.
+    ``network`` makes the networks for `V^u` and `mu^u`; each stage's name is given to ``progress`` as it begins. Raises
+    `InputError` where the law fails.
     """
     count, seed, ascents = settings.replicates, run.seed, settings.ascents
     part = max(TANGENT_PART, problem.dim // 2)
@@ -56,6 +59,8 @@ def certify_policy(
     few = replicated_samples(problem, max(1, settings.points // part), count, seed, divergences=False)
     posed = check_problem(problem, wide)
     warnings: list[str] = []
+    if settings.stage.steps:
+        progress("closed-loop fit")
     evaluated, own = evaluate_policy(problem, law, network, bounds, settings, few, wide, seed)
     if settings.stage.steps and evaluated is None:
         warnings.append("no bound on Perf without simulation: this problem gives no divergences of a and B.")
@@ -65,9 +70,11 @@ def certify_policy(
     number, perf, zero, given, best = settings.trajectories, {}, None, None, None
     lower = None
     if value is not None:
+        progress("bounds")
         odd = odd_states(problem, settings.scanned(problem), seed)
         lower = lower_side(problem, value, wide, bounds.M, ascents, settings.searches(bounds), seed, odd)
     if number:
+        progress("simulation")
         initial = [integral(s, own(s.x) * s.mu0) for s in wide] if own is not None else None
         given = simulate(law, number, own, initial)
         perf[GIVEN] = given.perf
@@ -75,6 +82,7 @@ def certify_policy(
         if value is not None:
             best = simulate(ValueLaw(problem, value), number, value, lower.initial)
             perf["value"] = best.perf
+    progress("assumptions")
     met = measured(problem, law, given, few, posed, replace(settings, occupation_states=0))
     if best is not None:
         # M is about the optimal controller, which the one from V is nearer to than anybody's.

@@ -79,6 +79,8 @@ def candidate_parts(dim: int) -> tuple[Tensor, Tensor]:
             return pad(grid(half), 0), pad(grid(dim - half), half)
     zero = torch.zeros(1, dim)
     single = torch.cat([zero, *(k * torch.eye(dim) for k in (1.0, -1.0, 2.0, -2.0))])
+    if (1 + 4 * dim + math.comb(4 * dim, 2)) * len(single) > MOST_SUMS:  # said before they fill the memory
+        return single, single
     pair = torch.cat([single, torch.stack([a + b for a, b in itertools.combinations(single[1:], 2)])])
     for left, right in ((pair, pair), (pair, single)):
         if len(left) * len(right) <= MOST_SUMS:

@@ -86,13 +86,18 @@ def _(problem: Pendulum, path: Path) -> dict[str, float]:
     return {"upright": _part((angle.abs() <= UPRIGHT[0]) & (velocity.abs() <= UPRIGHT[1]))}
 
 
+def has_metrics(problem: Problem) -> bool:
+    """Whether ``problem`` has numbers of its own."""
+    return measure.dispatch(type(problem)) is not measure.dispatch(Problem)
+
+
 def metrics(problem: Problem, law: Law, seed: int = 0, starts: int = STARTS) -> dict | None:
     """``controller``, ``zero`` and ``classical`` (where there is one), each with its numbers and mean discounted ``cost``.
 
     All from the same ``starts`` (`random_starts`), for ``duration`` in the problem's unit of time; `None` for a problem
     without numbers of its own. Statistics, not bounds: a part `p` has the standard error `sqrt(p (1 - p) / starts)`.
     """
-    if measure.dispatch(type(problem)) is measure.dispatch(Problem):
+    if not has_metrics(problem):
         return None
     x0 = random_starts(problem, starts, seed)
     duration = TRIAL / problem.discount

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ocp_torch.errors import InputError, require_number
+from ocp_torch.errors import InputError, require_number, shown
 
 
 def require_numbers(name: str, value: object, count: int | None = None, above: float | None = None) -> list[float]:
     """``value`` as a list of finite floats, ``count`` of them and each ``above`` a number where given; else `InputError`."""
     if isinstance(value, str) or not isinstance(value, Sequence) or (count is not None and len(value) != count):
         wanted = "a list of" + (f" {count}" if count is not None else "") + " numbers"
-        raise InputError(f"{name} is {value!r}, but must be {wanted}.")
+        raise InputError(f"{name} is {shown(value)}, but must be {wanted}.")
     return [require_number(f"{name}[{i}]", v, above=above) for i, v in enumerate(value)]
 
 
@@ -19,7 +19,7 @@ def require_obstacles(name: str, value: object, space: int = 2) -> list[list[flo
     """``value`` as a list of round obstacles `[x, y, radius]`, or in ``space`` 3 `[x, y, z, radius]`, with positive radius;
     else `InputError`."""
     if isinstance(value, str) or not isinstance(value, Sequence):
-        raise InputError(f"{name} is {value!r}, but must be a list of [{', '.join('xyz'[:space])}, radius].")
+        raise InputError(f"{name} is {shown(value)}, but must be a list of [{', '.join('xyz'[:space])}, radius].")
     rows = [require_numbers(f"{name}[{i}]", row, space + 1) for i, row in enumerate(value)]
     for i, row in enumerate(rows):
         require_number(f"{name}[{i}][{space}]", row[space], above=0.0)

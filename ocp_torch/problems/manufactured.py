@@ -60,7 +60,7 @@ class Manufactured(Problem):
         self.contrast = require_number("problem.contrast", contrast, at_least=0.0, at_most=0.99)
         self.initial_contrast = require_number("problem.initial_contrast", initial_contrast, at_least=0.0, at_most=1.0)
         self.state_dependent_control = require_flag("problem.state_dependent_control", state_dependent_control)
-        self.interaction = require_integer("problem.interaction", interaction, 1)
+        self.interaction = require_integer("problem.interaction", interaction, 1, maximum=max(2, self.dim))
         self.seed = require_integer("problem.seed", seed, 0)
         self._prescribe(torch.Generator().manual_seed(self.seed))
         self._derive()

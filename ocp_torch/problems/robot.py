@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, shown
 from ocp_torch.problems.angles import TURN
 from ocp_torch.problems.arguments import require_numbers
 from ocp_torch.problems.linkage import Linkage
@@ -57,6 +57,8 @@ class RobotArm(Linkage):
     ) -> None:
         if urdf is not None and chain is not None:
             raise InputError("problem.urdf and problem.chain are both given, but either alone is the kinematics.")
+        if tip is not None and urdf is None:
+            raise InputError(f"problem.tip is {shown(tip)}, but it names a link of problem.urdf, which is not given.")
         given = chain if urdf is None else read_chain(urdf, tip)
         given = _elbow() if given is None else given
         if isinstance(given, str) or not isinstance(given, Sequence) or len(given) < 2:

@@ -32,7 +32,7 @@ def resolved(target: str) -> Callable:
             module = importlib.import_module(source)
     except InputError:
         raise
-    except Exception as error:  # whatever a stranger's module may raise
+    except (Exception, SystemExit) as error:  # whatever a stranger's module may raise
         raise InputError(f"problem.target = {target} cannot be imported: {type(error).__name__}: {error}.") from None
     found = getattr(module, name, None)
     if not callable(found):
@@ -43,9 +43,12 @@ def resolved(target: str) -> Callable:
 
 def asked(function: Callable, x: np.ndarray, one_by_one: bool):
     """``function`` at ``x`` ``(N, d)``, at all of them at once or one by one."""
-    if not one_by_one:
-        return function(x.copy())
-    rows = [function(state.copy()) for state in x]
+    try:
+        if not one_by_one:
+            return function(x.copy())
+        rows = [function(state.copy()) for state in x]
+    except SystemExit as end:  # it would end the run without a word
+        raise RuntimeError(f"it asks Python to exit (status {end.code})") from None
     if not all(isinstance(row, tuple | list) for row in rows):
         return rows[0]
     return tuple(

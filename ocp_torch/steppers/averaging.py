@@ -7,6 +7,9 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_m
 
 from ocp_torch.errors import require_choice, require_number
 
+# At 1 the average would never leave the first iterate.
+MOST_DECAY = 0.999999
+
 
 def averaged(fields: nn.Module, kind: str = "ema", decay: float = 0.998) -> AveragedModel:
     """A running average of ``fields``: ``ema`` (exponential with ``decay``), ``uniform`` as in the paper, or ``none``.
@@ -14,7 +17,7 @@ def averaged(fields: nn.Module, kind: str = "ema", decay: float = 0.998) -> Aver
     Call ``update_parameters(fields)`` at each iterate that counts; the average is in ``.module``.
     """
     require_choice("averaging.kind", kind, ("ema", "uniform", "none"))
-    decay = require_number("averaging.decay", decay, at_least=0.0, at_most=1.0)
+    decay = require_number("averaging.decay", decay, at_least=0.0, at_most=MOST_DECAY)
     rules = {"ema": lambda: get_ema_multi_avg_fn(decay), "uniform": get_swa_multi_avg_fn, "none": lambda: _latest}
     average = AveragedModel(fields, multi_avg_fn=rules[kind](), use_buffers=False)
     return average.requires_grad_(False)

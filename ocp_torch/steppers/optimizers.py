@@ -12,6 +12,9 @@ from torch.optim.lr_scheduler import CosineAnnealingWarmRestarts, LambdaLR, LRSc
 
 from ocp_torch.errors import InputError, require_call, require_choice, require_integer, require_number
 
+# No update with a larger one is of use; far beyond it does not even fit into single precision.
+LARGEST_RATE = 1e6
+
 
 def _sgd(parameters: list[Tensor], lr: float, momentum: float = 0.0) -> Optimizer:
     return torch.optim.SGD(parameters, lr=lr, momentum=require_number("optimizer.momentum", momentum, at_least=0.0))
@@ -41,7 +44,7 @@ OPTIMIZERS = {"sgd": _sgd, "adam": _adam, "soap": _soap}
 def optimizer_maker(name: str, lr: float, **options) -> Callable[[list[Tensor]], Optimizer]:
     """A maker of the optimiser ``name`` with learning rate ``lr``; other options as in its configuration file."""
     make = OPTIMIZERS[require_choice("optimizer.name", name, OPTIMIZERS)]
-    rate = require_number("optimizer.lr", lr, above=0.0)
+    rate = require_number("optimizer.lr", lr, above=0.0, at_most=LARGEST_RATE)
     require_call(make, "optimizer", options, parameters=None, lr=rate)
     return lambda parameters: make(parameters, lr=rate, **options)
 

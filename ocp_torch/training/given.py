@@ -14,6 +14,7 @@ from ocp_torch.budgets import fill
 from ocp_torch.calculus import Field
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, certify_policy, in_float64, table
 from ocp_torch.certificate.black_box import BlackBox, require_limit
+from ocp_torch.certificate.possible import require_possible
 from ocp_torch.config import build_certificate_settings, build_network, build_problem
 from ocp_torch.control_laws import ControlLaw, control_laws
 from ocp_torch.controller import Controller, problem_name
@@ -143,6 +144,8 @@ def read(config: dict) -> dict:
     train = require_flag("train", config["train"])
     if config["steps"] is not None:
         require_integer("steps", config["steps"], 1)
+    settings = build_certificate_settings(filled)
+    require_possible(problem, settings, trains_value=False)  # a given controller's bounds are not proved
     controller = load_law(config["controller"], problem)
     law_of(controller, problem)
     value = None if config["value"] is None else load_saved(Path(str(config["value"])), problem)
@@ -150,7 +153,7 @@ def read(config: dict) -> dict:
         "problem": problem,
         "controller": controller,
         "value": value,
-        "settings": build_certificate_settings(filled),
+        "settings": settings,
         "seed": require_integer("seed", config["seed"], 0),
         "train_steps": config["steps"] if train else 0,
     }

@@ -55,7 +55,7 @@ def _function(path: Path, name: str) -> Callable:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # whatever a stranger's code may raise
+    except (Exception, SystemExit) as error:  # whatever a stranger's code may raise
         raise InputError(f"{path} cannot be run: {type(error).__name__}: {error}.") from None
     found = getattr(module, name, None)
     if not callable(found):

@@ -9,15 +9,19 @@ from pathlib import Path
 import torch
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
 from tqdm import tqdm
 
 from ocp_torch import calculus, formulas
-from ocp_torch.certificate import Certificate
+from ocp_torch.certificate import Certificate, CertificateSettings
 from ocp_torch.control_laws import admissible_density, occupation_density
 from ocp_torch.samples import Samples
 from ocp_torch.steppers import StepReport
+from ocp_torch.training.stages import Stages, in_words, rough_seconds
 
 log = logging.getLogger(__name__)
+# How TensorBoard's files begin.
+EVENTS = "events.out.tfevents."
 
 
 @torch.no_grad()
@@ -67,6 +71,8 @@ class Monitor(Silent):
         hidden = None if trainer.settings.progress else True
         options = dict(unit="step", dynamic_ncols=True, disable=hidden)
         self.bar = tqdm(total=max(trainer.end, done), initial=done, **options)
+        self.stages = Stages(hidden)
+        self._folder = folder
         self._shown: dict[str, str] = {}
         self._mark = (time.perf_counter(), trainer.samples)
 
@@ -74,6 +80,7 @@ class Monitor(Silent):
         return self
 
     def __exit__(self, *_) -> None:
+        self.stages.close()
         self.bar.close()
         self.writer.close()
 
@@ -99,7 +106,7 @@ class Monitor(Silent):
         self._show(**{"samples/s": f"{speed:,.0f}"})
 
     def evaluated(self, trainer, certificate: Certificate) -> None:
-        self.record(certificate, trainer.step)
+        record(self.writer, certificate, trainer.step)
         shown = {name: e for name, e in {**certificate.lower, **certificate.upper}.items() if e is not None}
         values = {name: f"{shown[name].value:.6f}" for name in ("F_M", "J") if name in shown}
         gaps = [gap for gap in (certificate.gap["certified"], certificate.gap["simulated"]) if gap is not None]
@@ -116,33 +123,53 @@ class Monitor(Silent):
         self.bar.total = trainer.end
         log.info("not good yet: training goes on to step %d, with M = %.4g", trainer.end, trainer.bounds.M)
 
-    def record(self, certificate: Certificate, step: int) -> None:
-        """All numbers of ``certificate`` as scalars at ``step``."""
-        scalars = {f"bounds/{n}": e for g in ("lower", "upper") for n, e in getattr(certificate, g).items()}
-        scalars |= {f"performance/{n}": e for g in ("perf", "baseline") for n, e in getattr(certificate, g).items()}
-        for name, estimate in scalars.items():
-            if estimate is not None and estimate.finite:
-                self.writer.add_scalar(name, estimate.value, step)
-        if certificate.exact is not None:
-            self.writer.add_scalar("bounds/exact", certificate.exact, step)
-        for group in ("gap", "share"):
-            for kind in ("certified", "simulated"):
-                value = getattr(certificate, group)[kind]
-                if value is not None:
-                    self.writer.add_scalar(f"{group}/{kind}", value, step)
+    def stopped(self, trainer, why: str, settings: CertificateSettings) -> None:
+        """Training stopped, and the certificate is about to be made; says why, and about how long that takes."""
+        seconds = rough_seconds(trainer, settings.stage.steps)
+        self.bar.clear()
+        rest = f", in about {in_words(seconds)}" if seconds else ""
+        log.info("%s; the certificate is next%s", why.rstrip("."), rest)
+        self.bar.refresh()
+        self.stages.begin(seconds)
 
-    def figures(self, figures: dict, step: int) -> None:
-        """Matplotlib figures by name."""
-        for name, figure in figures.items():
-            self.writer.add_figure(f"fields/{name}", figure, step, close=False)
+    def certifying(self, stage: str) -> None:
+        """A stage of the certificate begins."""
+        self.stages(f"certifying: {stage}")
 
-    def hyper_parameters(self, flat: dict, certificate: Certificate) -> None:
-        """The run's settings beside its results, in TensorBoard's HParams tab."""
-        allowed = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in flat.items()}
-        results = {f"hparam/{k}": v for k, v in certificate.gap.items() if isinstance(v, float)}
-        # run_name="." keeps the hyper-parameters in this run instead of a sub-run.
-        self.writer.add_hparams(allowed, results or {"hparam/none": torch.nan}, run_name=".")
+    def finish(self, certificate: Certificate, figures: dict, settings: dict, step: int) -> None:
+        """The last points: all numbers of ``certificate``, the Matplotlib ``figures`` by name, and the run's ``settings``,
+        one level deep, for the HParams tab; in a file of their own, which replaces one left half-written by a kill."""
+        suffix = f".end-{step}"
+        for half in self._folder.glob(f"{EVENTS}*{suffix}"):
+            half.unlink()
+        with SummaryWriter(str(self._folder), filename_suffix=suffix) as writer:
+            record(writer, certificate, step)
+            for name, figure in figures.items():
+                writer.add_figure(f"fields/{name}", figure, step, close=False)
+            allowed = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in settings.items()}
+            gaps = {f"hparam/{k}": v for k, v in certificate.gap.items() if isinstance(v, float)}
+            results = gaps or {"hparam/none": torch.nan}
+            for summary in hparams(allowed, results):
+                writer.file_writer.add_summary(summary)
+            for name, value in results.items():
+                writer.add_scalar(name, value)
 
     def _show(self, **values: str) -> None:
         self._shown |= values
         self.bar.set_postfix(self._shown, refresh=False)
+
+
+def record(writer: SummaryWriter, certificate: Certificate, step: int) -> None:
+    """All numbers of ``certificate`` as scalars at ``step``."""
+    scalars = {f"bounds/{n}": e for g in ("lower", "upper") for n, e in getattr(certificate, g).items()}
+    scalars |= {f"performance/{n}": e for g in ("perf", "baseline") for n, e in getattr(certificate, g).items()}
+    for name, estimate in scalars.items():
+        if estimate is not None and estimate.finite:
+            writer.add_scalar(name, estimate.value, step)
+    if certificate.exact is not None:
+        writer.add_scalar("bounds/exact", certificate.exact, step)
+    for group in ("gap", "share"):
+        for kind in ("certified", "simulated"):
+            value = getattr(certificate, group)[kind]
+            if value is not None:
+                writer.add_scalar(f"{group}/{kind}", value, step)

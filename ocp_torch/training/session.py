@@ -17,7 +17,7 @@ from ocp_torch.errors import InputError, StorageError
 from ocp_torch.fields import Fields
 from ocp_torch.steppers import NonFiniteError
 from ocp_torch.storage import sweep_temporaries, write_atomically
-from ocp_torch.training import figures
+from ocp_torch.training import closing, figures
 from ocp_torch.training.checkpoint import LAST
 from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.monitor import Monitor
@@ -46,28 +46,29 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, fol
     log.info(summary(trainer))
     try:
         with Signals() as signals, Monitor(folder, trainer) as monitor:
-            failure = None
+            trainer.tell, failure = monitor.certifying, None
             try:
                 certificate, fields = _train(trainer, certificate_settings, monitor, last, signals)
             except NonFiniteError as error:
                 failure = f"Training stopped at step {trainer.step}, before the update: {error}"
-                certificate, fields = _salvage(trainer, certificate_settings, failure)
+                certificate, fields = _salvage(trainer, certificate_settings, failure, monitor)
+            closing.begin(folder)
             kind = _hand_out(trainer, certificate, fields, folder)
             law = control_laws(trainer.objective.occupation, trainer.problem, in_float64(fields), trainer.bounds)[kind]
+            drawn = {}
             if trainer.settings.figures:
+                monitor.stages("figures")
                 drawn = figures.draw(trainer.problem, fields, trainer.bounds, trainer.objective.occupation)
                 drawn["certificate"] = figures.interval(certificate.to_dict())
                 drawn |= practical_figures(trainer.problem, law, trainer.seed)
                 figures.save(drawn, folder / "figures")
-                monitor.figures(drawn, trainer.step)
-            # Last, so that a start that was killed before this point leaves no points to be doubled.
-            monitor.record(certificate, trainer.step)
-            monitor.hyper_parameters(flatten(trainer.config), certificate)
+            monitor.finish(certificate, drawn, flatten(trainer.config), trainer.step)
     except OSError as error:
         raise StorageError(f"{folder} cannot be written to: {error.strerror or error}.") from None
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
     if certificate_settings.trajectories:
         write_metrics(trainer.problem, law, trainer.seed, folder)
+    closing.complete(folder)
     log.info("controller from %s, %.0f s in all, in %s", kind, time.perf_counter() - started, folder)
     if failure is not None:
         raise InputError(f"{failure.rstrip('.')}; the controller in {folder} is that of the best look before.")
@@ -84,6 +85,7 @@ def _train(
         reason = trainer.fit(monitor, last, signals)
         signals.saved = True  # from here on a signal need not wait
         signals.take()
+        monitor.stopped(trainer, f"Training stopped: {trainer.why_stopped}", settings)
         fields, note = trainer.choose()
         certificate = trainer.certify(settings, fields)
         gap = certificate.gap["certified"]
@@ -93,13 +95,17 @@ def _train(
         trainer.go_on()
 
 
-def _salvage(trainer: Trainer, settings: CertificateSettings, failure: str) -> tuple[Certificate, Fields]:
+def _salvage(
+    trainer: Trainer, settings: CertificateSettings, failure: str, monitor: Monitor
+) -> tuple[Certificate, Fields]:
     """What a run that cannot go on still gives; `InputError` when nothing."""
     if trainer.watch.best is None:
         raise InputError(failure)
     trainer.stopped, fields = NOT_FINITE, trainer.best_fields()
     note = f"handed out are the averaged fields of step {trainer.watch.best.step}. {failure}"
-    return with_warnings(trainer, trainer.certify(settings, fields), [note]), fields
+    monitor.stopped(trainer, failure, settings)
+    certificate = trainer.certify(settings, fields)
+    return with_warnings(trainer, certificate, [note]), fields
 
 
 def with_warnings(trainer: Trainer, certificate: Certificate, notes: list[str]) -> Certificate:

@@ -9,10 +9,12 @@ from pathlib import Path
 from torch import Tensor
 
 from ocp_torch.certificate import CertificateSettings
+from ocp_torch.certificate.possible import require_possible
 from ocp_torch.config import build_certificate_settings, build_trainer
 from ocp_torch.errors import InputError, require_integer
 from ocp_torch.limits import require_held
 from ocp_torch.reading import require_unlinked
+from ocp_torch.training.closing import missing
 from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.resume import (
     filled_from,
@@ -47,7 +49,7 @@ def prepare(config: dict) -> Prepared:
     path = config.pop("resume", None)
     if path is None:
         trainer = _built(config)
-        return Prepared(trainer, build_certificate_settings(trainer.config))
+        return Prepared(trainer, _certificate_settings(trainer))
     state, checkpoint, notes = load_state(Path(path))
     made = state.get("config") if isinstance(state, dict) else None
     if not isinstance(made, dict):
@@ -57,7 +59,7 @@ def prepare(config: dict) -> Prepared:
     trainer = _built(filled)
     require_same_run(trainer.config, made)
     trainer.resume(checkpoint)
-    return Prepared(trainer, build_certificate_settings(trainer.config), state, tuple(notes))
+    return Prepared(trainer, _certificate_settings(trainer), state, tuple(notes))
 
 
 def numbers_in(state: dict) -> int:
@@ -72,6 +74,12 @@ def _built(config: dict) -> Trainer:
     return build_trainer(config)
 
 
+def _certificate_settings(trainer: Trainer) -> CertificateSettings:
+    settings = build_certificate_settings(trainer.config)
+    require_possible(trainer.problem, settings, trains_value=trainer.fields.value is not None)
+    return settings
+
+
 def train(config: dict, folder: Path) -> None:
     """One run in ``folder``, from wherever it is to its end."""
     require_unlinked(folder)
@@ -83,7 +91,10 @@ def train(config: dict, folder: Path) -> None:
         keep_configuration(folder, config)
     if run.state is not None:
         result = result_of(folder, run.state, run.trainer.config)
-        if result is not None:
+        lacking = missing(folder, run.trainer, run.certificate_settings)
+        if result is not None and lacking is not None:
+            log.info("%s lacks %s; what is missing is made.", folder, lacking)
+        elif result is not None:
             log.info("\n%s\n%s is finished; a larger trainer.steps would go on.", result, folder)
             return
     run_session(run.trainer, run.certificate_settings, folder)

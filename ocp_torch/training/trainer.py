@@ -20,6 +20,7 @@ from ocp_torch.certificate import (
     Trained,
     certify_fields,
 )
+from ocp_torch.certificate.progress import Progress, silent
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.fields.fields import typical_sizes
@@ -81,6 +82,8 @@ class Trainer:
         self.stopped, self.ended = STEPS, False
         (mean, spread), _ = typical_sizes(problem)
         self.watch = Watch(unit=abs(mean) + spread)
+        self.tell: Progress = silent  # who wants to know of the stages of a certificate
+        self.look_seconds: float | None = None  # how long the last look took
         self._seen: tuple[int, Bounds, Certificate] | None = None  # the last look, and what it was of
 
     @property
@@ -128,6 +131,19 @@ class Trainer:
         self.stopped, self.ended = self._reason() or STEPS, True
         self.save(checkpoint)
         return self.stopped
+
+    @property
+    def why_stopped(self) -> str:
+        """The reason for which `fit` stopped, in words."""
+        settings, at = self.settings, f"step {self.step:,}"
+        if self.stopped == MAX_SECONDS:
+            return f"trainer.max_seconds = {settings.max_seconds:g} are over, at {at} of {self.end:,}"
+        if self.stopped == TARGET_GAP:
+            return f"a look at {at} finds trainer.target_gap = {settings.target_gap:g} reached"
+        more = self.round + 1 < settings.rounds
+        return f"all {self.step:,} steps are done" + (
+            f", and trainer.good_gap = {settings.good_gap:g} is met" if more else ""
+        )
 
     def go_on(self) -> None:
         """The certificate did not reach the target gap: train on, and try again later."""
@@ -206,7 +222,9 @@ class Trainer:
     def look(self) -> Certificate:
         """A quick certificate of the averaged fields, on states that neither training nor `certify` uses."""
         if self._seen is None or self._seen[:2] != (self.step, self.bounds):
+            started = time.perf_counter()
             self._seen = (self.step, self.bounds, self._quick(QUICK))
+            self.look_seconds = time.perf_counter() - started
         return self._seen[2]
 
     def _quick(self, settings: CertificateSettings, fields: Fields | None = None) -> Certificate:
@@ -222,7 +240,8 @@ class Trainer:
     ) -> Certificate:
         """The certificate of ``fields``, or of the averaged ones as they stand."""
         trained = Trained(fields or self.averaged_fields, self.objective.occupation, self.network)
-        return certify_fields(problem or self.problem, trained, self.bounds, settings, run or self.run)
+        tell = self.tell if run is None else silent  # looks are too many to be told of
+        return certify_fields(problem or self.problem, trained, self.bounds, settings, run or self.run, tell)
 
     def choose(self) -> tuple[Fields, str | None]:
         """The fields to hand out: the averaged ones, or those of the best look where they are clearly worse than that; and
