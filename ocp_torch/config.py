@@ -25,6 +25,8 @@ from ocp_torch.errors import (
 from ocp_torch.fields import MODELS, VALUE, Fields
 from ocp_torch.objectives import METHODS, Objective
 from ocp_torch.problems import Problem
+from ocp_torch.problems.blame import in_their_words, origin, words
+from ocp_torch.problems.check import check_once
 from ocp_torch.process import prepare
 from ocp_torch.samplers import SAMPLERS, RowSampler, derive_seed
 from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
@@ -44,8 +46,10 @@ def problem_class(target: object) -> type[Problem]:
     module_name, _, class_name = target.rpartition(".")
     try:
         module = importlib.import_module(module_name)
-    except ImportError as error:
-        raise InputError(f"problem._target_ = {target} cannot be imported: {error}.") from None
+    except (Exception, SystemExit) as error:  # whatever a stranger's module may raise
+        missing = isinstance(error, ImportError) and module_name.startswith(str(error.name))
+        where = "" if missing else origin(error)
+        raise InputError(f"problem._target_ = {target} cannot be imported: {words(error)}{where}.") from None
     known = [n for n, c in vars(module).items() if inspect.isclass(c) and issubclass(c, Problem) and c is not Problem]
     if class_name not in known:
         hint = nearest(class_name, known)
@@ -54,9 +58,12 @@ def problem_class(target: object) -> type[Problem]:
 
 
 def build_problem(section: object) -> Problem:
-    """The problem ``_target_`` names, made with the other fields as arguments; any `Problem` subclass will do."""
+    """The problem ``_target_`` names, made with the other fields as arguments and checked; any `Problem` subclass will do."""
     options = require_section("problem", section)
-    return call(problem_class(options.pop("_target_", None)), "problem", options)
+    made = problem_class(options.pop("_target_", None))
+    problem = in_their_words(lambda: call(made, "problem", options), made.__name__, made)
+    check_once(problem)
+    return problem
 
 
 def build_trainer(config: dict) -> Trainer:

@@ -10,11 +10,13 @@ import torch
 from torch import Tensor
 
 from ocp_torch.bounds import Bounds
+from ocp_torch.commands import ForeignProblem, made_by, naming
 from ocp_torch.control_laws import CLOSED, NETWORK, SADDLE, control_laws
 from ocp_torch.errors import InputError
 from ocp_torch.fields import MODELS, Fields
 from ocp_torch.problems import PROBLEMS, Problem
-from ocp_torch.storage import load_tensors, save_tensors
+from ocp_torch.problems.check import check_once
+from ocp_torch.storage import finite, load_tensors, save_tensors
 
 SCHEMA = 1
 # What a file may ask for, so that a crafted one cannot ask for all memory.
@@ -85,7 +87,8 @@ def load_controller(path: str | Path, problem: Problem | None = None, device: st
     """Load a controller saved by a run; no code in the file is run.
 
     A controller of one of the package's problems rebuilds it from its parameters; one of a user's own problem needs that
-    ``problem``. Raises `InputError` when the file is missing, damaged, of a newer schema, or does not fit the problem.
+    ``problem``, made with the same arguments. Raises `InputError` when the file is missing, damaged, of a newer schema, or
+    does not fit the problem.
     """
     path = Path(path)
     tensors, metadata = load_tensors(path)
@@ -107,14 +110,19 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
     saved = metadata["problem"]
     if problem is None:
         if saved["name"] not in PROBLEMS:
-            raise InputError(
+            section = _section(saved, metadata["config"])
+            why = (
                 f"{path} belongs to the problem {str(saved['name'])[:80]!r}, which is not part of ocp_torch, or calls a "
-                "function of yours; pass it: load_controller(path, problem=MyProblem())."
+                "function of yours"
             )
+            how = f"pass it: load_controller(path, problem={made_by(section)})"
+            raise ForeignProblem(f"{why}; {how}.", why, naming(section))
         _require_reasonable(path, saved["parameters"])
         problem = PROBLEMS[saved["name"]](**saved["parameters"])
     elif saved["name"] in PROBLEMS and problem_name(problem) != saved["name"]:
         raise InputError(f"{path} belongs to the problem {saved['name']!r}, not to {problem_name(problem)!r}.")
+    else:
+        check_once(problem)
     model = metadata["model"]
     _require_reasonable(path, model)
     options = {k: v for k, v in model.items() if k != "name"}
@@ -129,6 +137,7 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
         raise InputError(
             f"{path} does not fit: its weights are not those of its model on a problem of dimension {problem.dim}."
         )
+    _require_same_arguments(path, problem, saved["parameters"])
     if not all(torch.isfinite(t).all() for t in tensors.values()):
         raise InputError(f"{path} holds weights that are not finite.")
     if metadata["dtype"] not in ("float32", "float64"):
@@ -148,6 +157,26 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
         certificate=metadata["certificate"],
         config=metadata["config"],
     )
+
+
+def _section(saved: dict, config: dict) -> dict:
+    """The problem of a run as its configuration names it, or as its parameters do where that is of something else."""
+    section = config.get("problem")
+    target = str(section.get("_target_")) if isinstance(section, dict) else ""
+    if target.rpartition(".")[2].lower() == str(saved["name"]).rpartition(".")[2]:
+        return section
+    return saved["parameters"]
+
+
+def _require_same_arguments(path: Path, problem: Problem, saved: dict) -> None:
+    """Raise `InputError` where ``problem`` is not made as that of the run was."""
+    given = finite(_plain(problem.parameters))
+    for name in given.keys() & saved.keys() - set(problem.incidental):
+        if given[name] != saved[name]:
+            raise InputError(
+                f"problem.{name} is {given[name]!r}, but the run of {path} has {repr(saved[name])[:80]}; a controller is "
+                "loaded with the problem it was trained for."
+            )
 
 
 def _blank(problem: Problem, names: list[str], network: type, options: dict) -> Fields:
@@ -174,4 +203,5 @@ def _require_reasonable(path: Path, numbers: dict) -> None:
 
 def _plain(parameters: dict) -> dict:
     """Only what JSON can hold; the rest is a user's own problem's, which is passed in on loading."""
-    return {k: v for k, v in parameters.items() if isinstance(v, bool | int | float | str | list | type(None))}
+    listed = {k: list(v) if isinstance(v, tuple) else v for k, v in parameters.items()}
+    return {k: v for k, v in listed.items() if isinstance(v, bool | int | float | str | list | type(None))}

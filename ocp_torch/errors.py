@@ -12,6 +12,10 @@ class InputError(ValueError):
     """A mistake in what the user asked for; its message is one sentence, fit to be printed without a traceback."""
 
 
+class ProblemError(InputError):
+    """A user's problem failed: its code raised, or gave what no problem may. The sentence says which function, and where."""
+
+
 class StorageError(InputError):
     """A file that could not be written: no space, no permission. What was there before is untouched."""
 

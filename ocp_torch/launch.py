@@ -21,6 +21,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from ocp_torch.commands import ForeignProblem, quoted
 from ocp_torch.composition import (
     CHECKOUT,
     CONFIGS,
@@ -31,6 +32,7 @@ from ocp_torch.composition import (
     plain,
     prepared,
     register_resolvers,
+    with_own_defaults,
 )
 from ocp_torch.errors import InputError
 from ocp_torch.training.checkpoint import LAST
@@ -56,6 +58,8 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object]) -
     logging.raiseExceptions = False  # a full disk is told once, not at every line of a log
     # A user's module is found where the command was given, as `python -m` would find it.
     sys.path.insert(0, os.getcwd())
+    typed = list(sys.argv)
+    sys.argv[1:] = with_own_defaults(config_name, sys.argv[1:])
     try:
         if not any(a.split("=")[0] in ASKS for a in sys.argv[1:]):
             sys.argv[1:] = checked(sys.argv[1:], config_name, check)
@@ -64,6 +68,8 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object]) -
             names = failed()
         if names:
             raise InputError(f"{len(names)} job(s) of the sweep failed: {'; '.join(names)}.")
+    except ForeignProblem as error:
+        fail(f"{error.why}; if it is yours, name it: {shlex.join(['python', *typed, *error.arguments])}")
     except InputError as error:
         fail(str(error))
     except Preempted as stop:
@@ -91,12 +97,6 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
         return arguments
     kept = [a for a in arguments if not a.lstrip("+").startswith(("resume=", "hydra.run.dir="))]
     return [*kept, f"resume={quoted(data['resume'])}", f"hydra.run.dir={quoted(folder)}"]
-
-
-def quoted(value: object) -> str:
-    """A value as Hydra reads it back, whatever signs it holds."""
-    text = str(value).replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{text}'"
 
 
 def require_fresh(folder: Path) -> None:
@@ -161,7 +161,7 @@ def again(hydra: DictConfig, folder: Path, sweeping: bool) -> str:
     """The command that goes on with what was stopped."""
     # What only the command line may name.
     mine = "problem." if "problem=callable" in hydra.overrides.task else "problem._target_="
-    own = [o for o in hydra.overrides.task if o == "problem=callable" or o.lstrip("+").startswith(mine)]
+    own = [o.lstrip("+") for o in hydra.overrides.task if o == "problem=callable" or o.lstrip("+").startswith(mine)]
     if not sweeping:
         path = str(folder) if re.fullmatch(r"[\w./+-]+", str(folder)) else quoted(folder)
         return shlex.join(["python", sys.argv[0], f"resume={path}", *own])
