@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import torch
 
-from ocp_torch.errors import require_number
+from ocp_torch.errors import ProblemError, require_number
 from ocp_torch.extremum import supremum
+from ocp_torch.problems.blame import place
 from ocp_torch.problems.problem import MARGIN, Problem
 
 # Without any knowledge of mu*, M starts at this multiple of sup mu0 and the certificate judges it afterwards.
@@ -95,7 +96,10 @@ def state_cost_supremum(problem: Problem) -> float:
     if problem.state_cost_bound is not None:
         return problem.state_cost_bound
     (x,) = problem.survey(SEARCHED, 1, "x")
-    return MARGIN * supremum(problem.state_cost, x, differentiable=False).value
+    found = supremum(problem.state_cost, x, differentiable=False)
+    if not math.isfinite(found.value):
+        raise ProblemError(f"state_cost is {found.value} at {place(found.x)}; it must be finite on the whole torus.")
+    return MARGIN * found.value
 
 
 def _estimate_value_bound(problem: Problem) -> tuple[float, str]:

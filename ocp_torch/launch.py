@@ -35,6 +35,7 @@ from ocp_torch.composition import (
     with_own_defaults,
 )
 from ocp_torch.errors import InputError
+from ocp_torch.problems.blame import blamed
 from ocp_torch.training.checkpoint import LAST
 from ocp_torch.training.resume import adopt, locate
 from ocp_torch.training.signals import Preempted
@@ -87,7 +88,10 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
     given = {o.key_or_group: o.value() for o in parsed(overrides) if not o.is_sweep_override() and not o.is_delete()}
     own = Path(str(given["hydra.run.dir"])) if "hydra.run.dir" in given else None
     data = composed(config_name, overrides, roots=(own,) if own else ())
-    check(data)
+    try:
+        check(data)
+    except (Exception, SystemExit) as error:
+        raise blamed(error) or error from None
     if data.get("resume") is None:
         if own is not None and "resume" in data:
             require_fresh(own)
@@ -128,7 +132,10 @@ def job(task: Callable[[dict, Path], object], config: DictConfig) -> None:
         if not sweeping or multiprocessing.parent_process() is None:
             raise
         failed(hydra, f"stopped by {stop}")
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        error = blamed(error) or error
+        if isinstance(error, SystemExit):
+            raise
         if not sweeping and isinstance(error, InputError):
             fail(str(error))
         if not sweeping:

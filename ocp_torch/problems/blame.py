@@ -28,6 +28,8 @@ MOST_SHOWN, LONGEST = 8, 300
 def blamed(error: BaseException, of: type | None = None) -> ProblemError | None:
     """The sentence on an ``error`` that came out of a user's code, or `None` for one that did not; ``of`` is the class of the
     problem at hand, whose file is a user's wherever it lies."""
+    if isinstance(error, InputError):
+        return error if isinstance(error, ProblemError) else None
     frames = _frames(error, of)
     if not frames:
         return None

@@ -17,7 +17,7 @@ from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
 from ocp_torch.objectives.objective import Objective
 from ocp_torch.samples import Samples
-from ocp_torch.steppers.culprit import NonFiniteError, culprit
+from ocp_torch.steppers.culprit import BROKEN_PROBLEM, NonFiniteError, culprit
 
 Draw = Callable[[], Samples]
 Visit = Callable[[], None]
@@ -113,7 +113,8 @@ class Stepper(ABC):
         checks = torch.stack([*losses.values(), *norms.values()])
         if not torch.isfinite(checks).all():
             what = culprit(self.objective, self.fields, samples)
-            raise NonFiniteError(f"{what}; try a smaller optimizer.lr, or stepper.clip.")
+            advice = "" if what.endswith(BROKEN_PROBLEM) else "; try a smaller optimizer.lr, or stepper.clip"
+            raise NonFiniteError(f"{what}{advice}.")
 
     def _update(self, players: Iterable[str]) -> None:
         """One update of ``players`` with the gradients in place, then the projection."""
