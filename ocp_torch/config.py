@@ -23,6 +23,7 @@ from ocp_torch.errors import (
     require_section,
 )
 from ocp_torch.fields import MODELS, VALUE, Fields
+from ocp_torch.fields.fields import cost_unit
 from ocp_torch.objectives import METHODS, Objective
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import in_their_words, origin, words
@@ -85,7 +86,7 @@ def build_trainer(config: dict) -> Trainer:
     network = build_network(config["model"])
     fields = Fields.build(problem, objective.fields, network, derive_seed(seed, WEIGHTS_STREAM))
     fields = fields.to(dtype=settings.torch_dtype, device=settings.torch_device)
-    stepper = _build_stepper(config, fields, objective, settings.steps)
+    stepper = _build_stepper(config, fields, objective, settings.steps, cost_unit(problem))
     average = call(averaged, "averaging", require_section("averaging", config["averaging"]), fields=fields)
     sampler_section = require_section("sampler", config["sampler"])
     sampler_name = require_choice("sampler.name", sampler_section.pop("name", None), SAMPLERS)
@@ -119,7 +120,7 @@ def build_certificate_settings(config: dict) -> CertificateSettings:
     return call(CertificateSettings, "certificate", section, stage=stage)
 
 
-def _build_stepper(config: dict, fields: Fields, objective: Objective, steps: int) -> Stepper:
+def _build_stepper(config: dict, fields: Fields, objective: Objective, steps: int, unit: float) -> Stepper:
     options = require_section("optimizer", config["optimizer"])
     player_lr = require_section("optimizer.player_lr", options.pop("player_lr", {}))
     for player, rate in player_lr.items():
@@ -134,4 +135,5 @@ def _build_stepper(config: dict, fields: Fields, objective: Objective, steps: in
     for field in ("radius", "clip"):
         if section.get(field) is not None:
             require_number(f"stepper.{field}", section[field], above=0.0)
-    return call(stepper, "stepper", section, fields=fields, objective=objective, optimizers=makers, schedule=schedule)
+    given = dict(fields=fields, objective=objective, optimizers=makers, schedule=schedule, unit=unit)
+    return call(stepper, "stepper", section, **given)

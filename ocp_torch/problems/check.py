@@ -38,6 +38,8 @@ ROUNDING = 1e-6
 GRID = 2**17
 # Divergences: states, the two steps of the differences, what these must agree to be believed, and how wrong is wrong.
 FEW, STEPS, AGREE, WRONG = 24, (1e-3, 2.5e-4), 0.01, 0.1
+# Simulated in steps of a fraction of a turn, more than that takes hours.
+MOST_TURNS = 1e4
 # Beyond so many numbers the differences behind a divergence cost too much.
 MOST_DIFFERENCES = 2**24
 
@@ -48,12 +50,14 @@ def check_once(problem: Problem) -> None:
     The package's own classes are tested instead, and a data set has checks of its own.
     """
     _require_made(problem)
+    if not problem.evaluable:
+        return
     own = type(problem).__module__.startswith("ocp_torch.")
     simulator = hasattr(problem, "answers")
-    if not problem.evaluable or (own and not simulator):
-        return
-    with torch.random.fork_rng(devices=[]), torch.no_grad():
-        _Check(problem, simulator).run()
+    if simulator or not own:
+        with torch.random.fork_rng(devices=[]), torch.no_grad():
+            _Check(problem, simulator).run()
+    _require_units(problem)
 
 
 def _require_made(problem: Problem) -> None:
@@ -80,6 +84,24 @@ def _require_made(problem: Problem) -> None:
         infinite = name == "occupation_bound" and bound == math.inf
         if bound is not None and not infinite:
             require_number(f"{name} of {named(problem)}", _number(bound))
+
+
+def _require_units(problem: Problem) -> None:
+    """Units of cost and time in which a state can be followed for the time that counts."""
+    f, a, B = problem.survey(64, 13, "f", "a", "B")
+    # A control that costs as much as the state cost varies.
+    u = (problem.exponent * float(f.std())) ** (1.0 / problem.exponent)
+    u = u if problem.control_limit is None else min(u, problem.control_limit)
+    drift, push = float(a.norm(dim=-1).mean()), u * float(B.flatten(1).norm(dim=-1).mean())
+    turns = (drift + push) / problem.discount
+    if turns > MOST_TURNS:
+        time = 1.0 / problem.discount
+        raise ProblemError(
+            f"the units of {named(problem)} are too far apart: within 1 / discount = {time:.3g} a state would move "
+            f"{turns:.2g} times round the torus (drift {drift:.2g} and control {push:.2g} per unit of time), more than the "
+            f"{MOST_TURNS:g} that can be followed; discount, drift and control_matrix must be of one unit of time, and "
+            "state_cost of the unit of |u|^q / q: f times s goes with control_matrix times s^(-1/q)."
+        )
 
 
 def _has(problem: Problem, name: str) -> bool:
@@ -198,10 +220,12 @@ class _Check:
     def _same(
         self, name: str, x: Tensor, one: Tensor, other: Tensor, how: str, all_of_it: Tensor | None = None
     ) -> None:
-        size = float((one if all_of_it is None else all_of_it).abs().max())
-        change = (one - other).abs().reshape(len(x), -1).amax(dim=-1)
+        whole = one if all_of_it is None else all_of_it
+        size = float(torch.cat([whole, other]).nan_to_num(0.0, 0.0, 0.0).abs().max())
+        alike = (one == other) | (one.isnan() & other.isnan())  # what is not finite is told elsewhere
+        change = torch.where(alike, 0.0, (one - other).abs()).reshape(len(x), -1).amax(dim=-1)
         worst = int(change.nan_to_num(nan=math.inf).argmax())
-        if not float(change[worst]) <= SAME * max(size, float(other.abs().max())) and bool(one.isfinite().all()):
+        if not float(change[worst]) <= SAME * size:
             raise ProblemError(f"{name} of {self.name} {how}: at {place(x[worst])} it differs by {change[worst]:.3g}.")
 
     def _differentiable(self) -> None:
