@@ -16,9 +16,9 @@ UNKNOWN = "my_module.MyProblem"
 class ForeignProblem(InputError):
     """A file is of a problem that only a user can name; ``arguments`` are what a command lacks."""
 
-    def __init__(self, sentence: str, why: str, arguments: list[str]) -> None:
+    def __init__(self, sentence: str, arguments: list[str]) -> None:
         super().__init__(sentence)
-        self.why, self.arguments = why, arguments
+        self.arguments = arguments
 
 
 def quoted(value: object) -> str:

@@ -65,10 +65,15 @@ def with_own_defaults(config_name: str, overrides: list[str]) -> list[str]:
     bare = [o.lstrip("+") for o in overrides]
     if not any(o.startswith("problem._target_=") for o in bare):
         return overrides
-    own = [f"++{b}" if b.startswith("problem.") else o for o, b in zip(overrides, bare, strict=True)]
-    if not _has_problem_group(config_name):
-        return own
-    return [NO_CHOICE, *(o for o, b in zip(own, bare, strict=True) if not b.startswith("problem=") and b != NO_CHOICE)]
+    found: list[str] = []
+    grouped = _has_problem_group(config_name)
+    for given, field in zip(overrides, bare, strict=True):
+        if grouped and (field.startswith("problem=") or given == NO_CHOICE):
+            continue
+        if grouped and field.startswith("problem._target_="):
+            found.append(NO_CHOICE)  # beside the other overrides, which Hydra wants in one piece
+        found.append(f"++{field}" if field.startswith("problem.") else given)
+    return found
 
 
 @cache

@@ -111,12 +111,11 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
     if problem is None:
         if saved["name"] not in PROBLEMS:
             section = _section(saved, metadata["config"])
-            why = (
+            raise ForeignProblem(
                 f"{path} belongs to the problem {str(saved['name'])[:80]!r}, which is not part of ocp_torch, or calls a "
-                "function of yours"
+                f"function of yours; pass it: load_controller(path, problem={made_by(section)}).",
+                naming(section),
             )
-            how = f"pass it: load_controller(path, problem={made_by(section)})"
-            raise ForeignProblem(f"{why}; {how}.", why, naming(section))
         _require_reasonable(path, saved["parameters"])
         problem = PROBLEMS[saved["name"]](**saved["parameters"])
     elif saved["name"] in PROBLEMS and problem_name(problem) != saved["name"]:

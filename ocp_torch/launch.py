@@ -70,7 +70,7 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object]) -
         if names:
             raise InputError(f"{len(names)} job(s) of the sweep failed: {'; '.join(names)}.")
     except ForeignProblem as error:
-        fail(f"{error.why}; if it is yours, name it: {shlex.join(['python', *typed, *error.arguments])}")
+        fail(f"{str(error).rstrip('.')}; if it is yours: {shlex.join(['python', *typed, *error.arguments])}")
     except InputError as error:
         fail(str(error))
     except Preempted as stop:

@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ocp_torch.certificate import table
-from ocp_torch.commands import ForeignProblem, naming
+from ocp_torch.commands import UNKNOWN, ForeignProblem, naming
 from ocp_torch.errors import InputError
 from ocp_torch.problems import PROBLEMS
 from ocp_torch.storage import write_atomically
@@ -137,12 +137,11 @@ def resumed_configuration(composed: dict, named: Iterable[str]) -> dict:
     problem = result.get("problem")
     target = problem.get("_target_") if isinstance(problem, dict) else None
     if target not in OWN_TARGETS and not {"problem", "problem._target_"} & set(named):
-        why = (
+        raise ForeignProblem(
             f"the configuration of {path} names the problem {str(target)[:80]!r}, which is not part of ocp_torch and is not "
-            "imported for a file"
+            f"imported for a file; name it yourself: problem._target_={UNKNOWN}.",
+            naming({"_target_": target}, mark=""),  # its arguments are in the configuration
         )
-        name = naming({"_target_": target}, mark="")  # its arguments are in the configuration
-        raise ForeignProblem(f"{why}; name it yourself: {name[0]}.", why, name)
     return result
 
 

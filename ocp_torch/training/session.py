@@ -18,6 +18,7 @@ from ocp_torch.errors import InputError, StorageError
 from ocp_torch.fields import Fields
 from ocp_torch.problems.blame import blamed
 from ocp_torch.steppers import NonFiniteError
+from ocp_torch.steppers.culprit import BROKEN_PROBLEM
 from ocp_torch.storage import sweep_temporaries, write_atomically
 from ocp_torch.training import figures
 from ocp_torch.training.checkpoint import LAST
@@ -105,7 +106,10 @@ def _failure(trainer: Trainer, error: BaseException) -> str | None:
     """Why the run cannot go on, where a loss or the user's problem failed; `None` for any other ``error``."""
     if isinstance(error, NonFiniteError):
         trainer.stopped = NOT_FINITE
-        return f"Training stopped at step {trainer.step}, before the update: {error}"
+        failure = f"Training stopped at step {trainer.step}, before the update: {error}"
+        if trainer.watch.best is None and BROKEN_PROBLEM not in failure:
+            raise InputError(failure) from None  # nobody knows how long it has diverged
+        return failure
     told = blamed(error, type(trainer.problem))
     if told is None:
         return None
