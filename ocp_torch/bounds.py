@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import torch
 
-from ocp_torch.errors import require_number
+from ocp_torch.errors import ProblemError, require_number
 from ocp_torch.extremum import supremum
 from ocp_torch.needs import GIVEN, GUESSED, SEARCHED
+from ocp_torch.problems.blame import place
 from ocp_torch.problems.problem import MARGIN, Problem
 
 # Without any knowledge of mu*, M is this multiple of sup mu0 on recorded data, where there is no bound without M.
@@ -111,7 +112,10 @@ def state_cost_supremum(problem: Problem) -> float:
     if problem.state_cost_bound is not None:
         return problem.state_cost_bound
     (x,) = problem.survey(SURVEYED, 1, "x")
-    return MARGIN * supremum(problem.state_cost, x, differentiable=False).value
+    found = supremum(problem.state_cost, x, differentiable=False)
+    if not math.isfinite(found.value):
+        raise ProblemError(f"state_cost is {found.value} at {place(found.x)}; it must be finite on the whole torus.")
+    return MARGIN * found.value
 
 
 def _estimate_value_bound(problem: Problem) -> tuple[float, str]:

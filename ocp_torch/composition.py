@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import re
 from collections.abc import Callable, Iterable
 from functools import cache, partial
@@ -22,7 +21,6 @@ from hydra.errors import (
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ocp_torch.config import problem_class
 from ocp_torch.errors import InputError, nearest, require_flag, require_section, shown
 from ocp_torch.training.resume import find_run, next_subfolder, resumed_configuration
 
@@ -30,6 +28,8 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 CONFIGS = CHECKOUT / "configs"
 OUTPUTS = CHECKOUT / "outputs"
 MOST_TRIED = 8  # jobs of a sweep that are tried for one value
+# No choice of a problem, whose fields would be mixed with those of a user's own class.
+NO_CHOICE = "~problem"
 EXTRAS = {"hydra/launcher": "parallel"}  # Hydra's plugin groups -> the extra that installs them
 
 
@@ -62,33 +62,49 @@ def parsed(overrides: list[str]) -> list[Override]:
         raise InputError("the command line holds a number of thousands of digits, which nothing here takes.") from None
 
 
+def with_own_defaults(config_name: str, overrides: list[str]) -> list[str]:
+    """``overrides`` in which a class that ``problem._target_`` names starts from its own defaults: the group's fields,
+    which are another problem's, are left out, and `problem.x=` sets or adds x, whether it was there or not."""
+    bare = [o.lstrip("+") for o in overrides]
+    if not any(o.startswith("problem._target_=") for o in bare):
+        return overrides
+    found: list[str] = []
+    grouped = _has_problem_group(config_name)
+    for given, field in zip(overrides, bare, strict=True):
+        if grouped and (field.startswith("problem=") or given == NO_CHOICE):
+            continue
+        if grouped and field.startswith("problem._target_="):
+            found.append(NO_CHOICE)  # beside the other overrides, which Hydra wants in one piece
+        found.append(f"++{field}" if field.startswith("problem.") else given)
+    return found
+
+
+@cache
+def _has_problem_group(config_name: str) -> bool:
+    defaults = OmegaConf.to_container(OmegaConf.load(CONFIGS / f"{config_name}.yaml")).get("defaults", [])
+    return any(isinstance(choice, dict) and choice.get("problem") for choice in defaults)
+
+
 def prepared(data: dict, overrides: list[str], roots: tuple[Path, ...] = ()) -> dict:
     """``data`` as a run is built from it: that of the run to go on with, where ``resume`` names one (`auto`: the last of
-    this configuration below ``roots``); and with the problem's fields reduced to those its class takes."""
+    this configuration below ``roots``)."""
     named = [o.key_or_group for o in parsed(overrides) if not o.key_or_group.startswith("hydra")]
+    if "problem._target_" in named:
+        named.remove("problem") if "problem" in named else None
+        # What an experiment sets is another problem's as well.
+        mine = {name.split(".")[1] for name in named if name.startswith("problem.")}
+        data = {**data, "problem": {k: v for k, v in data["problem"].items() if k in mine}}
     if data.get("resume") == "auto":
         run = find_run(data, (*roots, OUTPUTS))
         data = {**data, "resume": str(run) if run else None}
     if data.get("resume") is not None:
         data = resumed_configuration(data, named)
-    if isinstance(data.get("problem"), dict) and "_target_" in data["problem"]:
-        data["problem"] = drop_unclaimed(data["problem"], overrides)
     return data
-
-
-def drop_unclaimed(problem: dict, overrides: list[str]) -> dict:
-    """Without the group's own fields that a user's class does not take; those the user set himself stay, to be refused."""
-    target = str(problem.get("_target_"))
-    if target.startswith("ocp_torch."):
-        return problem
-    own = [o.lstrip("+") for o in overrides if o.lstrip("+").startswith("problem.")]
-    named = {o.split("=")[0].removeprefix("problem.") for o in own}
-    taken = inspect.signature(problem_class(problem.get("_target_"))).parameters
-    return {k: v for k, v in problem.items() if k == "_target_" or k in taken or k in named}
 
 
 def composed(config_name: str, overrides: list[str], roots: tuple[Path, ...] = ()) -> dict:
     """What the job will be given; whatever Hydra or OmegaConf has against it becomes an `InputError` of one sentence."""
+    overrides = with_own_defaults(config_name, overrides)
     return prepared(_composed(config_name, overrides), overrides, roots)
 
 

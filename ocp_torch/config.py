@@ -23,10 +23,13 @@ from ocp_torch.errors import (
     require_section,
 )
 from ocp_torch.fields import MODELS, VALUE, Fields
+from ocp_torch.fields.fields import cost_unit
 from ocp_torch.fields.spectrum import STATES
 from ocp_torch.memory import require_memory
 from ocp_torch.objectives import METHODS, Objective
 from ocp_torch.problems import Problem
+from ocp_torch.problems.blame import in_their_words, origin, words
+from ocp_torch.problems.check import check_once
 from ocp_torch.problems.problem import MOST_COORDINATES
 from ocp_torch.process import prepare
 from ocp_torch.samplers import SAMPLERS, RowSampler, derive_seed
@@ -51,8 +54,10 @@ def problem_class(target: object) -> type[Problem]:
     module_name, _, class_name = target.rpartition(".")
     try:
         module = importlib.import_module(module_name)
-    except ImportError as error:
-        raise InputError(f"problem._target_ = {target} cannot be imported: {error}.") from None
+    except (Exception, SystemExit) as error:  # whatever a stranger's module may raise
+        missing = isinstance(error, ImportError) and module_name.startswith(str(error.name))
+        where = "" if missing else origin(error)
+        raise InputError(f"problem._target_ = {target} cannot be imported: {words(error)}{where}.") from None
     known = [n for n, c in vars(module).items() if inspect.isclass(c) and issubclass(c, Problem) and c is not Problem]
     if class_name not in known:
         hint = nearest(class_name, known)
@@ -61,14 +66,15 @@ def problem_class(target: object) -> type[Problem]:
 
 
 def build_problem(section: object) -> Problem:
-    """The problem ``_target_`` names, made with the other fields as arguments; any `Problem` subclass will do."""
+    """The problem ``_target_`` names, made with the other fields as arguments and checked; any `Problem` subclass will do."""
     options = require_section("problem", section)
     cls = problem_class(options.pop("_target_", None))
     dim = options.get("dim")
     if isinstance(dim, int) and 1 <= dim <= MOST_COORDINATES:  # a problem that large may take long to be made
         _require_room(dim, options.get("control_dim"))
-    problem = call(cls, "problem", options)
+    problem = in_their_words(lambda: call(cls, "problem", options), cls.__name__, cls)
     _require_room(problem.dim, problem.control_dim)
+    check_once(problem)
     return problem
 
 
@@ -98,7 +104,7 @@ def build_trainer(config: dict) -> Trainer:
     fields = Fields.build(problem, objective.fields, network, derive_seed(seed, WEIGHTS_STREAM))
     fields = fields.to(dtype=settings.torch_dtype, device=settings.torch_device)
     require_memory("trainer.batch", settings.batch, _bytes_per_state(problem, fields, settings))
-    stepper = _build_stepper(config, fields, objective, settings.steps)
+    stepper = _build_stepper(config, fields, objective, settings.steps, cost_unit(problem))
     average = call(averaged, "averaging", require_section("averaging", config["averaging"]), fields=fields)
     sampler_section = require_section("sampler", config["sampler"])
     sampler_name = require_choice("sampler.name", sampler_section.pop("name", None), SAMPLERS)
@@ -139,7 +145,7 @@ def build_certificate_settings(config: dict) -> CertificateSettings:
     return call(CertificateSettings, "certificate", section, stage=stage)
 
 
-def _build_stepper(config: dict, fields: Fields, objective: Objective, steps: int) -> Stepper:
+def _build_stepper(config: dict, fields: Fields, objective: Objective, steps: int, unit: float) -> Stepper:
     options = require_section("optimizer", config["optimizer"])
     player_lr = require_section("optimizer.player_lr", options.pop("player_lr", {}))
     for player, rate in player_lr.items():
@@ -155,4 +161,5 @@ def _build_stepper(config: dict, fields: Fields, objective: Objective, steps: in
     for field in ("radius", "clip"):
         if section.get(field) is not None:
             require_number(f"stepper.{field}", section[field], above=0.0)
-    return call(stepper, "stepper", section, fields=fields, objective=objective, optimizers=makers, schedule=schedule)
+    given = dict(fields=fields, objective=objective, optimizers=makers, schedule=schedule, unit=unit)
+    return call(stepper, "stepper", section, **given)

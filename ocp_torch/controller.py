@@ -10,13 +10,15 @@ import torch
 from torch import Tensor
 
 from ocp_torch.bounds import Bounds
+from ocp_torch.commands import ForeignProblem, made_by, naming
 from ocp_torch.control_laws import CLOSED, NETWORK, SADDLE, control_laws
 from ocp_torch.errors import InputError, notes
 from ocp_torch.fields import MODELS, Fields
 from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE
 from ocp_torch.limits import require_held, require_modest_problem
 from ocp_torch.problems import PROBLEMS, Problem
-from ocp_torch.storage import load_tensors, save_tensors
+from ocp_torch.problems.check import check_once
+from ocp_torch.storage import finite, load_tensors, save_tensors
 
 SCHEMA = 1
 FIELDS = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION)
@@ -86,7 +88,8 @@ def load_controller(path: str | Path, problem: Problem | None = None, device: st
     """Load a controller saved by a run; no code in the file is run.
 
     A controller of one of the package's problems rebuilds it from its parameters; one of a user's own problem needs that
-    ``problem``. Raises `InputError` when the file is missing, damaged, of a newer schema, or does not fit the problem.
+    ``problem``, made with the same arguments. Raises `InputError` when the file is missing, damaged, of a newer schema, or
+    does not fit the problem.
     """
     path = Path(path)
     tensors, metadata = load_tensors(path)
@@ -108,14 +111,18 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
     saved = metadata["problem"]
     if problem is None:
         if saved["name"] not in PROBLEMS:
-            raise InputError(
+            section = _section(saved, metadata["config"])
+            raise ForeignProblem(
                 f"{path} belongs to the problem {str(saved['name'])[:80]!r}, which is not part of ocp_torch, or calls a "
-                "function of yours; pass it: load_controller(path, problem=MyProblem())."
+                f"function of yours; pass it: load_controller(path, problem={made_by(section)}).",
+                naming(section),
             )
         require_modest_problem(path, saved["parameters"], "pass it: load_controller(path, problem=...)")
         problem = PROBLEMS[saved["name"]](**saved["parameters"])
     elif saved["name"] in PROBLEMS and problem_name(problem) != saved["name"]:
         raise InputError(f"{path} belongs to the problem {saved['name']!r}, not to {problem_name(problem)!r}.")
+    else:
+        check_once(problem)
     model, names = metadata["model"], metadata["fields"]
     if len(names) > len(FIELDS) or not set(names) <= set(FIELDS) or len(set(names)) < len(names):
         raise InputError(
@@ -134,6 +141,7 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
         raise InputError(
             f"{path} does not fit: its weights are not those of its model on a problem of dimension {problem.dim}."
         )
+    _require_same_arguments(path, problem, saved["parameters"])
     if metadata["dtype"] not in ("float32", "float64"):
         raise InputError(f"{path} has dtype {metadata['dtype']!r}, but must have float32 or float64.")
     other = {str(t.dtype).removeprefix("torch.") for t in tensors.values()} - {metadata["dtype"]}
@@ -160,6 +168,26 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
     )
 
 
+def _section(saved: dict, config: dict) -> dict:
+    """The problem of a run as its configuration names it, or as its parameters do where that is of something else."""
+    section = config.get("problem")
+    target = str(section.get("_target_")) if isinstance(section, dict) else ""
+    if target.rpartition(".")[2].lower() == str(saved["name"]).rpartition(".")[2]:
+        return section
+    return saved["parameters"]
+
+
+def _require_same_arguments(path: Path, problem: Problem, saved: dict) -> None:
+    """Raise `InputError` where ``problem`` is not made as that of the run was."""
+    given = finite(_plain(problem.parameters))
+    for name in given.keys() & saved.keys() - set(problem.incidental):
+        if given[name] != saved[name]:
+            raise InputError(
+                f"problem.{name} is {given[name]!r}, but the run of {path} has {repr(saved[name])[:80]}; a controller is "
+                "loaded with the problem it was trained for."
+            )
+
+
 def _blank(problem: Problem, names: list[str], network: type, options: dict) -> Fields:
     """Fields to load a state into, on whatever device is the default."""
     outputs = {"value": None, "control_density": problem.control_dim, "log_occupation": None}
@@ -176,4 +204,5 @@ def _require_run(path: Path, certificate: object, config: object) -> None:
 
 def _plain(parameters: dict) -> dict:
     """Only what JSON can hold; the rest is a user's own problem's, which is passed in on loading."""
-    return {k: v for k, v in parameters.items() if isinstance(v, bool | int | float | str | list | type(None))}
+    listed = {k: list(v) if isinstance(v, tuple) else v for k, v in parameters.items()}
+    return {k: v for k, v in listed.items() if isinstance(v, bool | int | float | str | list | type(None))}

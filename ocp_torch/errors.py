@@ -38,6 +38,10 @@ class InputError(ValueError):
         return visible(super().__str__())
 
 
+class ProblemError(InputError):
+    """A user's problem failed: its code raised, or gave what no problem may. The sentence says which function, and where."""
+
+
 class StorageError(InputError):
     """A file that could not be written: no space, no permission. What was there before is untouched."""
 

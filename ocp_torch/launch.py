@@ -22,6 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from ocp_torch.commands import ForeignProblem, quoted
 from ocp_torch.composition import (
     CHECKOUT,
     CONFIGS,
@@ -32,8 +33,10 @@ from ocp_torch.composition import (
     plain,
     prepared,
     register_resolvers,
+    with_own_defaults,
 )
 from ocp_torch.errors import InputError, shown, visible
+from ocp_torch.problems.blame import blamed
 from ocp_torch.reading import require_unlinked
 from ocp_torch.training.checkpoint import LAST
 from ocp_torch.training.resume import adopt, locate
@@ -63,6 +66,8 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object]) -
     logging.raiseExceptions = False  # a full disk is told once, not at every line of a log
     # A user's module is found where the command was given, as `python -m` would find it.
     sys.path.insert(0, os.getcwd())
+    typed = list(sys.argv)
+    sys.argv[1:] = with_own_defaults(config_name, sys.argv[1:])
     try:
         if not any(a.split("=")[0] in ASKS for a in sys.argv[1:]):
             sys.argv[1:] = checked(sys.argv[1:], config_name, check)
@@ -71,6 +76,8 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object]) -
             names = failed()
         if names:
             raise InputError(f"{len(names)} job(s) of the sweep failed: {'; '.join(names)}.")
+    except ForeignProblem as error:
+        fail(f"{str(error).rstrip('.')}; if it is yours: {shlex.join(['python', *typed, *error.arguments])}")
     except InputError as error:
         fail(str(error))
     except Preempted as stop:
@@ -108,8 +115,11 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
         require_unlinked(folder)
     try:
         check(data)
-    except SystemExit as end:  # somebody's module or function would end the run without a word
-        raise InputError(f"the code that the command line names asks Python to exit (status {end.code}).") from None
+    except (Exception, SystemExit) as error:
+        told = blamed(error)
+        if told is None and isinstance(error, SystemExit):  # somebody's module would end the run without a word
+            told = InputError(f"the code that the command line names asks Python to exit (status {error.code}).")
+        raise told or error from None
     if data.get("resume") is None:
         if own is not None and "resume" in data:
             require_fresh(own)
@@ -122,12 +132,6 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
     return [*kept, f"resume={quoted(data['resume'])}", f"hydra.run.dir={quoted(folder)}"]
 
 
-def quoted(value: object) -> str:
-    """A value as Hydra reads it back, whatever signs it holds."""
-    text = str(value).replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{text}'"
-
-
 def require_fresh(folder: Path) -> None:
     """Raise `InputError` when ``folder`` holds a run that a new one would overwrite."""
     if (folder / "checkpoints" / LAST).exists():
@@ -137,7 +141,7 @@ def require_fresh(folder: Path) -> None:
 
 
 def fail(sentence: str) -> None:
-    """Print one sentence, on one line and without numbers of hundreds of digits, and leave with the status of a wrong input."""
+    """Print one sentence, on one line and without endless numbers, and leave with the status of a wrong input."""
     line = re.sub(r"\d{40,}", lambda digits: f"{digits[0][:6]}...({len(digits[0])} digits)", " ".join(sentence.split()))
     print(f"error: {visible(line)}", file=sys.stderr)
     sys.exit(FAILED_INPUT)
@@ -180,7 +184,10 @@ def job(task: Callable[[dict, Path], object], config: DictConfig) -> None:
         if not sweeping or multiprocessing.parent_process() is None:
             raise
         failed(hydra, f"stopped by {stop}")
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        error = blamed(error) or error
+        if isinstance(error, SystemExit):
+            raise
         if not sweeping and isinstance(error, InputError):
             fail(str(error))
         if not sweeping:
@@ -214,7 +221,7 @@ def again(hydra: DictConfig, folder: Path, sweeping: bool) -> str:
     """The command that goes on with what was stopped."""
     # What only the command line may name.
     mine = "problem." if "problem=callable" in hydra.overrides.task else "problem._target_="
-    own = [o for o in hydra.overrides.task if o == "problem=callable" or o.lstrip("+").startswith(mine)]
+    own = [o.lstrip("+") for o in hydra.overrides.task if o == "problem=callable" or o.lstrip("+").startswith(mine)]
     if not sweeping:
         path = str(folder) if re.fullmatch(r"[\w./+-]+", str(folder)) else quoted(folder)
         return shlex.join(["python", sys.argv[0], f"resume={path}", *own])

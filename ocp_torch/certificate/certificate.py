@@ -27,7 +27,7 @@ class Run:
     step: int = 0
     samples: int = 0
     train_seconds: float = 0.0
-    stopped: str = "steps"  # why training ended: steps, target_gap, max_seconds or not_finite
+    stopped: str = "steps"  # why training ended: steps, target_gap, max_seconds, not_finite or failed
 
     @classmethod
     def read(cls, certificate: dict) -> Run:

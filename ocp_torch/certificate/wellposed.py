@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.estimate import Estimate, integral
-from ocp_torch.errors import InputError
+from ocp_torch.errors import ProblemError
 from ocp_torch.extremum import supremum
 from ocp_torch.mixtures import worth
+from ocp_torch.problems.blame import place
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samplers import scrambled_sobol
 from ocp_torch.samples import Samples
@@ -45,8 +46,11 @@ def check_problem(problem: Problem, sets: list[Samples]) -> WellPosed:
     Raises `InputError` where a function is not finite.
     """
     for name in ("f", "a", "B", "mu0"):
-        if not all(bool(torch.isfinite(getattr(samples, name)).all()) for samples in sets):
-            raise InputError(f"{_NAMES[name]} is not finite at a sampled state; it must be finite on the whole torus.")
+        for samples in sets:
+            bad = ~torch.isfinite(getattr(samples, name)).reshape(len(samples), -1).all(dim=-1)
+            if bool(bad.any()):
+                at = place(samples.x[bad][0])
+                raise ProblemError(f"{_NAMES[name]} is not finite at {at}; it must be finite on the whole torus.")
     warnings: list[str] = []
     sizes = {name: max(float(getattr(samples, name).abs().max()) for samples in sets) for name in _NAMES}
     shifted, seams = _periods(problem, sizes), _seams(problem, sizes)

@@ -70,6 +70,8 @@ class Fields(nn.Module):
         return [p for name in names for p in self.networks[name].parameters() if p.requires_grad]
 
 
+# A state cost whose mean is within this factor of 1 is of an ordinary size.
+ORDINARY = 1e4
 # What was found for a problem: the search takes seconds in eight dimensions, and the stage builds networks again.
 _found: WeakKeyDictionary[Problem, dict[int, Tensor]] = WeakKeyDictionary()
 
@@ -80,6 +82,15 @@ def _waves(problem: Problem, count: int) -> Tensor:
     if count not in known:
         known[count] = prominent_waves(problem.independent_samples(STATES), count)
     return known[count]
+
+
+def cost_unit(problem: Problem) -> float:
+    """What losses are divided by before they are differentiated: 1 for costs of an ordinary size, else the power of two next
+    to their mean, so that no optimiser takes a gradient of 1e-12 for none."""
+    (f,) = problem.survey(1024, 0, "f")
+    size = float(f.abs().mean())
+    ordinary = not math.isfinite(size) or size == 0.0 or 1.0 / ORDINARY <= size <= ORDINARY
+    return 1.0 if ordinary else 2.0 ** round(math.log2(size))
 
 
 def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:

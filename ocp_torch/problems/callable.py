@@ -27,6 +27,8 @@ class Callable(Problem):
     finite, is not a function of the state alone, or jumps where a coordinate passes from 1 to 0.
     """
 
+    incidental = ("target", "differences", "workers")
+
     def __init__(
         self,
         target: str | abc.Callable,

@@ -76,6 +76,8 @@ class Dataset(Problem):
             self.state_cost_bound = MARGIN * float(self._recording.samples.f.max())
             self._split()
 
+    incidental = ("path",)
+
     @property
     def parameters(self) -> dict:
         return {

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError, require_integer
+from ocp_torch.errors import InputError, ProblemError, require_integer
 from ocp_torch.problems.target import asked, resolved
 from ocp_torch.problems.workers import Workers
 from ocp_torch.samplers import scrambled_sobol
@@ -66,13 +66,13 @@ class Oracle:
         except InputError:
             raise
         except Exception as error:  # whatever a stranger's code may raise
-            raise InputError(self._failure(x, error)) from None
+            raise ProblemError(self._failure(x, error)) from None
         found = self._shaped(answer, x)
         for name, values in found.items():
             bad = ~torch.isfinite(values).reshape(len(x), -1).all(dim=-1)
             if bool(bad.any()):
                 at_row = int(bad.nonzero()[0])
-                raise InputError(f"the oracle's {name} is not finite at x = {x[at_row].tolist()}.")
+                raise ProblemError(f"the oracle's {name} is not finite at x = {x[at_row].tolist()}.")
         return found
 
     def _failure(self, x: np.ndarray, error: Exception) -> str:

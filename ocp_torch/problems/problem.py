@@ -42,6 +42,13 @@ class Problem:
     evaluable: bool = True
     # Whether the control matrix can, which the controller from V needs.
     knows_control_matrix: bool = True
+    # Arguments that say where the data come from, not what they are: another run may give others.
+    incidental: tuple[str, ...] = ()
+
+    def __new__(cls, *args, **kwargs) -> Problem:
+        made = super().__new__(cls)
+        made._given = args, kwargs  # for `parameters`
+        return made
 
     def __init__(
         self,
@@ -183,9 +190,17 @@ class Problem:
 
     @property
     def parameters(self) -> dict:
-        """The arguments that make this problem again: each `__init__` argument is read from the attribute of its name."""
-        names = list(inspect.signature(type(self).__init__).parameters)[1:]
-        return {name: getattr(self, name) for name in names if hasattr(self, name)}
+        """The arguments that make this problem again: each `__init__` argument is read from the attribute of its name, or,
+        where there is none, is what was given."""
+        args, kwargs = self._given
+        signature = inspect.signature(type(self).__init__)
+        bound = signature.bind(self, *args, **kwargs)
+        bound.apply_defaults()
+        found = dict(list(bound.arguments.items())[1:])
+        for name, parameter in signature.parameters.items():
+            if parameter.kind is parameter.VAR_KEYWORD:
+                found |= found.pop(name)
+        return {name: getattr(self, name, value) for name, value in found.items()}
 
     def _like(self, x: Tensor, name: str, constant: Tensor) -> Tensor:
         """``constant`` in the precision and on the device of ``x``, converted once."""

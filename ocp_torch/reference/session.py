@@ -61,7 +61,8 @@ def prepare(config: dict) -> ReferenceJob:
         problem = build_problem(section)
     else:
         # A run names one of the package's problems itself; only a user's own comes from the command line.
-        if str(section.get("_target_", "")).startswith("ocp_torch."):
+        target = str(section.get("_target_", ""))
+        if target.startswith("ocp_torch.") and not target.endswith(".Callable"):
             raise InputError("problem and run are both given, but the run names its problem; leave problem out.")
         controller = load_run({"run": config["run"], "problem": section})
         problem, path = controller.problem, Path(str(config["run"]))

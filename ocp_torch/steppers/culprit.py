@@ -13,6 +13,10 @@ DATA = {"f": "the state cost", "a": "the drift", "B": "the control matrix", "mu0
 DATA |= {"div_a": "the divergence of the drift", "div_B": "the divergence of the control matrix"}
 
 
+# How the sentence ends where no learning rate would help.
+BROKEN_PROBLEM = "; it must be finite on the whole torus"
+
+
 class NonFiniteError(ArithmeticError):
     """A loss or gradient is not finite; raised before any parameter was touched."""
 
@@ -54,7 +58,7 @@ def _bad_data(one: Samples) -> str:
     for name, words in DATA.items():
         values = getattr(one, name)
         if values is not None and not torch.isfinite(values).all():
-            return f", where {words} of the problem is not finite"
+            return f", where {words} of the problem is not finite{BROKEN_PROBLEM}"
     return ""
 
 

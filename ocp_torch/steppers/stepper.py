@@ -17,7 +17,7 @@ from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
 from ocp_torch.objectives.objective import Objective
 from ocp_torch.samples import Samples
-from ocp_torch.steppers.culprit import NonFiniteError, culprit
+from ocp_torch.steppers.culprit import BROKEN_PROBLEM, NonFiniteError, culprit
 
 Draw = Callable[[], Samples]
 Visit = Callable[[], None]
@@ -39,7 +39,8 @@ class Stepper(ABC):
     ``optimizers`` maps a player to a maker of its optimiser, ``schedule`` makes the learning-rate schedule of each, given
     the part of the run the player rests;
     ``radius``, if given, is the Euclidean ball each player's parameters are projected on after every update (the paper's
-    proximal operator); ``clip``, if given, is the largest gradient norm of a player.
+    proximal operator); ``clip``, if given, is the largest gradient norm of a player; ``unit`` is what losses are divided by
+    (see `cost_unit`).
     """
 
     def __init__(
@@ -50,8 +51,9 @@ class Stepper(ABC):
         schedule: Callable[[Optimizer, float], LRScheduler],
         radius: float | None = None,
         clip: float | None = None,
+        unit: float = 1.0,
     ) -> None:
-        self.fields, self.objective, self.radius, self.clip = fields, objective, radius, clip
+        self.fields, self.objective, self.radius, self.clip, self.unit = fields, objective, radius, clip, unit
         self.parameters = {player: fields.parameters_of(names) for player, names in objective.players.items()}
         self.optimizers = {player: optimizers[player](self.parameters[player]) for player in objective.players}
         resting = objective.resting
@@ -96,7 +98,8 @@ class Stepper(ABC):
         gradients = {}
         for i, (player, parameters) in enumerate(moving.items()):
             more = i < len(moving) - 1
-            gradients[player] = torch.autograd.grad(losses[player], parameters, retain_graph=more, allow_unused=True)
+            loss = losses[player] if self.unit == 1.0 else losses[player] / self.unit
+            gradients[player] = torch.autograd.grad(loss, parameters, retain_graph=more, allow_unused=True)
         norms = {}
         for player, parameters in moving.items():
             for parameter, gradient in zip(parameters, gradients[player], strict=True):
@@ -113,7 +116,8 @@ class Stepper(ABC):
         checks = torch.stack([*losses.values(), *norms.values()])
         if not torch.isfinite(checks).all():
             what = culprit(self.objective, self.fields, samples)
-            raise NonFiniteError(f"{what}; try a smaller optimizer.lr, or stepper.clip.")
+            advice = "" if what.endswith(BROKEN_PROBLEM) else "; try a smaller optimizer.lr, or stepper.clip"
+            raise NonFiniteError(f"{what}{advice}.")
 
     def _update(self, players: Iterable[str]) -> None:
         """One update of ``players`` with the gradients in place, then the projection."""

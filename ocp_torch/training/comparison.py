@@ -143,14 +143,14 @@ def row_of(folder: Path, name: str) -> dict:
         raise InputError(progress_of(folder))
     try:
         certificate = read_json(file, LARGEST_CERTIFICATE)
-        lower, perf, upper = (best(certificate, *side) for side in SIDES)
+        lower, upper = (bound(certificate, *side) for side in SIDES)
         return {
             "run": name,
             **{k: printable(certificate[k]) for k in ("problem", "method")},
             **{k: int(number(certificate[k])) for k in ("seed", "step")},
             "train_seconds": number(certificate["train_seconds"]),
             "lower": lower,
-            "perf": perf,
+            "perf": performance(certificate),
             "upper": upper,
             "exact": number(certificate["exact"]),
             **{f"gap_{kind}": ranked(certificate["gap"][kind]) for kind in ("certified", "simulated")},
@@ -163,19 +163,28 @@ def row_of(folder: Path, name: str) -> dict:
         raise InputError(f"its certificate.json is damaged ({reason}).") from None
 
 
-# Each side of a certificate: its group, the key of `gap` that names the bound in use, and which end is the best.
-SIDES = (("lower", "lower_from", max), ("perf", None, min), ("upper", "upper_from", min))
+# Each bound's group, and the key of `gap` that names the one in use.
+SIDES = (("lower", "lower_from"), ("upper", "upper_from"))
 
 
-def best(certificate: dict, group: str, chosen: str | None, choose) -> float | None:
-    """The bound the gap was taken from, or the best value there is."""
-    name = certificate["gap"][chosen] if chosen else None
-    if name is not None:
-        return number(certificate[group][name]["value"])
-    if chosen is not None:
-        return None
-    values = [number(e["value"]) for e in certificate[group].values() if e is not None]
-    return choose(values, default=None)
+def bound(certificate: dict, group: str, chosen: str) -> float | None:
+    """The bound the gap was taken from."""
+    name = certificate["gap"][chosen]
+    return None if name is None else number(certificate[group][name]["value"])
+
+
+def performance(certificate: dict) -> float | None:
+    """Of the controller that was certified, which older certificates do not name: the one that was given, or that which the
+    upper bounds speak of, or else the one with the smallest value that its errors allow."""
+    known = {name: e for name, e in certificate["perf"].items() if e is not None and number(e["value"]) is not None}
+    spoken_of = [e.get("controller") for e in certificate["upper"].values() if e is not None]
+    at_most = lambda name: (
+        known[name]["value"] + (number(known[name].get("bias")) or 0.0) + 2.0 * number(known[name]["se"])
+    )
+    names = [name for name in (certificate.get("controller"), "given", *spoken_of) if name in known] or sorted(
+        known, key=at_most
+    )
+    return number(known[names[0]]["value"]) if names else None
 
 
 def number(value) -> float | None:

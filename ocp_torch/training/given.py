@@ -21,7 +21,7 @@ from ocp_torch.controller import Controller, problem_name
 from ocp_torch.errors import InputError, require_flag, require_integer
 from ocp_torch.extremum import batched
 from ocp_torch.fields import Fields
-from ocp_torch.fields.fields import VALUE
+from ocp_torch.fields.fields import VALUE, cost_unit
 from ocp_torch.objectives import Dual
 from ocp_torch.problems import Problem
 from ocp_torch.process import prepare
@@ -92,7 +92,7 @@ def train_value(
     states = SAMPLERS[sampler](problem.dim, derive_seed(seed, JUDGE_STREAM, 1), torch.float32)
     batches = Batches(problem, fields, objective, states, batch, derive_seed(seed, JUDGE_STREAM, 2))
     makers = {player: optimizer_maker("soap", lr, betas=(0.95, 0.95)) for player in objective.players}
-    stepper = Simultaneous(fields, objective, makers, schedule_maker("cosine", steps))
+    stepper = Simultaneous(fields, objective, makers, schedule_maker("cosine", steps), unit=cost_unit(problem))
     average = averaged(fields, decay=0.98)
     for step in range(steps):
         objective.progress = step / steps

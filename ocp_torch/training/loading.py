@@ -10,9 +10,9 @@ from pathlib import Path
 
 import torch
 
-from ocp_torch.controller import Controller, load_controller
+from ocp_torch.controller import Controller, load_controller, problem_name
 from ocp_torch.errors import InputError, nearest
-from ocp_torch.problems import Problem
+from ocp_torch.problems import PROBLEMS, Problem
 from ocp_torch.reading import FOLDER, kind, require_file
 
 log = logging.getLogger(__name__)
@@ -43,8 +43,15 @@ def load_law(source: str, problem: Problem) -> Callable | Controller:
 
 
 def load_saved(path: Path, problem: Problem) -> Controller:
-    """A controller of ours, by its file or its run's folder; of the same problem, whatever its parameters were."""
-    return load_controller(path / "controller.safetensors" if kind(path) == FOLDER else path, problem=problem)
+    """A controller of ours, by its file or its run's folder; of the same problem, and for one of the package's, which the
+    file makes again, whatever its parameters were."""
+    file = path / "controller.safetensors" if kind(path) == FOLDER else path
+    if problem_name(problem) not in PROBLEMS:
+        return load_controller(file, problem=problem)
+    found = load_controller(file)
+    if type(found.problem) is not type(problem):
+        raise InputError(f"{file} belongs to {problem_name(found.problem)!r}, not to {problem_name(problem)!r}.")
+    return found
 
 
 def _function(path: Path, name: str) -> Callable:

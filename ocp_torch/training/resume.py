@@ -16,6 +16,7 @@ from pathlib import Path
 import yaml
 
 from ocp_torch.certificate import table
+from ocp_torch.commands import UNKNOWN, ForeignProblem, naming
 from ocp_torch.errors import InputError
 from ocp_torch.limits import require_modest_problem, require_modest_run
 from ocp_torch.problems import PROBLEMS
@@ -117,9 +118,10 @@ def resumed_configuration(composed: dict, named: Iterable[str]) -> dict:
     problem = result.get("problem")
     target = problem.get("_target_") if isinstance(problem, dict) else None
     if target not in OWN_TARGETS and not {"problem", "problem._target_"} & set(named):
-        raise InputError(
+        raise ForeignProblem(
             f"the configuration of {path} names the problem {str(target)[:80]!r}, which is not part of ocp_torch and is not "
-            "imported for a file; name it yourself: problem._target_=my_module.MyProblem."
+            f"imported for a file; name it yourself: problem._target_={UNKNOWN}.",
+            naming({"_target_": target}, mark=""),  # its arguments are in the configuration
         )
     if target in OWN_TARGETS and "problem" not in named:
         given = {k: v for k, v in problem.items() if f"problem.{k}" not in named}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import shutil
@@ -15,7 +16,9 @@ from ocp_torch.control_laws import control_laws
 from ocp_torch.controller import Controller
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.fields import Fields
+from ocp_torch.problems.blame import blamed
 from ocp_torch.steppers import NonFiniteError
+from ocp_torch.steppers.culprit import BROKEN_PROBLEM
 from ocp_torch.storage import sweep_temporaries, write_atomically
 from ocp_torch.training import closing, figures
 from ocp_torch.training.checkpoint import LAST
@@ -23,7 +26,7 @@ from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.monitor import Monitor
 from ocp_torch.training.practice import practical_figures, write_metrics
 from ocp_torch.training.signals import Signals
-from ocp_torch.training.trainer import NOT_FINITE, TARGET_GAP, Trainer
+from ocp_torch.training.trainer import FAILED, NOT_FINITE, TARGET_GAP, Trainer
 from ocp_torch.training.watch import hopeless
 
 log = logging.getLogger(__name__)
@@ -34,7 +37,8 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, fol
     `metrics.json` for problems with numbers of their own.
 
     A trainer that was resumed goes on where it is. SIGTERM and Ctrl-C raise `Preempted` once the state is saved. Raises
-    `InputError` when a loss stops being finite (what the best look so far gives is handed out first), and `StorageError`
+    `InputError` when a loss stops being finite or the user's problem fails (what the best look so far gives is handed out
+    first), and `StorageError`
     when a file cannot be written.
     """
     started = time.perf_counter()
@@ -49,8 +53,10 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, fol
             trainer.tell, failure = monitor.certifying, None
             try:
                 certificate, fields = _train(trainer, certificate_settings, monitor, last, signals)
-            except NonFiniteError as error:
-                failure = f"Training stopped at step {trainer.step}, before the update: {error}"
+            except (Exception, SystemExit) as error:
+                failure = _failure(trainer, error)
+                if failure is None:
+                    raise
                 certificate, fields = _salvage(trainer, certificate_settings, failure, monitor)
             closing.begin(folder)
             kind = _hand_out(trainer, certificate, fields, folder)
@@ -58,20 +64,23 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, fol
             drawn = {}
             if trainer.settings.figures:
                 monitor.stages("figures")
-                drawn = figures.draw(trainer.problem, fields, trainer.bounds, trainer.objective.occupation)
-                drawn["certificate"] = figures.interval(certificate.to_dict())
-                drawn |= practical_figures(trainer.problem, law, trainer.seed)
+                drawn = {"certificate": figures.interval(certificate.to_dict())}
+                with _unless(failure, trainer):
+                    drawn |= figures.draw(trainer.problem, fields, trainer.bounds, trainer.objective.occupation)
+                    drawn |= practical_figures(trainer.problem, law, trainer.seed)
                 figures.save(drawn, folder / "figures")
             monitor.finish(certificate, drawn, flatten(trainer.config), trainer.step)
     except OSError as error:
         raise StorageError(f"{folder} cannot be written to: {error.strerror or error}.") from None
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
     if certificate_settings.trajectories:
-        write_metrics(trainer.problem, law, trainer.seed, folder)
+        with _unless(failure, trainer):
+            write_metrics(trainer.problem, law, trainer.seed, folder)
     closing.complete(folder)
     log.info("controller from %s, %.0f s in all, in %s", kind, time.perf_counter() - started, folder)
     if failure is not None:
-        raise InputError(f"{failure.rstrip('.')}; the controller in {folder} is that of the best look before.")
+        which = "the best look before" if trainer.watch.best else f"step {trainer.step}, without any look"
+        raise InputError(f"{failure.rstrip('.')}; the controller in {folder} is that of {which}.")
     return certificate
 
 
@@ -95,17 +104,55 @@ def _train(
         trainer.go_on()
 
 
+def _failure(trainer: Trainer, error: BaseException) -> str | None:
+    """Why the run cannot go on, where a loss or the user's problem failed; `None` for any other ``error``."""
+    if isinstance(error, NonFiniteError):
+        trainer.stopped = NOT_FINITE
+        failure = f"Training stopped at step {trainer.step}, before the update: {error}"
+        if trainer.watch.best is None and BROKEN_PROBLEM not in failure:
+            raise InputError(failure) from None  # nobody knows how long it has diverged
+        return failure
+    told = blamed(error, type(trainer.problem))
+    if told is None:
+        return None
+    trainer.stopped = FAILED
+    return f"Training stopped at step {trainer.step}: {told}"
+
+
+@contextlib.contextmanager
+def _unless(failure: str | None, trainer: Trainer):
+    """What is done with a problem that failed before may fail again, and is then left out."""
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        told = blamed(error, type(trainer.problem))
+        if told is None or isinstance(error, StorageError):
+            raise
+        if failure is None:
+            raise told from None
+
+
 def _salvage(
     trainer: Trainer, settings: CertificateSettings, failure: str, monitor: Monitor
 ) -> tuple[Certificate, Fields]:
-    """What a run that cannot go on still gives; `InputError` when nothing."""
-    if trainer.watch.best is None:
+    """What a run that cannot go on still gives: the certificate of its best look made anew, or, where the problem fails there
+    as well, as it was seen then; without any look that of the fields as they are. `InputError` when nothing."""
+    best, seen = trainer.watch.best, trainer.watch.certificate
+    if best is None and trainer.step == 0:
         raise InputError(failure)
-    trainer.stopped, fields = NOT_FINITE, trainer.best_fields()
-    note = f"handed out are the averaged fields of step {trainer.watch.best.step}. {failure}"
+    fields = trainer.averaged_fields if best is None else trainer.best_fields()
+    step = trainer.step if best is None else best.step
+    notes = [f"handed out are the averaged fields of step {step}. {failure}"]
     monitor.stopped(trainer, failure, settings)
-    certificate = trainer.certify(settings, fields)
-    return with_warnings(trainer, certificate, [note]), fields
+    with _unless(failure, trainer):
+        return with_warnings(trainer, trainer.certify(settings, fields), notes), fields
+    if seen is None:
+        raise InputError(failure)
+    notes.append(
+        f"the numbers are those of the quick look at step {step}: the problem failed again when they were refined."
+    )
+    certificate = replace(seen, run=replace(trainer.run, step=step))
+    return replace(certificate, warnings=[*seen.warnings, *trainer.watch.notes, *notes]), fields
 
 
 def with_warnings(trainer: Trainer, certificate: Certificate, notes: list[str]) -> Certificate:

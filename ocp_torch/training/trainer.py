@@ -26,6 +26,7 @@ from ocp_torch.fields import Fields
 from ocp_torch.fields.fields import typical_sizes
 from ocp_torch.objectives import Objective
 from ocp_torch.problems import Problem
+from ocp_torch.problems.blame import blamed
 from ocp_torch.samplers import derive_seed
 from ocp_torch.steppers import NonFiniteError, Stepper
 from ocp_torch.training.batches import Batches
@@ -49,7 +50,8 @@ QUICK = CertificateSettings(
 SEARCHED = replace(QUICK, mollify=None)
 # Looks choose between fields; on a branch of states of their own they cannot flatter the certificate of their choice.
 LOOK_STREAM = 5
-STEPS, TARGET_GAP, MAX_SECONDS, NOT_FINITE = "steps", "target_gap", "max_seconds", "not_finite"
+STEPS, TARGET_GAP, MAX_SECONDS = "steps", "target_gap", "max_seconds"
+NOT_FINITE, FAILED = "not_finite", "failed"
 # After a certificate that did not reach the target gap, the next is tried this much further on.
 RETRY = 1.25
 
@@ -182,7 +184,7 @@ class Trainer:
         self._require_finite()
         certificate = self.look()
         monitor.evaluated(self, certificate)
-        best = self.watch.looked(Look.at(self.step, certificate), self.averaged_fields)
+        best = self.watch.looked(Look.at(self.step, certificate), self.averaged_fields, certificate)
         if certificate.contradiction is not None:
             for sentence in self.watch.contradicted(self.step, certificate.contradiction):
                 monitor.noticed(sentence)
@@ -288,6 +290,8 @@ class Trainer:
         except Exception as error:  # a crafted state raises whatever its odd part leads to
             if isinstance(error, InputError):
                 raise
+            if (told := blamed(error, type(self.problem))) is not None:
+                raise told from None
             reason = next(iter(str(error).splitlines()), "empty").rstrip(".")
             raise InputError(f"{checkpoint} does not fit this run ({type(error).__name__}: {reason}).") from None
 

@@ -61,21 +61,23 @@ class Look:
 
 
 class Watch:
-    """Follows a run. ``best`` is the best `Look` so far and ``fields`` the averaged fields it was of; ``notes`` are what a
-    user should be told of the run's health; ``unit`` is the size of the problem's costs."""
+    """Follows a run. ``best`` is the best `Look` so far, ``fields`` the averaged fields it was of and ``certificate`` what it
+    said (not kept in checkpoints); ``notes`` are what a user should be told of the run's health; ``unit`` is the size of the
+    problem's costs."""
 
     def __init__(self, unit: float) -> None:
         self.best: Look | None = None
         self.fields: dict | None = None
+        self.certificate: Certificate | None = None
         self.notes: list[str] = []
         self.warned = False  # that a look was hopeless
         self._unit, self._start = unit, {}
 
-    def looked(self, look: Look, fields: torch.nn.Module) -> bool:
+    def looked(self, look: Look, fields: torch.nn.Module, certificate: Certificate | None = None) -> bool:
         """Take note of a look at ``fields``; whether it is the best so far."""
         if not look.better_than(self.best):
             return False
-        self.best = look
+        self.best, self.certificate = look, certificate
         self.fields = {name: tensor.detach().clone() for name, tensor in fields.state_dict().items()}
         return True
 
@@ -109,7 +111,7 @@ class Watch:
         return {"best": best, "fields": self.fields, "start": dict(self._start), **told}
 
     def load_state_dict(self, state: dict) -> None:
-        self.best = Look(**state["best"]) if state["best"] else None
+        self.best, self.certificate = Look(**state["best"]) if state["best"] else None, None
         self.fields = copy.deepcopy(state["fields"])
         self.notes, self.warned = list(notes(state["notes"])), bool(state["warned"])
         self._start = dict(state["start"])

@@ -1,0 +1,140 @@
+"""Whose fault an exception is: what came out of a user's own code becomes one sentence with the place and the state."""
+
+from __future__ import annotations
+
+import sys
+import sysconfig
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+
+import torch
+from torch import Tensor
+
+from ocp_torch.errors import InputError, ProblemError
+from ocp_torch.problems.problem import Problem
+
+PACKAGE = Path(__file__).resolve().parent.parent
+# Not a user's code: this package, its scripts, Python's own library and what was installed beside it.
+LIBRARIES = tuple(
+    {str(PACKAGE), str(PACKAGE.parent / "scripts"), str(Path(torch.__file__).resolve().parent.parent)}
+    | {sysconfig.get_paths()[key] for key in ("stdlib", "platstdlib", "purelib", "platlib")}
+)
+# Coordinates of a state, and signs of a message, that a sentence shows.
+MOST_SHOWN, LONGEST = 8, 300
+
+
+def blamed(error: BaseException, of: type | None = None) -> ProblemError | None:
+    """The sentence on an ``error`` that came out of a user's code, or `None` for one that did not; ``of`` is the class of the
+    problem at hand, whose file is a user's wherever it lies."""
+    if isinstance(error, InputError):
+        return error if isinstance(error, ProblemError) else None
+    frames = _frames(error, of)
+    if not frames:
+        return None
+    outer = frames[0][0]
+    owner = outer.f_locals.get("self")
+    whose = f" of {named(owner)}" if isinstance(owner, Problem) else ""
+    return ProblemError(f"{outer.f_code.co_name}{whose} raised {words(error)}{_at(outer, owner)}{origin(error, of)}.")
+
+
+def origin(error: BaseException, of: type | None = None) -> str:
+    """`` (my_module.py, line 7)``: where in a user's code it was raised; nothing where in none."""
+    if isinstance(error, SyntaxError) and error.filename:
+        return f" ({_short(error.filename)}, line {error.lineno})"
+    frames = _frames(error, of)
+    return f" ({_short(frames[-1][0].f_code.co_filename)}, line {frames[-1][1]})" if frames else ""
+
+
+def _frames(error: BaseException, of: type | None) -> list[tuple[FrameType, int]]:
+    return [(f, line) for f, line in traceback.walk_tb(error.__traceback__) if _is_users(f.f_code.co_filename, of)]
+
+
+def in_their_words(action: Callable[[], object], who: str, of: type | None = None):
+    """What ``action``, which runs a user's code, gives; whatever that raises as one sentence, about ``who`` where the place
+    is not known."""
+    try:
+        return action()
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:  # whatever a stranger's code may raise
+        raise blamed(error, of) or ProblemError(f"{who} raised {words(error)}.") from None
+
+
+def named(problem: object) -> str:
+    """The class of ``problem`` as a command line names it."""
+    return f"{type(problem).__module__}.{type(problem).__qualname__}"
+
+
+def words(error: BaseException) -> str:
+    """The last line of its own traceback: kind and message, without line breaks and what a terminal would obey."""
+    text = " ".join(str(error).split()) if not isinstance(error, SyntaxError) else str(error.msg)
+    text = "".join(c if c.isprintable() else "?" for c in text).rstrip(".")
+    if len(text) > LONGEST:
+        text = f"{text[: LONGEST // 2]} .. {text[-LONGEST // 2 :]}"
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def place(x: Tensor) -> str:
+    """One state ``(d,)`` for a sentence."""
+    shown = ", ".join(f"{c:.9g}" for c in x[:MOST_SHOWN].tolist())
+    return f"x = [{shown}{', ..' if len(x) > MOST_SHOWN else ''}]"
+
+
+def failing_state(function: Callable[[Tensor], object], x: Tensor) -> Tensor | None:
+    """The one state of ``x`` ``(N, d)`` at which ``function`` raises; `None` where it raises at others as well, or at none of
+    them alone."""
+
+    def raises(rows: Tensor) -> bool:
+        try:
+            with torch.no_grad():
+                function(rows)
+        except (Exception, SystemExit):  # whatever a stranger's code may raise
+            return True
+        return False
+
+    every = x
+    while len(x) > 1:
+        half = x[: len(x) // 2]
+        x = half if raises(half) else x[len(x) // 2 :]
+    if not raises(x) or (len(every) > 1 and raises(every[-1:] if torch.equal(x, every[:1]) else every[:1])):
+        return None
+    return x[0]
+
+
+def _at(frame: FrameType, owner: object) -> str:
+    """`` at x = [..]`` where ``frame`` is a problem's function of a batch of states, and one of them is to blame."""
+    code = frame.f_code
+    function = getattr(owner, code.co_name, None) if isinstance(owner, Problem) else None
+    x = frame.f_locals.get(code.co_varnames[1]) if code.co_argcount == 2 else None
+    if not callable(function) or not isinstance(x, Tensor):
+        return ""
+    try:
+        state = failing_state(function, x.detach()) if x.ndim == 2 else None
+        return "" if state is None else f" at {place(state)}"
+    except Exception:  # a tensor of a transform that is over
+        return ""
+
+
+def _is_users(file: str, of: type | None) -> bool:
+    if file.startswith("<frozen"):
+        return False
+    path = str(Path(file).resolve()) if not file.startswith("<") else file
+    if not any(path.startswith(library) for library in LIBRARIES):
+        return True
+    return path in _files(of)
+
+
+def _files(of: type | None) -> set[str]:
+    """Where the classes that ``of`` is made of are written."""
+    modules = [sys.modules.get(c.__module__) for c in (of.__mro__ if of is not None else ())]
+    files = {str(Path(file).resolve()) for file in (getattr(m, "__file__", None) for m in modules) if file}
+    return {file for file in files if not file.startswith(str(PACKAGE))}
+
+
+def _short(file: str) -> str:
+    path = Path(file)
+    if file.startswith("<") or not path.is_absolute():
+        return file
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else file

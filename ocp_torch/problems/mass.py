@@ -1,0 +1,135 @@
+"""The mass of a density that may be very narrow: sampled evenly first, then where its mass was met."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ocp_torch.samplers import derive_seed, scrambled_sobol
+
+Density = Callable[[Tensor], Tensor]
+
+# Independent estimates, Student's quantile of their mean at the level 0.9999 (15 degrees of freedom), and the half-width that
+# needs no closer look.
+REPLICATES, QUANTILE, CLOSE = 16, 5.2391, 0.01
+# What quadrature and rounding may leave; a half-width relative to its value below which nothing narrow is left unmet.
+TOLERANCE, SETTLED = 1e-4, 0.5
+# Closer looks at most; peaks kept; steps of the climb to each; the part of the states that stays evenly spread.
+LOOKS, PEAKS, CLIMB, EVEN = 4, 8, 120, 0.3
+# Half-widths of a peak that are told apart: 2^-1 to 2^-NARROWEST.
+NARROWEST = 30
+MASS_STREAM = 12
+
+
+@dataclass(frozen=True)
+class Mass:
+    """An estimate and half of its interval; ``states`` is how many it took."""
+
+    value: float
+    half: float
+    states: int
+
+    @property
+    def wrong(self) -> bool:
+        """Whether it is certainly not 1. What was not met can only add mass: a value below 1 must be a settled one."""
+        settled = self.half <= SETTLED * self.value
+        return self.value - self.half > 1.0 + TOLERANCE or (settled and self.value + self.half < 1.0 - TOLERANCE)
+
+    @property
+    def right(self) -> bool:
+        """Whether it is 1 as closely as needs be."""
+        return self.half <= CLOSE and abs(self.value - 1.0) <= self.half + TOLERANCE
+
+    @property
+    def sentence(self) -> str:
+        if self.value == 0.0:
+            return f"is 0 at all of {self.states:,} states"
+        return f"integrates to {self.value:.4g} (+- {self.half:.1g}, from {self.states:,} states)"
+
+
+def sampled_mass(density: Density, dim: int, count: int) -> Mass:
+    """The integral of ``density`` ``(N, d) -> (N,)`` over the torus, from ``REPLICATES * count`` evenly spread states, and
+    from as many near its peaks, again and again, where these do not settle it."""
+    sets = [scrambled_sobol(count, dim, derive_seed(MASS_STREAM, r), torch.float64) for r in range(REPLICATES)]
+    x = torch.cat(sets)
+    share = density(x)  # of the mass, times the number of states
+    found, states = _mass(share, count), len(x)
+    peaks = torch.empty(0, dim, dtype=torch.float64)
+    widths, heights = peaks, torch.empty(0, dtype=torch.float64)
+    for look in range(LOOKS):
+        if found.right:
+            break
+        top, top_widths, top_heights, used = _peaks(density, x, share)
+        peaks, widths, heights = (torch.cat(p) for p in ((peaks, top), (widths, top_widths), (heights, top_heights)))
+        peaks, widths, heights = _distinct(peaks, widths, heights)
+        generator = torch.Generator().manual_seed(derive_seed(MASS_STREAM, look, REPLICATES))
+        x = _drawn(peaks, widths, REPLICATES * count, generator)
+        share = density(x) / _density(x, peaks, widths)
+        states += used + len(x)
+        found = Mass(**{**vars(_mass(share, count)), "states": states})
+    return found
+
+
+def _mass(share: Tensor, count: int) -> Mass:
+    means = share.reshape(REPLICATES, count).mean(dim=1)
+    se = float(means.std()) / math.sqrt(REPLICATES)
+    return Mass(float(means.mean()), QUANTILE * se, len(share))
+
+
+def _peaks(density: Density, x: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
+    """Peaks climbed to from the states with the largest ``share``, their half-widths along each coordinate, their heights,
+    and how many states that took."""
+    at = x[share.topk(PEAKS).indices].clone()
+    height, step = density(at), torch.full((PEAKS, 1), 0.05, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(CLIMB):
+        there = (at + step * torch.randn(at.shape, dtype=torch.float64, generator=generator)).remainder(1.0)
+        reached = density(there)
+        better = (reached > height).unsqueeze(-1)
+        at, height = torch.where(better, there, at), torch.maximum(height, reached)
+        step = (step * torch.where(better, 2.0, 0.8)).clamp(1e-9, 0.3)
+    distances = 2.0 ** -torch.arange(1, NARROWEST + 1, dtype=torch.float64)
+    widths = torch.full_like(at, 1.0)
+    for i in range(at.shape[1]):
+        moved = at.repeat(2 * NARROWEST, 1, 1)  # (2 NARROWEST, PEAKS, d)
+        moved[:, :, i] += torch.cat([distances, -distances]).unsqueeze(-1)
+        half = density(moved.flatten(0, 1)).reshape(2, NARROWEST, PEAKS) < 0.5 * height
+        nearest = torch.where(half, distances.view(1, -1, 1), 1.0).amin(dim=1)  # (2, PEAKS), on either side
+        widths[:, i] = nearest.amax(dim=0)
+    return at, widths, height, PEAKS * (1 + CLIMB + 2 * NARROWEST * at.shape[1])
+
+
+def _distinct(peaks: Tensor, widths: Tensor, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The highest of them, one of each that lie within a width of one another."""
+    kept: list[int] = []
+    for k in heights.argsort(descending=True).tolist():
+        away = lambda j, k=k: ((peaks[j] - peaks[k] + 0.5).remainder(1.0) - 0.5).abs() > widths[j]
+        if all(bool(away(j).any()) for j in kept):
+            kept.append(k)
+    kept = kept[:PEAKS]
+    return peaks[kept], widths[kept], heights[kept]
+
+
+def _drawn(peaks: Tensor, widths: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """States of the mixture `_density`: even ones, and around each peak wrapped Cauchy ones, coordinate by coordinate."""
+    draw = lambda *shape: torch.rand(*shape, dtype=torch.float64, generator=generator)
+    which = torch.randint(len(peaks), (count,), generator=generator)
+    even = draw(count, peaks.shape[1])
+    offset = widths[which] * torch.tan(math.pi * (draw(count, peaks.shape[1]) - 0.5))
+    near = torch.where(widths[which] >= 0.5, even, (peaks[which] + offset).remainder(1.0))
+    return torch.where(draw(count, 1) < EVEN, even, near)
+
+
+def _density(x: Tensor, peaks: Tensor, widths: Tensor) -> Tensor:
+    """Of the mixture, ``(N,)``: sinh g / (cosh g - cos 2 pi t) with g = 2 pi width is the wrapped Cauchy density."""
+    total = torch.zeros_like(x[:, 0])
+    for peak, width in zip(peaks, widths, strict=True):
+        g = 2.0 * math.pi * width
+        # cosh g - cos 2 pi t as a sum of squares, which does not cancel where both are small.
+        gap = 2.0 * ((0.5 * g).sinh().square() + (math.pi * (x - peak)).sin().square())
+        total += torch.where(width >= 0.5, 1.0, g.sinh() / gap).prod(dim=-1)
+    return EVEN + (1.0 - EVEN) * total / len(peaks)
