@@ -35,7 +35,7 @@ MODULE = """
                 raise RuntimeError("licence expired\\nask your admin")
             if self.how == "somewhere" and (x[:, 0] > 0.9).any():
                 raise ValueError("no such state")
-            return torch.where(x[:, 0] > 0.9, math.nan, f) if self.how == "nan" else f
+            return torch.where(x[:, 0] > 0.9, math.nan, f) if self.how == "holes" else f
 
     class Wide(Problem):
         # The same problem in other units: cost times 4^-k, controls in units 2^k times as small.

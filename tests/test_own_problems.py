@@ -162,7 +162,7 @@ def test_a_run_goes_on_with_the_arguments_it_has(finished, module):
         ("always", r"state_cost of own.*Ageing raised RuntimeError: licence expired ask your admin (own", "failed"),
         ("somewhere", "raised ValueError: no such state at x = [0.9", "failed"),
         (
-            "nan",
+            "holes",
             "where the state cost of the problem is not finite; it must be finite on the whole torus",
             "not_finite",
         ),
@@ -171,15 +171,15 @@ def test_a_run_goes_on_with_the_arguments_it_has(finished, module):
 def test_a_problem_that_fails_late_leaves_a_sentence_and_the_best_look(how, words, stopped, module):
     folder, name = module
     run = folder / f"late_{how}"
-    mine = (f"problem._target_={name}.Ageing", f"problem.how={how}", "problem.calls=1500", f"hydra.run.dir={run}")
-    ended = train(*SMALL, *mine, "trainer.steps=900", "trainer.evaluate_every=10", cwd=folder)
+    mine = (f"problem._target_={name}.Ageing", f"problem.how={how}", "problem.calls=2500", f"hydra.run.dir={run}")
+    ended = train(*SMALL, *mine, "trainer.steps=400", "trainer.evaluate_every=20", cwd=folder)
     assert ended.status == 2
     for word in words.split("own.*"):
         assert word.replace("(own", "(own_") in ended.sentence
     assert "Training stopped at step" in ended.sentence
     certificate = json.loads((run / "certificate.json").read_text())
     assert certificate["stopped"] == stopped
-    assert certificate["step"] % 10 == 0 < certificate["step"]
+    assert certificate["step"] % 20 == 0 < certificate["step"]
     assert any("Training stopped" in w for w in certificate["warnings"])
     assert (run / "controller.safetensors").exists()
 
@@ -188,7 +188,7 @@ def test_a_problem_that_fails_in_another_script_ends_in_one_sentence(module):
     folder, name = module
     mine = (f"problem._target_={name}.Ageing", "problem.how=always")
     for script, more in (("record", ("out=x.npz", "samples=100000")), ("reference", ("side=128",))):
-        said = command(script, *mine, "problem.calls=300", *more, cwd=folder).sentence
+        said = command(script, *mine, "problem.calls=75", *more, cwd=folder).sentence
         assert "raised RuntimeError: licence expired" in said
     assert not (folder / "x.npz").exists()
 
@@ -201,12 +201,11 @@ def test_training_is_the_same_in_other_units(method, module):
         own = (f"problem._target_={module[1]}.Wide", f"problem.k={k}", f"method={method}", "trainer.steps=12")
         trainer = build_trainer(composed("train", [*SMALL, *own]))
         trainer.fit(Silent())
-        return trainer.averaged_fields.state_dict()
+        return dict(trainer.averaged_fields.named_parameters())
 
     plain, wide = weights(0), weights(20)
     for name, tensor in plain.items():
-        if not name.endswith("scale"):
-            torch.testing.assert_close(wide[name], tensor, rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(wide[name], tensor, rtol=1e-3, atol=1e-4)
 
 
 def test_the_performance_in_a_comparison_is_that_of_the_certified_controller():
