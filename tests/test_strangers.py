@@ -356,6 +356,31 @@ def test_the_refusal_of_a_pickle_does_not_say_how_to_run_it(run):
         assert "never run" in sentence
 
 
+PICKLES = {
+    "an allocation": b"\x80\x02cbuiltins\nbytearray\n\x8a\x05\x00\x00\x00\x00\x01\x85R.",
+    "an allocation, by its old name": b"\x80\x02c__builtin__\nbytearray\n\x8a\x05\x00\x00\x00\x00\x01\x85R.",
+    "a tensor made anew": b"\x80\x02ctorch\nFloatTensor\n\x8a\x05\x00\x00\x00\x00\x01\x85R.",
+    "a name from the stack": b"\x80\x04\x8c\x02os\x8c\x06system\x93.",
+    "millions of lists": b"\x80\x02(" + b"]" * 4_000_000 + b"l.",
+    "more": b"\x80\x02(" + b"]" * 30_000_000 + b"l.",
+    "a million groups": b"\x80\x02(" + b"}K\x01K\x01s" * 500_000 + b"l.",
+    "a long number": b"\x80\x02\x8b\x00\x00\x10\x00" + b"\x7f" * 2**20 + b".",
+    "deep": b"\x80\x02" + b"(" * 500_000 + b"l" * 500_000 + b".",
+}
+
+
+@pytest.mark.parametrize("name", ["data.pkl", "DATA.PKL"])
+@pytest.mark.parametrize("what", PICKLES)
+def test_a_crafted_list_of_parts_makes_little(what, name, run):
+    path, packed = run / "checkpoints" / "last.pt", io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr(f"archive/{name}", PICKLES[what])
+        for part, text in (("version", b"3\n"), ("byteorder", b"little"), (".format_version", b"1")):
+            archive.writestr(f"archive/{part}", text)
+    seal(path, packed.getvalue())
+    assert "not a readable checkpoint" in refusal(lambda: load_checkpoint(path))
+
+
 def test_a_checkpoint_of_a_million_parts_is_not_listed(run):
     path, packed = run / "checkpoints" / "last.pt", io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
