@@ -608,6 +608,16 @@ def test_a_graph_of_flags_is_read_as_before(tmp_path):
     assert Kuramoto(oscillators=3, graph=str(tmp_path / "a.npy")).graph == (1.0 - np.eye(3)).tolist()
 
 
+def test_a_header_of_very_many_tensors_is_not_believed(run):
+    path = run / "controller.safetensors"
+    many = {f"t{k}": {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]} for k in range(60_000)}
+    header = json.dumps(many).encode()
+    path.write_bytes(struct.pack("<Q", len(header)) + header)
+    assert "60,000 tensors" in refusal(lambda: load_controller(path))
+    path.write_bytes(struct.pack("<Q", 2**24 + 1) + bytes(2**10))
+    assert "header" in refusal(lambda: load_controller(path), megabytes=50)
+
+
 def test_text_for_a_graph_is_no_larger_than_the_graph(tmp_path):
     (tmp_path / "a.txt").write_text("1 " * 10**7)
     assert "bytes" in refusal(lambda: Kuramoto(oscillators=4, graph=str(tmp_path / "a.txt")), megabytes=50)

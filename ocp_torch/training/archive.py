@@ -14,7 +14,8 @@ from typing import BinaryIO
 import torch
 from torch import Tensor
 
-from ocp_torch.reading import require_plain, zip_file
+from ocp_torch.plain import require_plain
+from ocp_torch.reading import zip_file
 
 # Of the list of an archive's parts: bytes and instructions at most; a thousand times what a run's has.
 LARGEST_LIST, MOST_INSTRUCTIONS = 2**22, 2**20
