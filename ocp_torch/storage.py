@@ -18,11 +18,12 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from ocp_torch.errors import InputError, StorageError
-from ocp_torch.reading import LARGEST_FILE, LARGEST_JSON, NotPlain, json_object, kind, opened
+from ocp_torch.plain import NotPlain, json_object
+from ocp_torch.reading import LARGEST_FILE, kind, opened
 
 METADATA_KEY, DIGEST_KEY = "ocp_torch", "sha256"
 # More than the header of any controller or recording has, in bytes, and more tensors than a network has.
-LARGEST_HEADER, MOST_TENSORS = LARGEST_JSON, 2**14
+LARGEST_HEADER, MOST_TENSORS = 2**24, 2**14
 
 
 def write_atomically(path: Path, write: Callable[[Path], None], make_room: Callable[[], None] | None = None) -> None:

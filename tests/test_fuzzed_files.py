@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 
 from ocp_torch.controller import load_controller
 from ocp_torch.errors import InputError
+from ocp_torch.plain import NotPlain, json_object, looked_up, require_plain, yaml_mapping
 from ocp_torch.problems import Kuramoto
-from ocp_torch.reading import NotPlain, json_object, looked_up, read_json, require_plain, yaml_mapping
+from ocp_torch.reading import read_json
 from ocp_torch.recording import read
 from ocp_torch.storage import load_tensors, save_tensors
 from ocp_torch.training.checkpoint import load_checkpoint
@@ -194,6 +195,7 @@ def odd_places(data, chance, count):
     return [(chance.choice(everywhere), chance.choice(ODD)) for _ in range(count)]
 
 
+@pytest.mark.slow
 def test_any_field_of_a_controller_replaced_by_anything_is_taken_or_refused(run, tmp_path):
     path, chance = tmp_path / "controller.safetensors", random.Random(2)
     tensors, good = load_tensors(run / "controller.safetensors")
@@ -226,6 +228,7 @@ def test_any_field_of_a_certificate_replaced_by_anything_is_shown_or_named(run, 
         result_of(folder, {"ended": True, "config": 1, "step": good["step"]}, 1)
 
 
+@pytest.mark.slow
 def test_any_entry_of_a_checkpoint_replaced_by_anything_is_refused_or_goes_on(run, tmp_path):
     from ocp_torch.composition import composed
     from ocp_torch.training.start import prepare

@@ -356,6 +356,31 @@ def test_the_refusal_of_a_pickle_does_not_say_how_to_run_it(run):
         assert "never run" in sentence
 
 
+PICKLES = {
+    "an allocation": b"\x80\x02cbuiltins\nbytearray\n\x8a\x05\x00\x00\x00\x00\x01\x85R.",
+    "an allocation, by its old name": b"\x80\x02c__builtin__\nbytearray\n\x8a\x05\x00\x00\x00\x00\x01\x85R.",
+    "a tensor made anew": b"\x80\x02ctorch\nFloatTensor\n\x8a\x05\x00\x00\x00\x00\x01\x85R.",
+    "a name from the stack": b"\x80\x04\x8c\x02os\x8c\x06system\x93.",
+    "millions of lists": b"\x80\x02(" + b"]" * 4_000_000 + b"l.",
+    "more": b"\x80\x02(" + b"]" * 30_000_000 + b"l.",
+    "a million groups": b"\x80\x02(" + b"}K\x01K\x01s" * 500_000 + b"l.",
+    "a long number": b"\x80\x02\x8b\x00\x00\x10\x00" + b"\x7f" * 2**20 + b".",
+    "deep": b"\x80\x02" + b"(" * 500_000 + b"l" * 500_000 + b".",
+}
+
+
+@pytest.mark.parametrize("name", ["data.pkl", "DATA.PKL"])
+@pytest.mark.parametrize("what", PICKLES)
+def test_a_crafted_list_of_parts_makes_little(what, name, run):
+    path, packed = run / "checkpoints" / "last.pt", io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr(f"archive/{name}", PICKLES[what])
+        for part, text in (("version", b"3\n"), ("byteorder", b"little"), (".format_version", b"1")):
+            archive.writestr(f"archive/{part}", text)
+    seal(path, packed.getvalue())
+    assert "not a readable checkpoint" in refusal(lambda: load_checkpoint(path))
+
+
 def test_a_checkpoint_of_a_million_parts_is_not_listed(run):
     path, packed = run / "checkpoints" / "last.pt", io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
@@ -581,6 +606,16 @@ def test_constant_parts_of_a_recording_are_no_bomb(tmp_path):
 def test_a_graph_of_flags_is_read_as_before(tmp_path):
     np.save(tmp_path / "a.npy", ~np.eye(3, dtype=bool))
     assert Kuramoto(oscillators=3, graph=str(tmp_path / "a.npy")).graph == (1.0 - np.eye(3)).tolist()
+
+
+def test_a_header_of_very_many_tensors_is_not_believed(run):
+    path = run / "controller.safetensors"
+    many = {f"t{k}": {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]} for k in range(60_000)}
+    header = json.dumps(many).encode()
+    path.write_bytes(struct.pack("<Q", len(header)) + header)
+    assert "60,000 tensors" in refusal(lambda: load_controller(path))
+    path.write_bytes(struct.pack("<Q", 2**24 + 1) + bytes(2**10))
+    assert "header" in refusal(lambda: load_controller(path), megabytes=50)
 
 
 def test_text_for_a_graph_is_no_larger_than_the_graph(tmp_path):

@@ -5,29 +5,23 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-import math
 import os
 import pickle
-import zipfile
-from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
 
 import torch
-from torch import Tensor
 
 from ocp_torch.errors import InputError, StorageError
-from ocp_torch.reading import LARGEST_FILE, kind, opened, require_plain, zip_file
+from ocp_torch.reading import LARGEST_FILE, kind, opened
 from ocp_torch.storage import write_atomically
+from ocp_torch.training.archive import After, unpacked
 
 SCHEMA = 2
 # The file is one line, this word with the schema and a digest, and then what torch.save wrote.
 MAGIC = "ocp_torch-checkpoint"
 LAST, BEST = "last.pt", "best.pt"
-# Bytes of that first line, and of what lists the parts of the rest, at most; how often a number may be seen by tensors.
-LONGEST_HEADER, LARGEST_PICKLE, SHARED = 256, 2**23, 4
-# Bytes that are read at once for the digest.
-PIECE = 2**22
+# Bytes of that first line at most, and how many are read at once for the digest.
+LONGEST_HEADER, PIECE = 256, 2**22
 
 
 def save_checkpoint(path: Path, state: dict, keep: int = 1) -> None:
@@ -81,12 +75,8 @@ def load_checkpoint(path: Path) -> dict:
             sha.update(piece)
         if sha.hexdigest() != words[2]:
             raise InputError(f"{path} is damaged: its contents do not match the digest it carries.")
-        content = _After(file, len(header))
         try:
-            _require_stored(content)
-            state = torch.load(content, map_location="cpu", weights_only=True)
-            require_plain(state, tensors=True)
-            _require_whole(state, content.size)
+            return unpacked(After(file, len(header)))
         except pickle.UnpicklingError:  # PyTorch's own words tell how to run what the file holds
             raise InputError(
                 f"{path} is not a readable checkpoint: it holds more than numbers, words and tensors, which is never run."
@@ -94,7 +84,6 @@ def load_checkpoint(path: Path) -> dict:
         except Exception as error:  # a crafted archive raises whatever its odd part leads to
             reason = next(iter(str(error).splitlines()), "empty").rstrip(".")
             raise InputError(f"{path} is not a readable checkpoint ({type(error).__name__}: {reason}).") from None
-    return state
 
 
 def newest(folder: Path) -> tuple[dict, Path, list[str]]:
@@ -118,62 +107,3 @@ def newest(folder: Path) -> tuple[dict, Path, list[str]]:
 def _age(path: Path) -> int:
     suffix = path.stem.removeprefix("last").removeprefix("-")
     return int(suffix) if suffix.isdecimal() else 0
-
-
-class _After:
-    """What follows the first ``start`` bytes of an open file, as a file of its own: only what is asked for is in memory."""
-
-    def __init__(self, file: BinaryIO, start: int) -> None:
-        self.file, self.start = file, start
-        self.size = file.seek(0, os.SEEK_END) - start
-        self.seek(0)
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        return self.file.seek(offset + self.start if whence == os.SEEK_SET else offset, whence) - self.start
-
-    def tell(self) -> int:
-        return self.file.tell() - self.start
-
-    def read(self, count: int = -1) -> bytes:
-        return self.file.read(count)
-
-    def readinto(self, buffer) -> int:
-        return self.file.readinto(buffer)
-
-    def seekable(self) -> bool:
-        return True
-
-
-def _require_stored(content: _After) -> None:
-    """A crafted archive could unpack to any size; `torch.save` never compresses. And it is a list of few parts, of which
-    the one that describes the others is small."""
-    with zip_file(content) as archive:
-        entries = archive.infolist()
-    if any(e.compress_type != zipfile.ZIP_STORED for e in entries) or sum(e.file_size for e in entries) > content.size:
-        raise ValueError("its parts are compressed")
-    if any(e.filename.endswith(".pkl") and e.file_size > LARGEST_PICKLE for e in entries):
-        raise ValueError("the list of its parts is too long")
-    content.seek(0)
-
-
-def _require_whole(state: object, size: int) -> None:
-    """Every tensor of a plain ``state`` holds as many numbers as it claims, none a small storage seen as a huge one; all of
-    them together are hardly more than the ``size`` bytes of the file; and they are real."""
-    claimed = 0
-    for tensor in _tensors(state):
-        own = math.prod(tensor.shape) * tensor.element_size()
-        if tensor.layout != torch.strided or tensor.device.type != "cpu" or tensor.is_quantized or tensor.is_complex():
-            raise ValueError(f"a tensor of shape {tuple(tensor.shape)} is of no kind that a run has")
-        if own > tensor.untyped_storage().nbytes():
-            raise ValueError(f"a tensor of shape {tuple(tensor.shape)} is not all there")
-        claimed += own
-    if claimed > SHARED * size:
-        raise ValueError("its tensors are one and the same many times over")
-
-
-def _tensors(state: object) -> Iterator[Tensor]:
-    if isinstance(state, Tensor):
-        yield state
-    elif isinstance(state, dict | list | tuple):
-        for value in state.values() if isinstance(state, dict) else state:
-            yield from _tensors(value)
