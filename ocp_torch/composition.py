@@ -131,9 +131,12 @@ def _composed(config_name: str, overrides: list[str], whole: bool = True) -> dic
 
 def require_places(overrides: list[str]) -> None:
     """Raise `InputError` where a field or a group of ours is left out: defaults stand in the configuration alone. A class of
-    a user's own may do without some of the problem's."""
+    a user's own may do without some of the problem's, or all."""
+    own = any(o.lstrip("+").startswith("problem._target_=") for o in overrides)
     for override in parsed(overrides):
         name = override.key_or_group
+        if own and name == "problem":
+            continue
         if override.is_delete() and not name.startswith(("hydra", "problem.", "experiment")):
             raise InputError(f"~{name} leaves out {name}, which is needed; set it to another value instead.")
 
