@@ -57,7 +57,7 @@ def _kept(problem: Problem, name: str, fit) -> Mixture:
 
 
 def _fitted_starts(problem: Problem) -> Mixture:
-    if type(problem).initial_density is Problem.initial_density:
+    if getattr(problem.initial_density, "__func__", None) is Problem.initial_density:
         return Mixture.uniform(problem.dim)
     return fitted_mixture(problem.initial_density, problem.dim).scaled(1.0 - UNIFORM_STARTS)
 
