@@ -83,7 +83,7 @@ def inside(x, width):
 
 
 UNSOUND = {
-    "half of it": (2, lambda x: 0.5 * gaussian(x, [0.2, 0.7], 0.004), "integrates to 0.5"),
+    "half of it": (2, lambda x: 0.5 * gaussian(x, [0.2, 0.7], 0.004), "integrates to 0."),
     "never met": (3, lambda x: inside(x, 1e-4) * 1e12, "integrates to 0 "),
     "a part is never met": (3, lambda x: 0.7 + 0.3e12 * inside(x, 1e-4), "integrates to 0.7"),
 }

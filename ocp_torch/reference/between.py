@@ -22,6 +22,8 @@ ASCENTS, STEPS = 32, 60
 UNSEEN = 0.02
 # Oscillations below that part of the largest value are rounding.
 FLAT = 1e-9
+# What the nodes around differ by shows a kink; its tip is within that part of it.
+KINK = 0.5
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def _unseen(
     relative to its oscillation, and absolutely; the state, and ``name``.
 
     A smooth function rises above its nodes by `O(h^2)` but hardly above the interpolation; beside a jump or a kink the
-    interpolation is far off but the nodes are not.
+    interpolation is far off but the nodes are not, nor by more than they differ themselves.
     """
     values = torch.cat([function(part) for part in grid.nodes().split(PIECE)])
     sampled = torch.cat([function(part) for part in x.split(PIECE)])
@@ -79,7 +81,8 @@ def _unseen(
     def excess(x: Tensor) -> Tensor:
         here, stencil = function(x), grid.stencil(x)
         around = values[stencil.index]  # (N, 4^d, k)
-        above = sign * here - (sign * around).amax(dim=1)
+        highest, lowest = (sign * around).amax(dim=1), (sign * around).amin(dim=1)
+        above = sign * here - highest - KINK * (highest - lowest)
         beside = sign * (here - (stencil.cubic.unsqueeze(-1) * around).sum(dim=1))
         return (torch.minimum(above, beside).clamp_min(0.0) / size).amax(dim=-1)
 
