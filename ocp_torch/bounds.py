@@ -12,6 +12,7 @@ from ocp_torch.extremum import supremum
 from ocp_torch.needs import GIVEN, GUESSED, SEARCHED
 from ocp_torch.problems.blame import place
 from ocp_torch.problems.problem import MARGIN, Problem
+from ocp_torch.starts import drawn_starts, starts_narrowly
 
 # Without any knowledge of mu*, M is this multiple of sup mu0 on recorded data, where there is no bound without M.
 OCCUPATION_GUESS = 4.0
@@ -136,6 +137,8 @@ def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
 def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
     (mu0,) = problem.survey(SURVEYED, 1, "mu0")
     guess = OCCUPATION_WEIGHT if is_unbounded(problem) else OCCUPATION_GUESS
+    if problem.evaluable and starts_narrowly(problem):
+        mu0 = problem.initial_density(drawn_starts(problem, SEARCHED // 32, 1))
     return guess * float(mu0.max()), f"a guess to train with, {guess:g} times sup mu0"
 
 

@@ -14,7 +14,7 @@ from ocp_torch.bounds import resolve_bounds
 from ocp_torch.errors import InputError, require_choice, require_number
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samplers import derive_seed
-from ocp_torch.starts import drawn_starts, start_law
+from ocp_torch.starts import drawn_starts, starts_narrowly
 
 # Branch of the seed tree for initial states of episodes, beside those of training.
 EPISODE_STREAM = 4
@@ -85,7 +85,7 @@ def _environment_class() -> type:
             self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (problem.control_dim,), np.float32)
             self.generator = torch.Generator().manual_seed(derive_seed(seed, EPISODE_STREAM))
             candidates = torch.rand(4096, problem.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-            narrow = not start_law(problem).is_uniform
+            narrow = starts_narrowly(problem)
             self._drawn = drawn_starts(problem, DRAWN_STARTS, derive_seed(seed, EPISODE_STREAM)) if narrow else None
             self._ceiling = 1.05 * float(problem.initial_density(candidates).max())
             self._weight = -math.expm1(-problem.discount * time_step)

@@ -22,7 +22,7 @@ IMAGES, WRAPPED, WIDEST = 3, 0.06, 0.5
 # A fitted standard deviation above this (that of the uniform law is 0.289) stands for uniform.
 SPREAD = 0.22
 # States the function is looked at, ascents from the highest of them, and states of each round of fitting.
-SCANNED, ASCENTS, ASCENT_STEPS, ROUND = 2**14, 16, 80, 4096
+SCANNED, ASCENTS, ASCENT_STEPS, ROUND = 2**16, 16, 80, 4096
 # A function whose uniform states are worth at least that part of their number needs no other states.
 BROAD = 0.5
 # A supremum climbed to that many times above the largest scanned value shows a feature that the scan missed.
@@ -31,6 +31,8 @@ MISSED = 4.0
 COMPONENTS, ROUNDS, STEPS, WORTH = 12, 16, 12, 0.4
 # Worth each tempered round keeps; standard deviations around a climbed maximum to begin with.
 KEPT, SCALES = 0.1, tuple(0.1 * 10.0 ** (-0.5 * k) for k in range(9))
+# The heaviest states are fitted to, at most so many.
+MOST = 2**13
 # Part of each component that is drawn so many times wider, for tails that are no normal law's.
 TAIL_PART, TAIL_WIDTH = 0.25, 2.5
 
@@ -81,32 +83,31 @@ class Mixture:
                 )
         return others * exponent.exp() / (math.sqrt(2.0 * math.pi) * self.widths).prod(dim=1)
 
-    def density(self, x: Tensor, shares: Tensor | None = None) -> Tensor:
-        """The whole density ``(N,)``, strictly positive; with other ``shares`` if given."""
-        shares = self.shares if shares is None else shares
-        pieces = [1.0 - shares.sum() + self.components(part) @ shares for part in x.split(2**13)]
-        return torch.cat(pieces) if pieces else x[:, 0]
+    def density(self, x: Tensor) -> Tensor:
+        """The whole density ``(N,)``, strictly positive."""
+        return batched(lambda part: 1.0 - self.shares.sum() + self.components(part) @ self.shares, x, 2**13)
 
     def draw(self, count: int, replicate: int, seed: int, extra: int = 0) -> tuple[Tensor, Tensor]:
         """``count`` points ``(count, d + extra)``, ``extra`` coordinates uniform, and one over their density ``(count,)``.
 
-        Each component has a point set of its own, of a size in proportion to its share and at least one uniform; the density
-        is that of the sizes. Uniform, these are `evaluation_points`; else their order is random, and a part of them will do.
+        Each component has a point set of its own, whose size is its share of ``count`` rounded up or down by chance. Uniform,
+        these are `evaluation_points`; else their order is random, and a part of them will do.
         """
         if self.is_uniform:
             points = evaluation_points(count, self.dim + extra, replicate, seed)
             return points, torch.ones_like(points[:, 0])
-        ends = (self.shares.cumsum(0) * count + 0.5).floor().clamp_max(count - 1).long()
+        generator = torch.Generator().manual_seed(derive_seed(seed, COMPONENTS, replicate))
+        ends = (self.shares.cumsum(0) * count + torch.rand((), generator=generator)).floor().clamp_max(count).long()
         sizes = ends.diff(prepend=torch.zeros(1, dtype=torch.long))
-        pieces = [evaluation_points(count - int(ends[-1]), self.dim + extra, replicate, seed)]
+        rest = count - int(ends[-1])
+        pieces = [evaluation_points(rest, self.dim + extra, replicate, seed)] if rest else []
         for k in sizes.nonzero().squeeze(-1).tolist():
             points = evaluation_points(int(sizes[k]), self.dim + extra, replicate, derive_seed(seed, COMPONENTS, k))
             normal = torch.special.ndtri(points[:, : self.dim].clamp(2.0**-53, 1.0 - 2.0**-53))
             points[:, : self.dim] = (self.centres[k] + self.widths[k] * normal).remainder(1.0)
             pieces.append(points)
-        order = torch.randperm(count, generator=torch.Generator().manual_seed(derive_seed(seed, COMPONENTS, replicate)))
-        points = torch.cat(pieces)[order]
-        return points, 1.0 / self.density(points[:, : self.dim], sizes.to(points) / count)
+        points = torch.cat(pieces)[torch.randperm(count, generator=generator)]
+        return points, 1.0 / self.density(points[:, : self.dim])
 
 
 def worth(weights: Tensor) -> float:
@@ -152,6 +153,12 @@ def fitted_mixture(
     return _with_tails(mixture)
 
 
+def concentrated(x: Tensor, values: Tensor, density: Tensor) -> Mixture:
+    """Components fitted to states ``(N, d)`` of a known ``density``, each with a part of the whole in proportion to
+    ``values`` ``(N,)``."""
+    return _with_tails(_maximised(x, values / values.max().clamp_min(1e-300), density))
+
+
 def _tempered(level: Tensor, density: Tensor, power: float) -> tuple[float, Tensor]:
     """The next power of the function, whose logarithm is ``level``, and the weights of its states for it."""
 
@@ -181,7 +188,8 @@ def _maximised(x: Tensor, weights: Tensor, density: Tensor) -> Mixture:
     states are, which no component is narrower than."""
     dim = x.shape[1]
     spacing = (len(x) * density) ** (-1.0 / dim)
-    used = weights > 1e-12 * weights.max()
+    used = weights.topk(min(MOST, len(weights))).indices
+    used = used[weights[used] > 1e-12 * weights.max()]
     x, weights, spacing = x[used], weights[used] / weights[used].sum(), spacing[used]
     generator = torch.Generator().manual_seed(0)
     start = torch.multinomial(weights, COMPONENTS, replacement=True, generator=generator)

@@ -16,6 +16,8 @@ from ocp_torch.samplers import derive_seed
 # Parts that stay uniform: of starts, for mass that the search missed; and of the states of bounds, most of whose integrands
 # are large elsewhere too.
 UNIFORM_STARTS, UNIFORM_STATES = 0.125, 0.5
+# Part of the starts that is near spikes of `f`, which others meet by chance.
+SPIKE_STARTS = 0.125
 # A state cost whose uniform states are worth that part of their number leaves them alone.
 BROAD_COST = 0.05
 # Candidates for each start that is to carry as much mass as all others.
@@ -23,13 +25,24 @@ CANDIDATES = 16
 
 
 def start_law(problem: Problem) -> Mixture:
-    """The density starts are drawn from: near `mu0`, and uniform where `mu0` is broad. Found once for a problem."""
-    return _kept(problem, "_start_law", _fitted_starts)
+    """The density starts are drawn from: near `mu0` and spikes of `f`, and uniform where both are broad."""
+    density, cost = _fits(problem)
+    if density.is_uniform:
+        return cost.scaled(SPIKE_STARTS)
+    spikes = [] if cost.is_uniform else [cost.scaled(SPIKE_STARTS)]
+    return Mixture.join([density.scaled(1.0 - UNIFORM_STARTS - SPIKE_STARTS * len(spikes)), *spikes])
 
 
 def evaluation_law(problem: Problem) -> Mixture:
     """The density states are drawn from at which bounds are evaluated; uniform where neither `mu0` nor `f` is narrow."""
-    return _kept(problem, "_evaluation_law", _fitted_states)
+    laws = [law for law in _fits(problem) if not law.is_uniform]
+    part = (1.0 - UNIFORM_STATES) / max(1, len(laws))
+    return Mixture.uniform(problem.dim) if not laws else Mixture.join([law.scaled(part) for law in laws])
+
+
+def starts_narrowly(problem: Problem) -> bool:
+    """Whether hardly any uniform state carries mass of `mu0`."""
+    return not _fits(problem)[0].is_uniform
 
 
 @torch.no_grad()
@@ -49,21 +62,11 @@ def drawn_starts(problem: Problem, count: int, seed: int) -> Tensor:
     return x[torch.multinomial(weight, count, replacement=True, generator=generator)]
 
 
-def _kept(problem: Problem, name: str, fit) -> Mixture:
+def _fits(problem: Problem) -> tuple[Mixture, Mixture]:
+    """The densities fitted to `mu0` and to `f`; found once for a problem."""
     kept = vars(problem)
-    if name not in kept:
-        kept[name] = fit(problem)
-    return kept[name]
-
-
-def _fitted_starts(problem: Problem) -> Mixture:
-    if type(problem).initial_density is Problem.initial_density:
-        return Mixture.uniform(problem.dim)
-    return fitted_mixture(problem.initial_density, problem.dim).scaled(1.0 - UNIFORM_STARTS)
-
-
-def _fitted_states(problem: Problem) -> Mixture:
-    starts, costs = start_law(problem), fitted_mixture(problem.state_cost, problem.dim, broad=BROAD_COST)
-    laws = [law for law in (starts, costs) if not law.is_uniform]
-    part = (1.0 - UNIFORM_STATES) / max(1, len(laws))
-    return Mixture.uniform(problem.dim) if not laws else Mixture.join([law.scaled(part) for law in laws])
+    if "_fits" not in kept:
+        everywhere = getattr(problem.initial_density, "__func__", None) is Problem.initial_density
+        density = Mixture.uniform(problem.dim) if everywhere else fitted_mixture(problem.initial_density, problem.dim)
+        kept["_fits"] = density, fitted_mixture(problem.state_cost, problem.dim, broad=BROAD_COST)
+    return kept["_fits"]

@@ -91,3 +91,23 @@ class JumpingMatrix(Problem):
     def control_matrix(self, x):
         y = x.remainder(1.0)
         return torch.diag_embed(torch.where((y > 0.2) & (y < 0.6), 0.5, 1.0).to(x))
+
+
+class Spike(Problem):
+    """A state cost of mean `1 + mass` whose spike of width ``sigma`` holds ``mass``; carried at a constant velocity, every
+    state is visited alike: from a uniform start doing nothing costs that mean, whatever the velocity."""
+
+    def __init__(self, centre, sigma: float = 0.0025, mass: float = 0.2, wavy: float = 0.0, speed: float = 0.0) -> None:
+        super().__init__(dim=len(centre))
+        self.centre, self.sigma, self.mass, self.wavy, self.speed = list(centre), sigma, mass, wavy, speed
+
+    def state_cost(self, x):
+        waves = self.wavy * (TURN * (x - 0.1)).cos().mean(dim=-1)
+        return 1.0 + waves + self.mass * gaussian(x, self.centre, self.sigma)
+
+    def drift(self, x):
+        return torch.full_like(x, self.speed)
+
+    @property
+    def idle(self) -> float:
+        return 1.0 + self.mass

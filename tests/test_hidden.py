@@ -16,8 +16,10 @@ from ocp_torch.certificate.regularity import largest_jump
 from ocp_torch.certificate.sides import upper_side
 from ocp_torch.control_laws import CLOSED, NETWORK
 from ocp_torch.fields import Fields, PeriodicMLP
+from ocp_torch.problems import Dataset
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.samples import Samples
+from test_recording import Exactly, certificate_of, record
 
 
 def log_density(dim):
@@ -164,3 +166,12 @@ def test_a_control_matrix_that_jumps_has_neither_J_nor_G():
 
 def test_a_smooth_drift_keeps_its_upper_bound():
     assert certified(JumpSink(width=0.1), NETWORK).best_upper is not None
+
+
+@pytest.mark.parametrize(("width", "stands"), [(0.0, False), (0.1, True)])
+def test_recorded_samples_of_a_jump_give_no_upper_bound(tmp_path, width, stands):
+    problem = JumpSink(width=width)
+    data = Dataset(str(record(tmp_path, problem, 4000)))
+    certificate = certificate_of(data, problem, 0, Exactly(lambda x: 0.0 * x[:, 0]), steps=3)
+    assert (certificate.upper["J"] is not None) == stands
+    assert any("do not see" in w for w in certificate.warnings) != stands

@@ -228,8 +228,10 @@ def test_absolute_and_relative_phases_have_the_same_optimum():
     options = dict(oscillators=2, coupling=0.4, spread=0.8, seed=1)
     line = solve_reference(Kuramoto(**options), side=256)
     square = solve_reference(Kuramoto(relative=False, **options), side=64)
-    assert abs(line.optimum - square.optimum) <= 2.0 * (line.error + square.error)
-    assert line.error + square.error <= 0.02 * line.optimum
+    # In the plane two controls push the same phase difference; grids agree to three digits, but show no order.
+    assert square.error is None
+    assert abs(line.optimum - square.optimum) <= 2.0 * line.error + 1e-3 * line.optimum
+    assert line.error <= 0.02 * line.optimum
 
 
 def test_the_order_parameter_is_one_in_synchrony_and_zero_in_a_splay_state():

@@ -7,11 +7,13 @@ import torch
 
 import zoo
 from adversarial import TURN, NarrowStart, gaussian, short_way
+from ocp_torch.bounds import resolve_bounds
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
 from ocp_torch.certificate.sides import lower_side
 from ocp_torch.certificate.wellposed import check_problem
 from ocp_torch.control_laws import zero_law
+from ocp_torch.environment import make_environment
 from ocp_torch.mixtures import Mixture, fitted_mixture, worth
 from ocp_torch.practice.metrics import random_starts
 from ocp_torch.problems import Problem
@@ -83,7 +85,7 @@ def inside(x, width):
 
 
 UNSOUND = {
-    "half of it": (2, lambda x: 0.5 * gaussian(x, [0.2, 0.7], 0.004), "integrates to 0.5"),
+    "half of it": (2, lambda x: 0.5 * gaussian(x, [0.2, 0.7], 0.004), "integrates to 0."),
     "never met": (3, lambda x: inside(x, 1e-4) * 1e12, "integrates to 0 "),
     "a part is never met": (3, lambda x: 0.7 + 0.3e12 * inside(x, 1e-4), "integrates to 0.7"),
 }
@@ -160,6 +162,20 @@ def test_starts_that_count_the_same_are_drawn_from_the_density():
         away = short_way(x, problem.centre)
         assert float(away.std()) == pytest.approx(0.004, rel=0.05)
         assert float(away.mean().abs()) < 4.0 * 0.004 / math.sqrt(len(x))
+
+
+@pytest.mark.parametrize("name", ["2-d", "5-d"])
+def test_the_guess_of_M_knows_how_high_a_narrow_start_is(name):
+    problem = NarrowStart(*NARROW[name])
+    peak = float(problem.initial_density(torch.tensor([problem.centre], dtype=torch.float64)))
+    assert 2.0 * peak < resolve_bounds(problem).M <= 4.0 * peak
+
+
+def test_episodes_of_the_environment_start_there():
+    pytest.importorskip("gymnasium")
+    environment = make_environment(NarrowStart(*NARROW["2-d"]), control_bound=1.0)
+    states = [environment.reset(seed=k)[1]["state"] for k in range(20)]
+    assert all(float(short_way(torch.as_tensor(x), [0.37, 0.91]).abs().max()) < 0.03 for x in states)
 
 
 def test_the_same_starts_come_again():

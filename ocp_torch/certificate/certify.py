@@ -12,7 +12,6 @@ import torch
 from torch import nn
 
 from ocp_torch.bounds import Bounds
-from ocp_torch.calculus import CHUNK
 from ocp_torch.certificate.assumptions import Met, check_assumptions
 from ocp_torch.certificate.certificate import Certificate, Run
 from ocp_torch.certificate.contradictions import examined
@@ -28,6 +27,7 @@ from ocp_torch.certificate.scan import odd_states
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.sides import LowerSide, lower_side, upper_side
 from ocp_torch.certificate.stage import fit_closed_loop
+from ocp_torch.certificate.tails import notes_on, sharpened
 from ocp_torch.certificate.wellposed import WellPosed, check_problem
 from ocp_torch.control_laws import CLOSED, ControlLaw, admissible_density, control_laws, occupation_density, zero_law
 from ocp_torch.errors import InputError
@@ -109,7 +109,8 @@ def certify_fields(
     J = G = hidden = None
     if has_density and problem.gives_divergences:
         mu = occupation_density(occupation, problem, fields, bounds)
-        J, G, hidden = upper_side(problem, admissible_density(occupation, problem, fields, bounds), mu, few, bounds.C_V)
+        w = admissible_density(occupation, problem, fields, bounds)
+        J, G, hidden, _ = sharpened(lambda sets: upper_side(problem, w, mu, sets, bounds.C_V), problem, few, seed)
         with torch.no_grad():
             vanishes = any(bool((mu(samples.x[:4096]) <= 0.0).any()) for samples in few)
         if best == "density" and vanishes:
@@ -141,6 +142,8 @@ def certify_fields(
         J, assumptions, speaks["J"] = stage.J, assumptions.with_value_bound(stage.C_V), True
     if G is not None and not speaks["G"]:
         warnings.append("G bounds OPT, but not the controller that is handed out: the gap does not use it.")
+    upper = {"J": J, "G": G, "lagrangian": stage.lagrangian if stage else None}
+    warnings += notes_on({**upper, "F_M": lower.F_M if lower else None})
     perf = {name: simulated[name].perf if name in simulated else None for name in ("value", "density")}
     warnings += _plausibility(perf, zero)
     certificate = Certificate(
@@ -151,7 +154,7 @@ def certify_fields(
             "shifted": lower.shifted if lower else None,
             **({"rigorous": proved.estimate if proved else None} if settings.rigorous else {}),
         },
-        upper={"J": J, "G": G, "lagrangian": stage.lagrangian if stage else None},
+        upper=upper,
         perf=perf,
         baseline={"zero": zero},
         assumptions=assumptions,
@@ -248,10 +251,12 @@ def certification_stage(
         return None, [f"the certification stage failed: {error}"]
     fitted = in_float64(fitted)
     loop = ClosedLoop(problem, control_laws(trained.occupation, problem, fields, bounds)[kind])
-    loop_sets = [Samples.concatenate([Samples.of(loop, p.x, weight=p.weight) for p in s.split(CHUNK)]) for s in sets]
     value = fields.value if fields.value is not None else fitted.value
     initial = lower.initial if lower is not None else None
-    return closed_loop_bounds(loop, value, fitted.log_occupation, loop_sets, settings.ascents, kind, initial), []
+    judge = lambda sets: closed_loop_bounds(
+        loop, value, fitted.log_occupation, loop.samples_of(sets), settings.ascents, kind, initial
+    )
+    return sharpened(judge, problem, sets, seed), []
 
 
 def searches_of(

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.student import t_factor
+from ocp_torch.mixtures import Mixture
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
 from ocp_torch.starts import evaluation_law
@@ -71,10 +72,12 @@ class Estimate:
 
 
 @torch.no_grad()
-def replicated_samples(problem: Problem, count: int, replicates: int, seed: int, divergences: bool) -> list[Samples]:
+def replicated_samples(
+    problem: Problem, count: int, replicates: int, seed: int, divergences: bool, law: Mixture | None = None
+) -> list[Samples]:
     """``replicates`` independent scrambled Sobol sets of ``count`` states with the problem's data, in float64; weighted, with
-    more states where `mu0` or `f` is large on a small set."""
-    law = evaluation_law(problem)
+    more states where `mu0` or `f` is large on a small set, or from ``law``."""
+    law = evaluation_law(problem) if law is None else law
     sets = [law.draw(count, r, seed) for r in range(replicates)]
     return [Samples.of(problem, x, divergences=divergences, weight=weight) for x, weight in sets]
 

@@ -20,7 +20,7 @@ Write `Q_u` for the Bellman slack of `V` and `r = mu0 - mu - div(mu g_u) / rho` 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import torch
@@ -31,6 +31,7 @@ from ocp_torch.calculus import CHUNK, Field, chunked_gradient
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.hidden import Flux, Hidden, hidden_divergence
 from ocp_torch.certificate.shifted import slack_function
+from ocp_torch.certificate.tails import widened
 from ocp_torch.extremum import Extremum, minimiser, supremum
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.samples import Samples
@@ -52,6 +53,7 @@ class ClosedLoopBounds:
     below: Estimate  # of Perf(u) from below: 2. with the signs turned
     sandwich: tuple[Estimate, Estimate]  # E[V mu0] - eps_lo <= Perf(u) <= E[V mu0] + eps_hi, by 1. alone
     hidden: Hidden | None = None  # a divergence that the residual does not see: only the sandwich stands then
+    contributions: list[list[torch.Tensor]] = field(default_factory=list)  # of `lagrangian` and `J`, parts of each
 
 
 def closed_loop_bounds(
@@ -91,16 +93,23 @@ def closed_loop_bounds(
         high.append(started + hi * mass)
         residual.append(integral(own.samples, own.r.abs()))
     mean_residual = sum(residual) / len(residual)
+    weighted = lambda integrand: [t.samples.weight * integrand(t) for t in terms]
+    of_lagrangian, of_below = (weighted(lambda t, s=s: t.lagrangian_integrand(1.0, *s)) for s in ((hi, lo), (-lo, -hi)))
+    of_J = weighted(lambda t: t.J_integrand(1.0, C_V))
+    found = widened(Estimate.of(lagrangian, controller=controller), of_lagrangian)
+    penalised_by = widened(Estimate.of(J), of_J)
+    parts_of = lambda estimate, values: [v / (abs(estimate.value) or 1.0) for v in values]
     return ClosedLoopBounds(
-        Estimate.of(lagrangian, controller=controller),
-        Estimate.of(J),
+        found,
+        penalised_by,
         C_V,
         eps_hi,
         eps_lo,
         mean_residual,
-        Estimate.of(below),
+        widened(Estimate.of(below), of_below),
         (Estimate.of(low), Estimate.of(high)),
         hidden_divergence([flux for *_, flux in values]),
+        [parts_of(found, of_lagrangian), parts_of(penalised_by, of_J)],
     )
 
 
@@ -119,13 +128,21 @@ class Terms:
 
     def lagrangian(self, scale: float, hi: float, lo: float) -> float:
         """`E[hi max(r, 0) + lo max(-r, 0) - mu Q_u]` of ``scale`` times `mu`: the bound of 2. without `E[V mu0]`."""
+        return integral(self.samples, self.lagrangian_integrand(scale, hi, lo))
+
+    def lagrangian_integrand(self, scale: float, hi: float, lo: float) -> torch.Tensor:
+        """What `lagrangian` is the mean of, ``(N,)``."""
         r = self.residual(scale)
-        return integral(self.samples, hi * r.clamp_min(0.0) + lo * (-r).clamp_min(0.0) - scale * self.spent)
+        return hi * r.clamp_min(0.0) + lo * (-r).clamp_min(0.0) - scale * self.spent
 
     def J(self, scale: float, C_V: float) -> float:
         """The bound of 4., without `E[V mu0]`."""
+        return integral(self.samples, self.J_integrand(scale, C_V))
+
+    def J_integrand(self, scale: float, C_V: float) -> torch.Tensor:
+        """What `J` is the mean of, ``(N,)``."""
         r = self.residual(scale)
-        return integral(self.samples, C_V * r.clamp_min(0.0) - self.v * r - scale * self.spent)
+        return C_V * r.clamp_min(0.0) - self.v * r - scale * self.spent
 
     @staticmethod
     def join(terms: list[Terms]) -> Terms:

@@ -21,6 +21,7 @@ from ocp_torch.calculus import Field
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
 from ocp_torch.certificate.simulation import Dynamics, discounted_integral, rate_at, refined
+from ocp_torch.certificate.tails import widened
 from ocp_torch.control_laws import ControlLaw, ValueLaw
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samplers import derive_seed
@@ -124,4 +125,5 @@ def simulate_performance(
         bias += math.exp(-rho * longest) * largest_rate * float(mass.mean())
     parts = means(result).tolist()
     totals = [part + (initial[r % len(initial)] if initial else 0.0) for r, part in enumerate(parts)]
-    return Simulated(Estimate.of(totals, bias=bias), None if random else float((base + result).max()), end)
+    perf = widened(Estimate.of(totals, bias=bias), [mass * result])
+    return Simulated(perf, None if random else float((base + result).max()), end)

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from ocp_torch.bounds import Bounds
-from ocp_torch.calculus import CHUNK, Field
+from ocp_torch.calculus import Field
 from ocp_torch.certificate.assumptions import check_assumptions
 from ocp_torch.certificate.black_box import BlackBox
 from ocp_torch.certificate.certificate import Certificate, Run
@@ -28,6 +28,7 @@ from ocp_torch.certificate.scan import odd_states
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.sides import lower_side
 from ocp_torch.certificate.stage import fit_closed_loop
+from ocp_torch.certificate.tails import notes_on, sharpened
 from ocp_torch.certificate.wellposed import check_problem
 from ocp_torch.control_laws import ControlLaw, ValueLaw, zero_law
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -99,6 +100,7 @@ def certify_policy(
             notes.append("J is left out: the controller computes in float32, too coarse for its divergence.")
     # On a jump the divergence is not what the formulas see: a wrong number is not shown at all.
     smooth = evaluated if assumptions.regular_holds else None
+    notes += notes_on({"J": smooth.J, "lagrangian": smooth.lagrangian} if smooth else {})
     if value is None:
         notes.append("no lower bound: there is no V to give one.")
     certificate = Certificate(
@@ -141,8 +143,9 @@ def evaluate_policy(
         return None, None
     fitted = in_float64(fit_closed_loop(problem, law, None, network, bounds, settings.stage, seed))
     loop = ClosedLoop(problem, law)
-    sets = [Samples.concatenate([Samples.of(loop, p.x, weight=p.weight) for p in s.split(CHUNK)]) for s in few]
     with torch.no_grad():
         initial = [integral(s, fitted.value(s.x) * s.mu0) for s in wide]
-    found = closed_loop_bounds(loop, fitted.value, fitted.log_occupation, sets, settings.ascents, GIVEN, initial)
-    return found, fitted.value
+    judge = lambda sets: closed_loop_bounds(
+        loop, fitted.value, fitted.log_occupation, loop.samples_of(sets), settings.ascents, GIVEN, initial
+    )
+    return sharpened(judge, problem, few, seed), fitted.value

@@ -23,6 +23,7 @@ from ocp_torch.certificate.assumptions import Met, check_assumptions
 from ocp_torch.certificate.certificate import Certificate, Run
 from ocp_torch.certificate.contradictions import examined
 from ocp_torch.certificate.estimate import Estimate, integral
+from ocp_torch.certificate.hidden import Flux, Hidden, hidden_divergence
 from ocp_torch.certificate.lagrangian import Terms, best_multiples
 from ocp_torch.certificate.regularity import largest_jump
 from ocp_torch.certificate.settings import CertificateSettings
@@ -66,9 +67,12 @@ def certify_recorded(problem: Dataset, trained, bounds: Bounds, settings: Certif
         warnings.append("no upper bound: the recording holds no div_a (and, where B varies, no div_B).")
     elif settings.stage.steps:
         try:
-            J, C_V, sup_occupation = closed_loop_J(
+            J, C_V, sup_occupation, hidden = closed_loop_J(
                 problem, trained, fields, law, kind, bounds, settings, sets, run.seed
             )
+            if hidden is not None:
+                J = None
+                warnings.append(f"J is not used: {hidden.sentence}.")
         except ArithmeticError as error:
             warnings.append(f"the certification stage failed: {error}")
     met = Met(
@@ -186,8 +190,9 @@ def closed_loop_J(
     settings: CertificateSettings,
     sets: list[Samples],
     seed: int,
-) -> tuple[Estimate, float, float]:
-    """`J(mu u, mu)` of ``law`` on ``sets`` with `log mu` fitted on the training samples; its `C_V`, the largest `mu` met.
+) -> tuple[Estimate, float, float, Hidden | None]:
+    """`J(mu u, mu)` of ``law`` on ``sets`` with `log mu` fitted on the training samples; its `C_V`, the largest `mu` met, and
+    what the divergences of the samples do not see.
 
     By parts `E[(f + R(u)) mu] = E[V mu0 - mu Q_u - V r]`, the same number with less scatter. `C_V` is the largest of the
     bound at hand and of `V - min(Q_u, 0)`, which bounds `V^u` where it is largest, at all samples met, with head-room.
@@ -200,7 +205,7 @@ def closed_loop_J(
     fitted = fit_closed_loop(problem, rough, trained.fields, trained.network, bounds, settings.stage, seed, pool)
     fitted = replace(trained, fields=fitted).in_float64()
     value = fields.value if fields.value is not None else fitted.value
-    terms, densities, spreads, largest, deepest = [], [], [], 0.0, 0.0
+    terms, densities, spreads, fluxes, largest, deepest = [], [], [], [], 0.0, 0.0
     for samples in sets:
         loop = closed_loop_samples(samples, law, cost)
         v, gradient = chunked_gradient(value, loop.x)
@@ -210,6 +215,7 @@ def closed_loop_J(
         terms.append(Terms(loop, v, mu * slack, loop.mu0 - spent))
         largest, deepest = max(largest, float(v.max())), max(deepest, float(-slack.min()))
         densities.append(mu)
+        fluxes.append(Flux(loop.x, loop.weight, spent - mu, mu.unsqueeze(-1) * loop.a / rho))
         spreads.append(loop.div_a)
     with torch.no_grad():
         loop = training.to(torch.zeros((), dtype=torch.float64))
@@ -219,7 +225,9 @@ def closed_loop_J(
     C_V = max(bounds.C_V, MARGIN * (largest + deepest))
     excess = best_multiples(terms, lambda t, s: t.J(s, C_V))
     J = [integral(t.samples, t.v * t.samples.mu0) + e for t, e in zip(terms, excess, strict=True)]
-    return Estimate.of(J, controller=kind), C_V, highest_occupation(torch.cat(densities), torch.cat(spreads), rho)
+    found = Estimate.of(J, controller=kind)
+    highest = highest_occupation(torch.cat(densities), torch.cat(spreads), rho)
+    return found, C_V, highest, hidden_divergence(fluxes)
 
 
 def highest_occupation(mu: Tensor, spread: Tensor, rho: float) -> float:

@@ -15,6 +15,7 @@ from ocp_torch.certificate.hidden import Flux, Hidden, hidden_divergence
 from ocp_torch.certificate.mollified import mollified_shift
 from ocp_torch.certificate.recombined import recombined
 from ocp_torch.certificate.shifted import Shift, slack_parts
+from ocp_torch.certificate.tails import rarity, widened
 from ocp_torch.control_laws import Density
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
@@ -32,10 +33,12 @@ class LowerSide:
     violation: list[float]
     own: Shift
     best: Shift
+    rare: float = 0.0  # by how much E[max(Q, 0)] may be off because few states carry it, where that matters
 
     @property
     def F_M(self) -> Estimate:
-        return Estimate.of([e - self.M * v for e, v in zip(self.initial, self.violation, strict=True)])
+        found = Estimate.of([e - self.M * v for e, v in zip(self.initial, self.violation, strict=True)])
+        return replace(found, bias=self.M * self.rare) if self.rare > 0.0 else found
 
     @property
     def shifted(self) -> Estimate:
@@ -71,7 +74,9 @@ def lower_side(
             if tried.bound > own.bound:
                 value, parts, best = other, others, tried
         best = mollified_shift(problem, value, sets, parts, ascents, best, beside)
-    return LowerSide(M, own.initial, violation, own, best)
+    spread = torch.cat([s.weight * p.slack(1.0).clamp_min(0.0) for s, p in zip(sets, parts, strict=True)])
+    rare = rarity(spread, sum(own.initial) / len(own.initial) / M)
+    return LowerSide(M, own.initial, violation, own, best, rare)
 
 
 class UpperSide(NamedTuple):
@@ -80,6 +85,7 @@ class UpperSide(NamedTuple):
     J: Estimate
     G: Estimate | None
     hidden: Hidden | None
+    contributions: list[list[torch.Tensor]] = []  # of `J` and `G`, as parts of each
 
 
 def upper_side(
@@ -89,15 +95,19 @@ def upper_side(
 
     `OPT <= J` for every `w` and `mu >= 0` once `C_V >= sup V*`; `Perf(w/mu) <= J` once `C_V >= sup V^u` (Proposition 6).
     """
-    J, G, fluxes = [], [], []
+    fluxes, of = [], {"J": [], "G": []}
     for samples in sets:
         parts = [_upper_integrands(problem, control_density, occupation, s, C_V) for s in samples.split(CHUNK)]
-        J.append(integral(samples, torch.cat([j for j, *_ in parts])))
+        of["J"].append(samples.weight * torch.cat([j for j, *_ in parts]))
         if problem.driftless:
-            G.append(integral(samples, torch.cat([g for _, g, *_ in parts])))
+            of["G"].append(samples.weight * torch.cat([g for _, g, *_ in parts]))
         moved = (torch.cat(columns) / problem.discount for columns in list(zip(*parts, strict=True))[2:])
         fluxes.append(Flux(samples.x, samples.weight, *moved))
-    return UpperSide(Estimate.of(J), Estimate.of(G) if G else None, hidden_divergence(fluxes))
+    means = {
+        name: widened(Estimate.of([float(v.mean()) for v in values]), values) for name, values in of.items() if values
+    }
+    parts_of = [[v / (abs(means[name].value) or 1.0) for v in of[name]] for name in means]
+    return UpperSide(means["J"], means.get("G"), hidden_divergence(fluxes), parts_of)
 
 
 @torch.no_grad()

@@ -17,7 +17,7 @@ from ocp_torch.problems.pendulum import Pendulum
 from ocp_torch.problems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.planar import PlanarVehicle
 from ocp_torch.problems.problem import Problem
-from ocp_torch.starts import drawn_starts, start_law
+from ocp_torch.starts import drawn_starts, starts_narrowly
 
 STARTS, STEPS = 512, 240
 # The time of a trial in units of 1 / rho; what the discount still sees after it is e^-8.
@@ -119,7 +119,7 @@ def _within_limit(problem: Problem, law: Law) -> Law:
 def random_starts(problem: Problem, count: int, seed: int) -> Tensor:
     """``count`` starts, ``(count, d)`` float64: drawn from `mu0` where that is narrow; else uniform admissible ones, or all
     where hardly any is admissible."""
-    if not start_law(problem).is_uniform:
+    if starts_narrowly(problem):
         return drawn_starts(problem, count, seed)
     generator = torch.Generator().manual_seed(seed)
     x = torch.rand(64 * count, problem.dim, generator=generator, dtype=torch.float64)

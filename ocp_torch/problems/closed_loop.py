@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ocp_torch import calculus
 from ocp_torch.problems.problem import Problem
+from ocp_torch.samples import Samples
 
 
 class ClosedLoop(Problem):
@@ -24,6 +25,11 @@ class ClosedLoop(Problem):
     @property
     def driftless(self) -> bool:
         return False
+
+    def samples_of(self, sets: list[Samples]) -> list[Samples]:
+        """Its data at the states of ``sets``, with their weights."""
+        pieces = lambda s: [Samples.of(self, part.x, weight=part.weight) for part in s.split(calculus.CHUNK)]
+        return [Samples.concatenate(pieces(samples)) for samples in sets]
 
     def state_cost(self, x: Tensor) -> Tensor:
         return self.problem.state_cost(x) + self.problem.control_cost.cost(self.law(x))

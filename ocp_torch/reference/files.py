@@ -23,11 +23,11 @@ def require_npz(name: str, value: object) -> Path:
 
 
 def save_reference(path: Path, reference: Reference) -> None:
-    """Write ``optimum``, ``error``, ``order``, ``sides``, ``estimates``, and of the finest grid ``value`` ``(side,) * d`` and
-    ``control`` ``(side,) * d + (m,)``, at the nodes `k / side`."""
+    """Write ``optimum``, ``error`` (NaN where it is unknown), ``order``, ``sides``, ``estimates``, and of the finest grid
+    ``value`` ``(side,) * d`` and ``control`` ``(side,) * d + (m,)``, at the nodes `k / side`."""
     arrays = {
         "optimum": np.float64(reference.optimum),
-        "error": np.float64(reference.error),
+        "error": np.float64(np.nan if reference.error is None else reference.error),
         "order": np.float64(reference.order),
         "sides": np.array(reference.sides),
         "estimates": np.array(reference.estimates),

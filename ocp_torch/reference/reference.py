@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.problems.problem import Problem
+from ocp_torch.reference.between import look_between
 from ocp_torch.reference.checks import grid_sides, require_solvable
 from ocp_torch.reference.grid import Grid
 from ocp_torch.reference.richardson import Extrapolation, extrapolate
@@ -26,7 +27,8 @@ SPEED_ROUNDS = 3
 class Reference:
     """What three grids say of ``problem``.
 
-    ``optimum`` is `OPT` extrapolated, ``error`` its stated error, ``order`` the order observed (see `richardson`);
+    ``optimum`` is `OPT` extrapolated, ``error`` its stated error, ``order`` the order observed (see `richardson`); an error
+    that nobody knows is `None`, and ``unknown`` says why;
     ``sides`` are nodes per coordinate and ``estimates`` the `OPT` of the three grids; ``value_change`` the largest change
     of `V` from the second grid to the finest; ``unsettled`` is the part of ``error`` that iterations stopped early leave;
     ``value`` ``(side,) * d`` is `V` on the finest grid.
@@ -34,13 +36,14 @@ class Reference:
 
     problem: Problem
     optimum: float
-    error: float
+    error: float | None
     order: float
     sides: tuple[int, ...]
     estimates: tuple[float, ...]
     value_change: float
     unsettled: float
     solution: GridSolution
+    unknown: str | None = None
 
     @property
     def value(self) -> Tensor:
@@ -81,12 +84,18 @@ def solve_reference(problem: Problem, side: int | None = None, memory: float = 4
             start = scheme.solve(rough.value, rough.control, TOLERANCE)
             solutions.append(start)
         estimates = tuple(_mean(problem, s) for s in solutions)
+        between = look_between(problem, start.grid)
         change = float((_carried(solutions[1], start.grid)[0] - start.value).abs().max())
     spacings = tuple(1.0 / n for n in sides)
-    result: Extrapolation = extrapolate(spacings, estimates)
-    error = result.error + max(s.residual + s.defect for s in solutions)
+    noise = max(s.residual + s.defect for s in solutions)
+    result: Extrapolation = extrapolate(spacings, estimates, noise)
+    uneven = "the three grids do not approach evenly" if result.error is None else None
+    unknown = between.sentence or uneven
+    error = None
+    if unknown is None:
+        error = result.error + noise + between.cost + between.mass * float(start.value.abs().max())
     unsettled = max(s.residual for s in solutions)
-    return Reference(problem, result.optimum, error, result.order, sides, estimates, change, unsettled, start)
+    return Reference(problem, result.optimum, error, result.order, sides, estimates, change, unsettled, start, unknown)
 
 
 def _speed(problem: Problem, coarsest: int) -> tuple[GridSolution, float]:

@@ -12,29 +12,38 @@ SAFETY = 3.0
 # What is removed by extrapolation counts as uncertain by this share at least, times SAFETY.
 DOUBT = 0.1
 STEEPEST = 12.0
+# Numbers that differ by less, relative to their size, are the same.
+ROUNDING = 1e-10
 
 
 @dataclass(frozen=True)
 class Extrapolation:
-    """``optimum`` with its stated ``error``, and the ``order`` the three grids show (NaN where they show none)."""
+    """``optimum`` with its stated ``error``, and the ``order`` the three grids show (NaN where they show none: the error is
+    then unknown, `None`)."""
 
     optimum: float
-    error: float
+    error: float | None
     order: float
 
 
-def extrapolate(spacings: tuple[float, float, float], numbers: tuple[float, float, float]) -> Extrapolation:
+def extrapolate(
+    spacings: tuple[float, float, float], numbers: tuple[float, float, float], noise: float = 0.0
+) -> Extrapolation:
     r"""Richardson's extrapolation of ``numbers`` on grids of ``spacings`` `h_1 > h_2 > h_3`, taken as `Q + C h^2`.
 
     With `X_12`, `X_23` from the two pairs of grids and `Q_3` the finest number the stated error is
     `SAFETY max(|X_23 - X_12|, DOUBT |X_23 - Q_3|)`. If the error is `C h^p` instead, that of `X_23` is below it for every
     `p` in [1, 2) and ratio of spacings from 4/3 on, and also for `p > 2`.
+
+    Numbers that show no order say nothing about what they approach, unless all agree within ``noise``, their own error.
     """
     (h1, h2, h3), (Q1, Q2, Q3) = spacings, numbers
     pair = lambda coarse, fine, h, k: fine + (fine - coarse) / ((h / k) ** ORDER - 1.0)
     earlier, optimum = pair(Q1, Q2, h1, h2), pair(Q2, Q3, h2, h3)
     error = SAFETY * max(abs(optimum - earlier), DOUBT * abs(optimum - Q3))
-    return Extrapolation(optimum, error, observed_order(spacings, numbers))
+    order = observed_order(spacings, numbers)
+    settled = max(numbers) - min(numbers) <= noise + ROUNDING * max(map(abs, numbers))
+    return Extrapolation(optimum, error if settled or not math.isnan(order) else None, order)
 
 
 def observed_order(spacings: tuple[float, float, float], numbers: tuple[float, float, float]) -> float:

@@ -82,7 +82,8 @@ def table(reference: Reference) -> str:
     lines = [
         f"{problem_name(problem)}: d = {problem.dim}, m = {problem.control_dim}, rho = {problem.discount:g}, "
         f"q = {problem.exponent:g}",
-        f"OPT      {reference.optimum:.9g}  +- {reference.error:.2g}",
+        f"OPT      {reference.optimum:.9g}  "
+        + ("error unknown" if reference.error is None else f"+- {reference.error:.2g}"),
     ]
     if problem.exact_optimum is not None:
         off = reference.optimum - problem.exact_optimum
@@ -92,6 +93,9 @@ def table(reference: Reference) -> str:
     order = "none (the three grids do not approach evenly)" if math.isnan(reference.order) else f"{reference.order:.2f}"
     lines.append(f"order    {order}")
     lines.append(f"V        changes by up to {reference.value_change:.2g} from the second grid to the finest")
+    if reference.error is None:
+        lines.append(f"warning: nothing is known of how far the optimum is from this: {reference.unknown}.")
+        return "\n".join(lines)
     if not reference.unsettled < 0.5 * reference.error and not reference.unsettled <= 1e-6 * abs(reference.optimum):
         lines.append(
             f"warning: policy iteration stopped before it settled; {reference.unsettled:.2g} of the stated error is for that."
