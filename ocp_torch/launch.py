@@ -86,9 +86,12 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
         return arguments
     given = {o.key_or_group: o.value() for o in parsed(overrides) if not o.is_sweep_override() and not o.is_delete()}
     own = Path(str(given["hydra.run.dir"])) if "hydra.run.dir" in given else None
-    data = composed(config_name, overrides, roots=(own,) if own else ())
     try:
+        data = composed(config_name, overrides, roots=(own,) if own else ())
         check(data)
+    except OSError as error:  # a name that no file can have, a device that gives nothing
+        named = f"{shown(str(error.filename))} cannot be used" if error.filename else "a file cannot be used"
+        raise InputError(f"{named}: {error.strerror or error}.") from None
     except SystemExit as end:  # somebody's module or function would end the run without a word
         raise InputError(f"the code that the command line names asks Python to exit (status {end.code}).") from None
     if data.get("resume") is None:

@@ -11,7 +11,7 @@ from ocp_torch.certificate.certify import in_float64
 from ocp_torch.config import build_certificate_settings, build_network, build_problem
 from ocp_torch.control_laws import ControlLaw, control_laws
 from ocp_torch.controller import Controller, load_controller
-from ocp_torch.errors import InputError, require_integer
+from ocp_torch.errors import InputError, require_integer, require_section
 from ocp_torch.pictures import animate, require_gif
 from ocp_torch.process import prepare
 from ocp_torch.training.practice import write_metrics
@@ -37,9 +37,10 @@ def load_run(config: dict) -> Controller:
 
 def settings_for(controller: Controller, config: dict) -> CertificateSettings:
     """The settings of the controller's own run, with what ``config`` sets in their place."""
-    own = controller.config["certificate"]
-    changed = {k: v for k, v in config["certificate"].items() if v is not None and k != "stage"}
-    stage = {k: v for k, v in (config["certificate"].get("stage") or {}).items() if v is not None}
+    own, asked = controller.config["certificate"], require_section("certificate", config["certificate"])
+    changed = {k: v for k, v in asked.items() if v is not None and k != "stage"}
+    section = require_section("certificate.stage", {} if asked.get("stage") is None else asked["stage"])
+    stage = {k: v for k, v in section.items() if v is not None}
     return build_certificate_settings({"certificate": {**own, **changed, "stage": {**own.get("stage", {}), **stage}}})
 
 
