@@ -5,16 +5,24 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ocp_torch.errors import InputError, nearest
+from ocp_torch.errors import InputError, nearest, shown
 from ocp_torch.launch import fail
 from ocp_torch.training.comparison import compare
+
+
+def exists(path: str) -> bool:
+    """Whether there is such a file or folder; no file has a name of thousands of letters."""
+    try:
+        return Path(path).exists()
+    except OSError:
+        return False
 
 
 def main(arguments: list[str]) -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(__doc__)
         return
-    options = dict(a.split("=", 1) for a in arguments if "=" in a and not Path(a).exists())
+    options = dict(a.split("=", 1) for a in arguments if "=" in a and not exists(a))
     for name, value in options.items():
         if name not in ("csv", "plot"):
             raise InputError(
@@ -22,7 +30,11 @@ def main(arguments: list[str]) -> None:
             )
         if not value:
             raise InputError(f"{name} is empty, but must be the file to write.")
-    comparison = compare([Path(a) for a in arguments if "=" not in a or Path(a).exists()])
+    runs = [a for a in arguments if "=" not in a or exists(a)]
+    for run in runs:
+        if not exists(run):
+            raise InputError(f"{shown(run)} does not exist; give runs' folders, or folders that hold some.")
+    comparison = compare([Path(run) for run in runs])
     print(comparison.table())
     for name, save in (("csv", comparison.save_csv), ("plot", comparison.save_plot)):
         if name in options:
