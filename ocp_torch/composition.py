@@ -144,7 +144,7 @@ def require_places(overrides: list[str]) -> None:
 def require_sections(data: dict, config_name: str) -> dict:
     """``data``, if each group and field at the top of the configuration has a place in it; else `InputError`."""
     file = OmegaConf.to_container(OmegaConf.load(CONFIGS / f"{config_name}.yaml"), resolve=False)
-    chosen = [item for entry in file.pop("defaults") if isinstance(entry, dict) for item in entry.items()]
+    chosen = [item for entry in file.pop("defaults", []) if isinstance(entry, dict) for item in entry.items()]
     groups = [(key.partition("@")[2] or key).split(".")[0] for key, choice in chosen if choice is not None]
     for name in dict.fromkeys([*groups, *file]):
         if name not in data and not name.startswith(("hydra", "override ")):

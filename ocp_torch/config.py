@@ -80,7 +80,8 @@ def build_problem(section: object) -> Problem:
 
 def _require_room(dim: int, control_dim: object) -> None:
     """Raise `InputError` where `B` at the states at which the embedding looks for waves would not fit into the memory."""
-    entries = dim * (control_dim if isinstance(control_dim, int) else dim)
+    given = isinstance(control_dim, int) and 1 <= control_dim <= MOST_COORDINATES
+    entries = dim * (control_dim if given else dim)
     require_memory("the number of entries of B, problem.dim times control_dim,", entries, 8.0 * STATES)
 
 

@@ -46,8 +46,8 @@ class StorageError(InputError):
     """A file that could not be written: no space, no permission. What was there before is untouched."""
 
 
-# No number of a problem or a run needs to be larger; single precision ends at 3e38.
-LARGEST = 1e30
+# No number of a problem or a run needs to be larger, or nearer to 0 where 0 is out; single precision ends at 3e38.
+LARGEST, SMALLEST = 1e30, 1e-30
 # Of a value that is wrong, no more is repeated.
 LONGEST_SHOWN = 80
 
@@ -96,6 +96,8 @@ def require_number(
         )
     if at_most is None and abs(number) > LARGEST:
         raise InputError(f"{name} is {number:g}, but must be a number of at most {LARGEST:g} in size.")
+    if above == 0.0 and 0.0 < number < SMALLEST:
+        raise InputError(f"{name} is {number:g}, but must be at least {SMALLEST:g}.")
     outside = (
         (above is not None and number <= above)
         or (at_least is not None and number < at_least)

@@ -109,12 +109,16 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
         return arguments
     given = {o.key_or_group: o.value() for o in parsed(overrides) if not o.is_sweep_override() and not o.is_delete()}
     own = Path(str(given["hydra.run.dir"])) if "hydra.run.dir" in given else None
-    data = composed(config_name, overrides, roots=(own,) if own else ())
-    folder = own if data.get("resume") is None else locate(Path(data["resume"]))[0]
-    if folder is not None:
-        require_unlinked(folder)
     try:
+        data = composed(config_name, overrides, roots=(own,) if own else ())
+        folder = own if data.get("resume") is None else locate(Path(data["resume"]))[0]
+        if folder is not None:
+            require_unlinked(folder)
         check(data)
+    except OSError as error:  # a name that no file can have, a device that gives nothing
+        told = blamed(error)
+        named = f"{shown(str(error.filename))} cannot be used" if error.filename else "a file cannot be used"
+        raise told or InputError(f"{named}: {error.strerror or error}.") from None
     except (Exception, SystemExit) as error:
         told = blamed(error)
         if told is None and isinstance(error, SystemExit):  # somebody's module would end the run without a word

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ocp_torch.errors import InputError, nearest
+from ocp_torch.errors import InputError, nearest, shown
 from ocp_torch.launch import fail
 from ocp_torch.reading import kind
 from ocp_torch.training.comparison import compare
@@ -23,7 +23,11 @@ def main(arguments: list[str]) -> None:
             )
         if not value:
             raise InputError(f"{name} is empty, but must be the file to write.")
-    comparison = compare([Path(a) for a in arguments if "=" not in a or kind(a) is not None])
+    runs = [a for a in arguments if "=" not in a or kind(a) is not None]
+    for run in runs:
+        if kind(run) is None:
+            raise InputError(f"{shown(run)} does not exist; give runs' folders, or folders that hold some.")
+    comparison = compare([Path(run) for run in runs])
     print(comparison.table())
     for name, save in (("csv", comparison.save_csv), ("plot", comparison.save_plot)):
         if name in options:

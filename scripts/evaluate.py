@@ -6,6 +6,7 @@ import hydra
 from omegaconf import DictConfig
 
 from ocp_torch.certificate.possible import require_possible
+from ocp_torch.errors import require_integer
 from ocp_torch.launch import job, launch
 from ocp_torch.pictures import require_gif
 from ocp_torch.training.evaluation import animated, certify_saved, load_run, settings_for
@@ -13,6 +14,8 @@ from ocp_torch.training.evaluation import animated, certify_saved, load_run, set
 
 def check(config: dict):
     controller = load_run(config)
+    if config["seed"] is not None:
+        require_integer("seed", config["seed"], 0)
     if config["animation"] is not None:
         require_gif(controller.problem, config["animation"])
     settings = settings_for(controller, config)

@@ -22,7 +22,7 @@ from ocp_torch.budgets import fill
 from ocp_torch.certificate import CertificateSettings
 from ocp_torch.certificate.possible import require_possible
 from ocp_torch.config import build_certificate_settings, build_problem, build_trainer
-from ocp_torch.errors import InputError, call, require_choice, require_integer, require_section
+from ocp_torch.errors import InputError, call, require_choice, require_integer, require_number, require_section
 from ocp_torch.problems import Problem
 
 log = logging.getLogger(__name__)
@@ -77,11 +77,23 @@ def build(config: dict) -> tuple[Problem, Bounds, list, list[int], CertificateSe
     if not problem.driftless and "kernel_primal" in names:
         log.info("kernel_primal is left out: Lemma 2 needs a problem without drift.")
         names = [name for name in names if name != "kernel_primal"]
+    _require_numbers(config)
     made = [contender(name, config, problem, bounds) for name in names]
     training = {group: config[group] for group in TRAINING}
     certificate = build_certificate_settings(fill(training, problem))
     require_possible(problem, certificate)
     return problem, bounds, made, seeds, certificate
+
+
+def _require_numbers(config: dict) -> None:
+    """Fields of contenders that may not be among those named: a wrong one is refused all the same."""
+    kernel, rl = (require_section(name, config[name]) for name in ("kernel", "rl"))
+    for method, step in require_section("kernel.step", kernel.get("step")).items():
+        require_number(f"kernel.step.{require_choice('kernel.step', method, METHODS)}", step, above=0.0)
+    for name in ("time_step", "horizon"):
+        require_number(f"rl.{name}", rl.get(name), above=0.0)
+    for algorithm, steps in require_section("rl.steps", rl.get("steps")).items():
+        require_integer(f"rl.steps.{algorithm}", steps, 1)
 
 
 def contest(config: dict, folder: Path, say: Callable[[str], None] = log.info) -> list[Curve]:

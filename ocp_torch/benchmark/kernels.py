@@ -11,10 +11,11 @@ from ocp_torch.benchmark.curve import Curve, Point, due
 from ocp_torch.benchmark.measure import Judge
 from ocp_torch.bounds import Bounds
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields
-from ocp_torch.errors import require_integer, require_number
+from ocp_torch.errors import InputError, require_integer, require_number
 from ocp_torch.fields import PeriodicMLP
 from ocp_torch.fields.sobolev import SobolevFeatures
 from ocp_torch.kernel import Iteration, step_sizes
+from ocp_torch.memory import require_memory
 from ocp_torch.problems import Problem
 
 OCCUPATION = {"dual": None, "primal": control_laws.CLOSED, "pd": control_laws.SADDLE}
@@ -43,6 +44,11 @@ class KernelContender:
         if self.seconds is not None:
             require_number("kernel.seconds", self.seconds, above=0.0)
         require_integer("kernel.longest", self.longest, 1)
+        require_memory("kernel.longest", self.longest, 8)  # a step size each
+        try:
+            SobolevFeatures(self.problem.dim, self.regularity, modes=self.modes)
+        except InputError as error:
+            raise InputError(str(error).replace("model.", "kernel.")) from None
 
     @property
     def name(self) -> str:

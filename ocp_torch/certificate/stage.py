@@ -22,6 +22,7 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.samplers import SobolSampler, derive_seed
 from ocp_torch.samples import Samples
 from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
+from ocp_torch.steppers.optimizers import LARGEST_RATE
 
 # Branch of the seed tree for the stage's states and weights, beside those of training and evaluation.
 STAGE_STREAM = 3
@@ -52,7 +53,7 @@ class StageSettings:
         require_integer("certificate.stage.rounds", self.rounds, 1, maximum=16)
         require_number("certificate.stage.good_excess", self.good_excess, above=0.0)
         require_integer("certificate.stage.batch", self.batch, 1)
-        require_number("certificate.stage.lr", self.lr, above=0.0)
+        require_number("certificate.stage.lr", self.lr, above=0.0, at_most=LARGEST_RATE)
 
 
 def fit_closed_loop(

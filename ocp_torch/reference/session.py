@@ -21,6 +21,7 @@ from ocp_torch.reference.files import require_npz, save_reference
 from ocp_torch.reference.grid import Grid
 from ocp_torch.reference.reference import Reference, solve_reference
 from ocp_torch.training.evaluation import load_run
+from ocp_torch.training.settings import MOST_THREADS
 
 log = logging.getLogger(__name__)
 
@@ -71,7 +72,7 @@ def prepare(config: dict) -> ReferenceJob:
         figure = folder / "figures" / "reference.png"
     sides = grid_sides(problem.dim, config["side"], config["memory"])
     require_solvable(problem, Grid(problem.dim, sides[0]))
-    threads = require_integer("threads", config["threads"], 1)
+    threads = require_integer("threads", config["threads"], 1, maximum=MOST_THREADS)
     file = None if config["save"] is None else require_npz("save", config["save"])
     return ReferenceJob(problem, controller, figure, config["side"], config["memory"], threads, file)
 

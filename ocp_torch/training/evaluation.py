@@ -11,7 +11,7 @@ from ocp_torch.certificate.certify import in_float64
 from ocp_torch.config import build_certificate_settings, build_network, build_problem
 from ocp_torch.control_laws import ControlLaw, control_laws
 from ocp_torch.controller import Controller, load_controller
-from ocp_torch.errors import InputError, require_integer
+from ocp_torch.errors import InputError, require_integer, require_section
 from ocp_torch.limits import require_modest_run
 from ocp_torch.pictures import animate, require_gif
 from ocp_torch.process import prepare
@@ -41,9 +41,10 @@ def load_run(config: dict) -> Controller:
 def settings_for(controller: Controller, config: dict) -> CertificateSettings:
     """The settings of the controller's own run, with what ``config`` sets in their place. Raises `InputError` where the run's
     own would take more than a file may ask for."""
-    own = controller.config["certificate"]
-    changed = {k: v for k, v in config["certificate"].items() if v is not None and k != "stage"}
-    stage = {k: v for k, v in (config["certificate"].get("stage") or {}).items() if v is not None}
+    own, asked = controller.config["certificate"], require_section("certificate", config["certificate"])
+    changed = {k: v for k, v in asked.items() if v is not None and k != "stage"}
+    section = require_section("certificate.stage", {} if asked.get("stage") is None else asked["stage"])
+    stage = {k: v for k, v in section.items() if v is not None}
     named = {f"certificate.{k}" for k in changed} | {f"certificate.stage.{k}" for k in stage}
     require_modest_run(config["run"], controller.config, named)
     return build_certificate_settings(
