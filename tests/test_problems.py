@@ -138,7 +138,7 @@ def test_the_bounds_at_the_exact_truth_are_the_optimum(problem):
     sets = [Samples.of(problem, grid), Samples.of(problem, grid + 0.37)]
     lower = lower_side(problem, problem.exact_value, sets, problem.occupation_bound)
     w = lambda x: problem.exact_occupation(x).unsqueeze(-1) * problem.exact_control(x)
-    J, G, _ = upper_side(problem, w, problem.exact_occupation, sets, problem.value_bound)
+    J, G, *_ = upper_side(problem, w, problem.exact_occupation, sets, problem.value_bound)
     for estimate in (lower.F_M, lower.shifted, J):
         assert estimate.value == pytest.approx(problem.exact_optimum, rel=1e-9)
     assert G is None

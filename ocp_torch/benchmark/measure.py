@@ -49,7 +49,7 @@ class Judge:
         if fields.control_density is not None and problem.gives_divergences:
             mu = occupation_density(occupation, problem, fields, bounds)
             w = admissible_density(occupation, problem, fields, bounds)
-            J, G, _ = upper_side(problem, w, mu, self.sets, bounds.C_V)
+            J, G, *_ = upper_side(problem, w, mu, self.sets, bounds.C_V)
             numbers |= {"J": J.value} | ({"G": G.value} if G is not None else {})
         if perf:
             for name, law in control_laws(occupation, problem, fields, bounds).items():
