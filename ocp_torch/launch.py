@@ -126,9 +126,10 @@ def fail(sentence: str) -> None:
 
 
 def printable(sentence: str) -> str:
-    """``sentence`` on one line, with no sign in it that a terminal would obey, and no number of hundreds of digits."""
+    """``sentence`` on one line, with no sign in it that a terminal would obey, and no word of hundreds of letters."""
     line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(sentence.split()))
-    return re.sub(r"\d{40,}", lambda digits: f"{digits[0][:6]}...({len(digits[0])} digits)", line)
+    line = re.sub(r"\d{40,}", lambda digits: f"{digits[0][:6]}...({len(digits[0])} digits)", line)
+    return re.sub(r"\S{300,}", lambda word: f"{word[0][:80]}...", line)  # a path of thousands of letters
 
 
 def require_writable(name: str, folder: Path) -> None:
