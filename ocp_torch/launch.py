@@ -145,8 +145,9 @@ def require_fresh(folder: Path) -> None:
 
 
 def fail(sentence: str) -> None:
-    """Print one sentence, on one line and without endless numbers, and leave with the status of a wrong input."""
+    """Print one sentence, on one line and without endless numbers and words, and leave with the status of a wrong input."""
     line = re.sub(r"\d{40,}", lambda digits: f"{digits[0][:6]}...({len(digits[0])} digits)", " ".join(sentence.split()))
+    line = re.sub(r"\S{300,}", lambda word: f"{word[0][:80]}...", line)  # a path of thousands of letters
     print(f"error: {visible(line)}", file=sys.stderr)
     sys.exit(FAILED_INPUT)
 

@@ -33,6 +33,8 @@ def write_atomically(path: Path, write: Callable[[Path], None], make_room: Calla
     returns. Raises `StorageError` when there is no room or no permission.
     """
     temporary: Path | None = None
+    if os.path.lexists(path) and not path.is_file():
+        raise StorageError(f"{path} is no file but a folder or a device, which nothing may replace.")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")

@@ -2,6 +2,7 @@
 
 import os
 import random
+import stat
 
 import pytest
 
@@ -42,7 +43,7 @@ OTHERS = [
     "/proc/x",
     "/dev/null/x",
 ]
-PLACES = ["/proc/x", "/dev/null", "/dev/null/x", "/etc/passwd", "/proc/1/x", "a/" * 2500, "b" * 300]
+PLACES = ["/proc/x", "/dev/null/x", f"{__file__}/x", "/proc/1/x", "a/" * 2500, "b" * 300]
 # What is right whatever it is: names of what is not looked for before the work begins.
 FREE = {"out", "save", "animation", "video"}
 
@@ -174,3 +175,14 @@ def test_a_folder_that_is_missing_can_still_be_made(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert entered("train", f"hydra.run.dir={tmp_path}/a/b/c") == (0, "begun\n", "")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_no_file_takes_the_place_of_what_is_none(bases, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    os.mkdir("folder")
+    for place in ("pipe", "folder"):
+        status, _, err = entered("compare", f"csv={place}", *bases["compare"])
+        assert (status, "is no file but a folder or a device" in err) == (2, True)
+    assert stat.S_ISFIFO(os.stat("pipe").st_mode)
+    assert sorted(os.listdir()) == ["folder", "pipe"]

@@ -12,7 +12,7 @@ import torch
 from tqdm import tqdm
 
 from ocp_torch.benchmark.curve import median_and_spread
-from ocp_torch.errors import InputError, require_integer, require_section
+from ocp_torch.errors import InputError, require_choice, require_integer, require_section
 from ocp_torch.paper import figures
 from ocp_torch.paper.recipes import RECIPES
 from ocp_torch.paper.runs import Comparison, History, carry_out, compare_with_exact
@@ -27,6 +27,8 @@ def check(config: dict) -> tuple[tuple[int, ...], int, dict[str, int]]:
         raise InputError(f"seeds is {seeds!r}, but must be a list of whole numbers, as in [0,1,2].")
     modes = require_integer("modes", config["modes"], 1, maximum=4096)
     exact = require_section("exact_steps", config["exact_steps"])
+    for name in exact:
+        require_choice("exact_steps", name, RECIPES)
     for name in RECIPES:
         require_integer(f"exact_steps.{name}", exact.get(name), 1, maximum=min(20000, RECIPES[name].steps))
     return tuple(require_integer("seeds", seed, 0) for seed in seeds), modes, exact
