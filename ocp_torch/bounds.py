@@ -138,7 +138,7 @@ def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
     (mu0,) = problem.survey(SURVEYED, 1, "mu0")
     guess = OCCUPATION_WEIGHT if is_unbounded(problem) else OCCUPATION_GUESS
     if problem.evaluable and starts_narrowly(problem):
-        mu0 = problem.initial_density(drawn_starts(problem, SEARCHED // 32, 1))
+        mu0 = problem.initial_density(drawn_starts(problem, SURVEYED // 32, 1))
     return guess * float(mu0.max()), f"a guess to train with, {guess:g} times sup mu0"
 
 

@@ -53,7 +53,7 @@ def fill(config: dict, problem: Problem) -> dict:
         require_section(name, config.get(name))
     filled = copy.deepcopy(config)
     activation, sampler, of_method = ACTIVATION, SAMPLER, {}
-    method = config.get("method") or {}
+    method = require_section("method", config.get("method") or {})
     if is_unbounded(problem, method.get("occupation_bound")):
         if method.get("name") == "pd" and config["trainer"].get("batch") is None:
             of_method = {("method", "density_batch"): DENSITY_BATCH}

@@ -100,7 +100,7 @@ def test_a_guessed_M_makes_a_conditional_bound_that_enters_nothing_else():
     assert said["lower"]["F_M"] | {"rests_on": {"M": "guessed"}, "counts": False} == said["lower"]["F_M"]
     assert said["lower"]["F_M"]["if"] == f"sup mu* <= {certificate.assumptions.M:.4g}"
     assert said["lower"]["shifted"]["counts"]
-    assert 0.0 < said["gap"]["conditional"] < said["gap"]["simulated"]
+    assert 0.0 < said["gap"]["conditional"] <= (1.0 + 1e-9) * said["gap"]["simulated"]
     assert any("a guess: no gap uses it" in warning for warning in said["warnings"])
 
 

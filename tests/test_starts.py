@@ -8,7 +8,7 @@ import torch
 
 import zoo
 from adversarial import TURN, NarrowStart, gaussian, short_way
-from ocp_torch.bounds import resolve_bounds
+from ocp_torch.bounds import OCCUPATION_WEIGHT, resolve_bounds
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
 from ocp_torch.certificate.sides import lower_side
@@ -169,7 +169,7 @@ def test_starts_that_count_the_same_are_drawn_from_the_density():
 def test_the_guess_of_M_knows_how_high_a_narrow_start_is(name):
     problem = NarrowStart(*NARROW[name])
     peak = float(problem.initial_density(torch.tensor([problem.centre], dtype=torch.float64)))
-    assert 2.0 * peak < resolve_bounds(problem).M <= 4.0 * peak
+    assert 0.5 * OCCUPATION_WEIGHT * peak < resolve_bounds(problem).M <= OCCUPATION_WEIGHT * peak
 
 
 def test_episodes_of_the_environment_start_there():

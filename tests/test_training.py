@@ -291,7 +291,7 @@ def test_tensorboard_shows_every_group_of_scalars_and_the_exact_optimum(run):
 
 
 def test_a_run_that_diverges_says_so_and_never_saves_what_is_not_finite(tmp_path):
-    trainer = small("method=dual", "optimizer=sgd", "optimizer.lr=1e30", "trainer.checkpoint_every=1")
+    trainer = small("method=dual", "optimizer=sgd", "optimizer.lr=1e6", "trainer.checkpoint_every=1")
     with pytest.raises(InputError, match="Training stopped at step .* the loss of player 'value'") as stopped:
         session(trainer, tmp_path)
     assert "\n" not in str(stopped.value)
