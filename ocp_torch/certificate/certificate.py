@@ -194,8 +194,9 @@ class Certificate:
         }
 
     def _standing(self, name: str) -> dict:
-        """What the bound ``name`` rests on, whether it counts, and what it supposes where it rests on a guess."""
-        supposed = " and ".join(need.condition for need in self.needs(name) if need.basis == GUESSED)
+        """What the bound ``name`` rests on, whether it counts, and what it supposes where a guess may be right."""
+        guesses = [need.condition for need in self.needs(name) if need.basis == GUESSED]
+        supposed = " and ".join(guesses) if self.conditional(name) else ""
         counts = self.counts(name) and self.speaks.get(name, True)
         rests_on = {need.name: need.basis for need in self.needs(name)}
         return {"rests_on": rests_on, "counts": counts, **({"if": supposed} if supposed else {})}

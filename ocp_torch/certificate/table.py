@@ -25,7 +25,7 @@ def table(certificate: dict, searches: list[str] = ()) -> str:
 
     for kind in ("F_M", "shifted", "rigorous"):
         bound = certificate["lower"].get(kind)
-        row(f"lower: {kind}{', if' if bound and 'if' in bound else ''}", bound)
+        row(f"lower: {kind}{standing(bound or {})}", bound)
     if exact is not None:
         lines.append(f"{'OPT (exact)':26}{exact:14.8f}")
     row("Perf: controller from V", certificate["perf"].get("value"))
@@ -34,7 +34,8 @@ def table(certificate: dict, searches: list[str] = ()) -> str:
         row(f"Perf, at least: {visible(kind, LONGEST_NAME)}", estimate)
     row("Perf: this controller", certificate["perf"].get("given"))
     for name, label in (("lagrangian", "Lagrangian"), ("evaluation", "evaluation"), ("G", "G"), ("J", "J")):
-        row(f"upper: {label}", certificate["upper"].get(name))
+        bound = certificate["upper"].get(name)
+        row(f"upper: {label}{standing(bound or {})}", bound)
     row("Perf: doing nothing", certificate["baseline"]["zero"])
     lines.append("-" * len(header))
     gap, share = certificate["gap"], certificate["share"]
@@ -48,6 +49,11 @@ def table(certificate: dict, searches: list[str] = ()) -> str:
     lines += searches
     lines += [f"warning: {visible(warning)}" for warning in certificate["warnings"]]
     return "\n".join(lines)
+
+
+def standing(bound: dict) -> str:
+    """What its row adds to the name of a bound (as a dict of the schema): nothing where it counts."""
+    return "" if bound.get("counts", True) else ", if" if "if" in bound else ", not used"
 
 
 def in_words(certificate: dict) -> list[str]:
