@@ -4,9 +4,12 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from ocp_torch.config import build_certificate_settings
 from ocp_torch.control_laws import occupation_density
 from ocp_torch.samples import Samples
 from ocp_torch.training.monitor import Monitor, liouville_residual
+from ocp_torch.training.session import run_session
+from ocp_torch.training.stages import Stages
 from test_training import METHODS, small
 
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
@@ -50,3 +53,31 @@ def test_the_liouville_residual_is_that_of_finite_differences(way):
     got = liouville_residual(trainer, Samples.of(problem, x, divergences=False))["residual_mean_absolute"]
     # The minimiser of Lemma 3 has kinks; a difference across one is off at that state alone.
     assert float(got) == pytest.approx(float(wanted.mean()), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("override", "why"),
+    [("trainer.steps=8", "all 8 steps are done"), ("trainer.max_seconds=1e-9", "trainer.max_seconds")],
+    ids=["steps", "seconds"],
+)
+def test_after_the_last_step_one_is_told_why_and_what_is_being_made(override, why, tmp_path, caplog):
+    trainer = small("method=pd", "trainer.evaluate_every=4", override)
+    with caplog.at_level("INFO"):
+        run_session(trainer, build_certificate_settings(trainer.config), tmp_path)
+    (stopped,) = [line for line in caplog.messages if line.startswith("Training stopped")]
+    assert why in stopped
+    assert "the certificate is next" in stopped
+    told = [line for line in caplog.messages if line.endswith(" ...")]
+    stages = ["bounds", "simulation", "closed-loop fit", "assumptions"]
+    assert told == [*(f"certifying: {stage} ..." for stage in stages), "figures ..."]
+    assert caplog.messages.index(stopped) < caplog.messages.index(told[0])
+
+
+def test_in_a_terminal_a_clock_shows_the_stage_and_how_long_all_take(capsys):
+    stages = Stages(hidden=False)
+    stages.begin(150.0)
+    stages("certifying: simulation")
+    stages.close()
+    shown = capsys.readouterr().err
+    assert "certifying: simulation" in shown
+    assert "about 2 min in all" in shown
