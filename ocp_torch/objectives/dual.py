@@ -2,9 +2,6 @@ r"""The dual with an exact penalty, D(M) (section 4.1 of the paper), and the bou
 
 from __future__ import annotations
 
-import math
-
-import torch
 from torch import Tensor
 
 from ocp_torch import calculus, formulas
@@ -17,12 +14,6 @@ from ocp_torch.samples import Samples
 
 # Where no `M` is known: the part of `M` that a round starts with, and the part of the round in which it grows.
 LEAST_WEIGHT, GROWTH = 1.0 / 20.0, 0.7
-# In the rest of it the largest slack of a batch shares the weight with the mean: the bound without `M` was 0.186 % below OPT
-# instead of 0.207 % on the 2-d torus, 0.024 % instead of 0.037 % on a smooth 4-d problem, and no worse on the arm. Alone it
-# was better on smooth problems and worse at kinks.
-LARGEST_PART = 0.5
-# How smooth that maximum is, at first and at the end, in distances from the median of the slack to its 99 % quantile.
-SMOOTHNESS = (2.0, 0.5)
 
 
 class Dual(Objective):
@@ -34,8 +25,7 @@ class Dual(Objective):
 
     Where no `M` is known to be large enough (`Bounds.unbounded`) what is certified is `E[V mu0] - sup Q`. A large
     `M` keeps the supremum small; but from the start it ends in subsolutions far below `V*`, which have no gradient. So `M`
-    grows along a round: first `V` is too high, and then comes down until it is feasible. When it has grown, half of the
-    hinge gives way to the smoothed maximum of `Q` over the batch.
+    grows along a round: first `V` is too high, and then comes down until it is feasible.
     """
 
     players = {"value": (VALUE,)}
@@ -54,23 +44,10 @@ def value_loss(
     objective: Objective, fields: Fields, samples: Samples, value: Tensor, slack: Tensor, residual: float
 ) -> Tensor:
     """What a value player on its own minimises: `E[M max(Q, 0) + (residual / s) Q^2 - V mu0]`."""
-    M, scale, largest = objective.bounds.M, getattr(fields.value, "scale", 1.0), 0.0
+    M = objective.bounds.M
     if objective.bounds.unbounded:
         M = M * LEAST_WEIGHT ** max(0.0, 1.0 - objective.progress / GROWTH)
-        if objective.progress >= GROWTH:
-            late = (objective.progress - GROWTH) / (1.0 - GROWTH)
-            M = (1.0 - LARGEST_PART) * M
-            largest = LARGEST_PART * smoothed_maximum(slack, SMOOTHNESS[0] ** (1.0 - late) * SMOOTHNESS[1] ** late)
     violation = M * slack.clamp_min(0.0)
     if residual > 0.0:
-        violation = violation + residual / scale * slack.square()
-    return largest + samples.penalty(violation) - samples.mean(value * samples.mu0)
-
-
-def smoothed_maximum(slack: Tensor, smoothness: float) -> Tensor:
-    """`tau log E exp(Q / tau)` of ``slack`` ``(N,)``, at most its largest value; `tau` is ``smoothness`` times the distance
-    from its median to its 99 % quantile, and so follows the size of what is left."""
-    median, high = torch.quantile(slack.detach(), torch.tensor([0.5, 0.99]).to(slack))
-    tau = (smoothness * (high - median)).clamp_min(torch.finfo(slack.dtype).tiny ** 0.5)
-    top = slack.detach().max()  # taken off first: in float32 a large quotient would swallow the logarithm
-    return top + tau * (torch.logsumexp((slack - top) / tau, dim=0) - math.log(len(slack)))
+        violation = violation + residual / getattr(fields.value, "scale", 1.0) * slack.square()
+    return samples.penalty(violation) - samples.mean(value * samples.mu0)
