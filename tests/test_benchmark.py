@@ -186,6 +186,7 @@ def test_a_kernel_method_without_a_time_of_its_own_gets_that_of_the_longest_run_
     assert given[6:] == [None, 0.01]
 
 
+@pytest.mark.slow
 def test_a_whole_contest_in_small(tmp_path, quick):
     config = composed("benchmark", [*TINY, "seeds=[0,1]", "contenders=[kernel_dual,network_dual]"])
     curves = contest(config, tmp_path)

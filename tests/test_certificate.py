@@ -21,7 +21,15 @@ from ocp_torch.samples import Samples
 from ocp_torch.training.monitor import Silent
 from test_config import configured
 
-CHEAP = CertificateSettings(points=512, replicates=2, trajectories=8, ascents=4, stage=StageSettings(steps=0))
+CHEAP = CertificateSettings(
+    points=512,
+    replicates=2,
+    trajectories=8,
+    ascents=4,
+    occupation_states=36,
+    mollify=False,
+    stage=StageSettings(steps=0),
+)
 
 
 def fields_near_the_truth(problem) -> Fields:

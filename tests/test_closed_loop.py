@@ -73,6 +73,7 @@ def test_the_value_differs_from_that_of_the_loop_by_the_slack_met_along_its_traj
     torch.testing.assert_close(value(x) - problem.exact_value(x), met, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 @zoo.on(zoo.FEW_SMOOTH)
 def test_the_bounds_of_a_poor_controller_are_above_its_own_performance(problem):
     """Not only above OPT: a bound speaks of the controller it is given."""

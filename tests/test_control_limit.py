@@ -222,6 +222,7 @@ def test_the_bounds_at_the_exact_truth_are_the_optimum(problem):
     assert bounds.lagrangian.value == pytest.approx(problem.exact_optimum, rel=1e-9)
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(st.sampled_from(zoo.LIMITED), st.integers(0, 10**6), st.sampled_from([0.1, 1.0, 5.0]))
 def test_random_networks_obey_weak_duality_and_the_limit(name, seed, size):

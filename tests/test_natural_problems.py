@@ -386,6 +386,7 @@ def test_goals_onto_which_the_flow_contracts_leave_no_bound_on_the_occupation(na
     assert zoo.build(name).occupation_bound == math.inf
 
 
+@pytest.mark.slow
 # Truth by the grid.
 @zoo.on(["arm n=2", "kuramoto n=3", "phase neurons n=2", "pendulum"])
 def test_control_is_worth_something_and_the_grid_says_how_much(problem):

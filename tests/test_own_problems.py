@@ -87,6 +87,7 @@ def test_its_slips_are_named(module):
         build_problem(composed("train", [f"problem._target_={module[1]}.Pendula", "problem.couplin=1"])["problem"])
 
 
+@pytest.mark.slow
 def test_what_is_printed_and_stored_is_what_is_trained(finished, module):
     wanted = {"_target_": f"{module[1]}.Pendula", "coupling": 0.2}
     stored = yaml.safe_load((finished / ".hydra" / "config.yaml").read_text())
@@ -104,6 +105,7 @@ def commands(script: str, run) -> list[str]:
     }[script]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", ["evaluate", "reference", "rollout"])
 def test_a_script_given_its_run_answers_with_the_command_to_copy(script, finished, module):
     typed = commands(script, finished)
@@ -144,6 +146,7 @@ def test_loading_says_how_and_refuses_other_arguments(finished, module):
         load_controller(file, problem=made.Pendula(0.2, control_limit=None))
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_the_arguments_it_has(finished, module):
     said = train(f"resume={finished}", "trainer.steps=6", cwd=module[0]).sentence
     words = shlex.split(said.rpartition("if it is yours: ")[2])

@@ -43,6 +43,7 @@ def test_states_of_a_path_are_those_of_the_flow():
     assert path.late(0.25).shape == (2, 2, 1)
 
 
+@pytest.mark.slow
 @zoo.on(list(BETTER))
 def test_the_classical_controller_does_what_no_control_does_not(request, problem):
     number, larger = BETTER[request.node.callspec.params["problem"]]

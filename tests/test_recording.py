@@ -296,6 +296,7 @@ def certificate_of(data, problem, seed, value=None, steps=0):
     return certify_fields(data, Trained(fields, None, network), bounds, settings_, Run("dataset", "dual", seed))
 
 
+@pytest.mark.slow
 def test_the_lower_bound_at_the_exact_value_covers_the_optimum_as_often_as_it_says(tmp_path):
     """60 data sets: at the exact V the slack is 0 and F_M is an unbiased estimate of OPT; 95 % intervals cover."""
     problem, hits = zoo.build("manufactured 1-d q=2"), 0
@@ -384,6 +385,7 @@ def test_a_density_without_bound_is_noticed_without_a_simulation(tmp_path, disco
 RUN = ("problem=dataset", "certificate.stage.steps=10", "certificate.stage.rounds=1", "trainer.evaluate_every=10")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["dual", "primal", "pd"])
 @pytest.mark.parametrize("varying", [False, True])
 def test_runs_on_recorded_samples_leave_all_their_files(tmp_path, method, varying):

@@ -77,6 +77,7 @@ def test_kinked_problems_are_solved_within_the_stated_error(name):
     assert "settled" not in table(reference)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SMOOTH)
 def test_smooth_problems_are_solved_within_the_stated_error(name):
     assert_true_within_its_error(*SMOOTH[name], close=2e-2)
@@ -351,6 +352,7 @@ def test_a_wrong_field_is_refused_before_anything_is_solved(change, words):
         prepare(CONFIG | change)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["dual", "primal network"])
 def test_a_run_is_drawn_beside_the_grid_in_its_own_folder(method, tmp_path):
     """With a `V` network and without one."""

@@ -280,6 +280,7 @@ class Mine(Problem):
 """
 
 
+@pytest.mark.slow
 def test_a_problem_of_your_own_is_not_imported_for_a_file_but_must_be_named_again(tmp_path):
     canary, folder = tmp_path / "canary", tmp_path / "run"
     name = f"own_{time.monotonic_ns()}"

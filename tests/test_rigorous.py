@@ -300,6 +300,7 @@ CASES = [(n, options) for n in ("circle rho=4", "manufactured 1-d q=1.5") for op
     ("torus 1-d none", {}), ("manufactured 1-d q=1.2", {}), ("manufactured 1-d q=2", {"modes": 4})]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "options"), CASES)
 def test_the_proved_supremum_and_integral_hold_what_a_fine_grid_meets_and_are_tight(name, options):
     problem = zoo.build(name)

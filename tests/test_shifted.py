@@ -216,7 +216,9 @@ def test_the_slack_of_a_recombination_is_that_of_its_field():
 
 
 @pytest.mark.parametrize("name", ["manufactured 2-d q=1.5", "manufactured 1-d q=2"])
-def test_a_last_layer_chosen_anew_finds_the_subsolution_that_it_can_represent(name):
+def test_a_last_layer_chosen_anew_finds_the_subsolution_that_it_can_represent(name, monkeypatch):
+    monkeypatch.setattr("ocp_torch.certificate.recombined.STATES", 1024)
+    monkeypatch.setattr("ocp_torch.certificate.mollified.RADII", (1.0 / 64.0,))
     problem = zoo.build(name)
     value = perturbed(problem)
     sets = replicated_samples(problem, 1024, 8, seed=0, divergences=False)

@@ -78,6 +78,7 @@ def test_the_exact_value_as_control_variate_leaves_nothing_to_simulate(problem):
     assert simulated.largest_value == pytest.approx(float(problem.exact_value(starts).max()), rel=1e-10)
 
 
+@pytest.mark.slow
 @zoo.on(("manufactured 2-d mu0", "swing"))
 def test_a_control_variate_does_not_change_the_answer(problem):
     """Any smooth value function will do, and any controller: from the same starts nothing but the bias is left."""
@@ -92,6 +93,7 @@ def test_a_control_variate_does_not_change_the_answer(problem):
     assert varied.se == pytest.approx(plain.se, rel=0.05)
 
 
+@pytest.mark.slow
 @zoo.on(("manufactured 1-d q=2", "manufactured 2-d mu0", "manufactured 2-d B(x)", "manufactured 3-d m=2"))
 def test_a_controller_loses_half_its_squared_distance_from_the_optimal_one(problem):
     """`Perf(u) - OPT = E_{mu^u} |u - u*|^2 / 2` for `q = 2` and smooth `V*`; the right side simulated by itself."""

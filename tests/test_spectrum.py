@@ -46,6 +46,7 @@ def interactions(draw):
     return torch.tensor(draw(st.lists(wave, min_size=1, max_size=4)))
 
 
+@pytest.mark.slow
 @given(interactions())
 @settings(max_examples=12, deadline=None)
 def test_every_planted_wave_is_found(waves):
