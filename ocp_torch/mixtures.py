@@ -118,19 +118,16 @@ def worth(weights: Tensor) -> float:
 
 @torch.no_grad()
 def fitted_mixture(
-    function: Callable[[Tensor], Tensor], dim: int, scanned: tuple[Tensor, Tensor] | None = None, broad: float = BROAD
+    function: Callable[[Tensor], Tensor], dim: int, scanned: int = SCANNED, broad: float = BROAD
 ) -> Mixture:
     """A density to integrate ``function >= 0`` ``(N, d) -> (N,)`` by; uniform where uniform states are worth ``broad``.
 
-    ``scanned`` are uniform states and the function there, by default `SCANNED` Sobol points. Tempered: densities are fitted
-    in turn to powers of the function that rise to 1 as fast as the last one's states allow.
+    It is looked at ``scanned`` Sobol points and on ascents from the highest. Tempered: densities are fitted in turn to powers
+    of the function that rise to 1 as fast as the last one's states allow.
     """
     log = lambda x: batched(function, x).clamp_min(0.0).log()
-    if scanned is None:
-        x = scrambled_sobol(SCANNED, dim, 1, torch.float64)
-        level = log(x)
-    else:
-        x, level = scanned[0], scanned[1].clamp_min(0.0).log()
+    x = scrambled_sobol(scanned, dim, 1, torch.float64)
+    level = log(x)
     top = supremum(log, x[level.topk(min(4 * ASCENTS, len(x))).indices], ASCENTS, ASCENT_STEPS, differentiable=False)
     if not math.isfinite(top.value):
         return Mixture.uniform(dim)

@@ -6,10 +6,13 @@ uniform state carries its mass, and none of a few.
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
-from ocp_torch.mixtures import Mixture, fitted_mixture
+from ocp_torch.mixtures import SCANNED, Mixture, fitted_mixture
+from ocp_torch.problems.callable import Callable as BlackBox
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samplers import derive_seed
 
@@ -22,6 +25,8 @@ SPIKE_STARTS = 0.125
 BROAD_COST = 0.05
 # Candidates for each start that is to carry as much mass as all others.
 CANDIDATES = 16
+# States at which a simulator is asked, each of which may cost milliseconds, where a formula is looked at `SCANNED`.
+ASKED = 2**12
 
 
 def start_law(problem: Problem) -> Mixture:
@@ -67,6 +72,7 @@ def _fits(problem: Problem) -> tuple[Mixture, Mixture]:
     kept = vars(problem)
     if "_fits" not in kept:
         everywhere = getattr(problem.initial_density, "__func__", None) is Problem.initial_density
-        density = Mixture.uniform(problem.dim) if everywhere else fitted_mixture(problem.initial_density, problem.dim)
-        kept["_fits"] = density, fitted_mixture(problem.state_cost, problem.dim, broad=BROAD_COST)
+        fit = partial(fitted_mixture, dim=problem.dim, scanned=ASKED if isinstance(problem, BlackBox) else SCANNED)
+        density = Mixture.uniform(problem.dim) if everywhere else fit(problem.initial_density)
+        kept["_fits"] = density, fit(problem.state_cost, broad=BROAD_COST)
     return kept["_fits"]

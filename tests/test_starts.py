@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,7 +17,7 @@ from ocp_torch.control_laws import zero_law
 from ocp_torch.environment import make_environment
 from ocp_torch.mixtures import Mixture, fitted_mixture, worth
 from ocp_torch.practice.metrics import random_starts
-from ocp_torch.problems import Problem
+from ocp_torch.problems import Callable, Problem
 from ocp_torch.samplers import evaluation_points
 from ocp_torch.samples import Samples
 from ocp_torch.starts import drawn_starts, initial_points, start_law
@@ -176,6 +177,19 @@ def test_episodes_of_the_environment_start_there():
     environment = make_environment(NarrowStart(*NARROW["2-d"]), control_bound=1.0)
     states = [environment.reset(seed=k)[1]["state"] for k in range(20)]
     assert all(float(short_way(torch.as_tensor(x), [0.37, 0.91]).abs().max()) < 0.03 for x in states)
+
+
+def test_a_simulator_is_asked_at_few_states_for_it():
+    asked = []
+
+    def oracle(x):
+        asked.append(len(x))
+        return np.ones(len(x)), None, np.broadcast_to(np.eye(2), (len(x), 2, 2))
+
+    problem = Callable(oracle, dim=2)
+    asked.clear()
+    assert start_law(problem).is_uniform
+    assert sum(asked) < 6000
 
 
 def test_the_same_starts_come_again():
