@@ -279,8 +279,8 @@ def flat(level: float = 0.7):
     return lambda y: torch.full_like(y, level)
 
 
-# Every one builds a problem with `truth`, an enclosure of OPT, `idle_between`, one of what doing nothing costs, and `formula`,
-# about V*.
+# Every one builds a problem with `truth`, an enclosure of OPT, `idle_between`, one of what doing nothing costs, and
+# `formula`, about V*.
 FAMILY = {
     "hole 1-d": lambda: Hole(1, 0.0025),
     "hole 2-d": lambda: Hole(2, 0.0025),

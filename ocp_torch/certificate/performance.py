@@ -4,6 +4,10 @@ For any smooth `V`, `V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt` exactly alo
 `Q_u = V - f - R(u) - grad V . (a + B u) / rho`. So `Perf(u) = E[V mu0] - E int rho e^{-rho t} Q_u`, and what is left to
 simulate, with all its errors, is as small as `Q_u`.
 
+On a sliding mode, where a controller jumps to and fro at a kink of `V`, no step is small enough for `grad V . (a + B u)` to
+be the rate at which `V` changes: the sum of it is carried along, and where that is no more the change of `V`, what it is off
+by is taken off the slack.
+
 The infinite horizon is truncated, with the tail bounded; or each trajectory stops at a time `T ~ Exp(rho)` of its own,
 and `E[rate(x_T)]` is the discounted integral, without a tail.
 """
@@ -49,19 +53,27 @@ class Simulated:
     end_states: Tensor
 
 
-def _dynamics(problem: Problem, law: ControlLaw, value: Field | None) -> Dynamics:
+def _dynamics(problem: Problem, law: ControlLaw, value: Field | None, allowed: float = 0.0) -> Dynamics:
+    """The closed loop and what it costs; with ``value`` its slack `-Q_u`, and the sum of `grad V . g`, from `V` at the start
+    on, as one more coordinate: where it is off `V` by more than ``allowed``, that excess is taken off.
+
+    For any such sum `z` the discounted integral of `f + R(u) - z + z' / rho` is the cost less `z` at the start.
+    """
     cost, rho = problem.control_cost, problem.discount
 
-    def dynamics(x: Tensor) -> tuple[Tensor, Tensor]:
+    def dynamics(state: Tensor) -> tuple[Tensor, Tensor]:
         if value is None:
-            u = law(x)
-            return problem.velocity(x, u), problem.state_cost(x) + cost.cost(u)
+            u = law(state)
+            return problem.velocity(state, u), problem.state_cost(state) + cost.cost(u)
+        x, summed = state[:, :-1], state[:, -1]
         samples = Samples.of(problem, x, divergences=False)
         v, gradient = calculus.value_and_gradient(value, x)
         own = isinstance(law, ValueLaw) and law.value is value
         u = law.control(samples.B, gradient) if own else law(x)
         velocity = samples.a + torch.einsum("ndm,nm->nd", samples.B, u)
-        return velocity, -formulas.bellman_slack(samples, v, gradient, u, cost, rho)
+        rate = -formulas.bellman_slack(samples, v, gradient, u, cost, rho)
+        change = (gradient * velocity).sum(dim=-1, keepdim=True)
+        return torch.cat([velocity, change], dim=-1), rate - torch.nn.functional.softshrink(summed - v, allowed)
 
     return dynamics
 
@@ -97,33 +109,41 @@ def simulate_performance(
     random = horizon == RANDOM
     points, mass = starting_points(problem, trajectories, replicates, seed, extra=int(random))
     x0 = points[:, :dim]
-    dynamics = _dynamics(problem, law, value)
     with torch.no_grad():
-        velocity, rate = dynamics(x0)
-        base = value(x0) if value is not None else torch.zeros_like(rate)
+        base = value(x0) if value is not None else torch.zeros_like(x0[:, 0])
+        state = x0 if value is None else torch.cat([x0, base.unsqueeze(-1)], dim=-1)
+        velocity, rate = _dynamics(problem, law, value)(state)
+        velocity = velocity[:, :dim]
     if not (torch.isfinite(velocity).all() and torch.isfinite(rate).all()):
         return Simulated(Estimate(math.nan, math.nan), math.nan, x0)
     # By the slack's definition `V - Q_u = f + R(u) + grad V . g / rho`: the answer's size also where `E[V mu0]` is far off.
     size = max(float((mass * (base + rate)).mean().abs()), LEAST * float((mass * problem.state_cost(x0)).mean()), 1e-12)
+    allowed = tolerance * size  # what a trajectory's cost may be off by, as in `refined`
+    dynamics = _dynamics(problem, law, value, allowed)
     largest_rate = RATE_ROOM * float(rate.abs().max())
     if random:
         times = -torch.log1p(-points[:, dim]) / rho
         longest = float(times.max())
-        integrate = lambda rows, count: rate_at(dynamics, x0[rows], rho, times[rows], count)
+        integrate = lambda rows, count: rate_at(dynamics, state[rows], rho, times[rows], count, wrap=False)
     else:
         longest = max(math.log(max(largest_rate / (TAIL * size), math.e)), 1.0) / rho
-        integrate = lambda rows, count: discounted_integral(dynamics, x0[rows], rho, longest, count, grading=GRADING)
+        integrate = lambda rows, count: discounted_integral(
+            dynamics, state[rows], rho, longest, count, wrap=False, grading=GRADING
+        )
     speed = float(velocity.norm(dim=-1).max())
     steps = max(8, 2 * math.ceil(0.5 * longest * max(rho / 0.4, speed / 0.2)))
     generator = torch.Generator().manual_seed(derive_seed(seed, SIMULATION_REPLICATE))
     means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
     noise = lambda results: Estimate.of(means(results).tolist()).se
     result, end, bias = refined(integrate, mass, steps, tolerance * size, generator, noise)
+    ended = end[:, :dim].remainder(1.0)
+    with torch.no_grad():
+        if value is not None:
+            bias += allowed * float((mass * ((end[:, dim] - value(ended)).abs() > allowed)).mean())
+        largest_rate = max(largest_rate, RATE_ROOM * float(dynamics(end)[1].abs().max()))
     if not random:
-        with torch.no_grad():
-            largest_rate = max(largest_rate, RATE_ROOM * float(dynamics(end)[1].abs().max()))
         bias += math.exp(-rho * longest) * largest_rate * float(mass.mean())
     parts = means(result).tolist()
     totals = [part + (initial[r % len(initial)] if initial else 0.0) for r, part in enumerate(parts)]
     perf = widened(Estimate.of(totals, bias=bias), [mass * result])
-    return Simulated(perf, None if random else float((base + result).max()), end)
+    return Simulated(perf, None if random else float((base + result).max()), ended)

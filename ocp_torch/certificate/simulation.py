@@ -49,7 +49,9 @@ def discounted_integral(
 
 
 @torch.no_grad()
-def rate_at(dynamics: Dynamics, x0: Tensor, rho: float, times: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+def rate_at(
+    dynamics: Dynamics, x0: Tensor, rho: float, times: Tensor, steps: int, wrap: bool = True
+) -> tuple[Tensor, Tensor]:
     r"""An estimate of `rho int e^{-rho t} rate(x_t) dt` per trajectory ``(N,)``, and its state ``(N, d)`` at a time of its
     own, by RK4; ``times`` ``(N,)`` are draws of `T ~ Exp(rho)`.
 
@@ -65,7 +67,7 @@ def rate_at(dynamics: Dynamics, x0: Tensor, rho: float, times: Tensor, steps: in
         if k >= steps - window:
             s = k * ds
             total = total + (weight(s) * r1 + 2.0 * weight(s + 0.5 * ds) * (r2 + r3) + weight(s + ds) * r4) / 6.0
-    return total / window, x.remainder(1.0)
+    return total / window, x.remainder(1.0) if wrap else x
 
 
 def _step(dynamics: Dynamics, x: Tensor, h: tuple) -> tuple[Tensor, tuple[Tensor, ...]]:
