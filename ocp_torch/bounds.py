@@ -112,16 +112,17 @@ def is_unbounded(problem: Problem, occupation_bound: float | None = None) -> boo
 
 
 def state_cost_supremum(problem: Problem) -> float:
-    """`sup f`: the problem's own bound, or a sampled and climbed estimate with head-room."""
-    if problem.state_cost_bound is not None:
-        return problem.state_cost_bound
+    """`sup f`: the problem's own bound, unless more is met; or a sampled and climbed estimate with head-room."""
+    given = problem.state_cost_bound
+    if given is not None and not (problem.evaluable and problem.scan_factor):
+        return given
     (x,) = problem.survey(SURVEYED, 1, "x")
     if problem.evaluable:
         x = torch.cat([x, odd_states(problem, SCANNED * problem.scan_factor, 0)])
     found = supremum(problem.state_cost, x, differentiable=False)
     if not math.isfinite(found.value):
         raise ProblemError(f"state_cost is {found.value} at {place(found.x)}; it must be finite on the whole torus.")
-    return MARGIN * found.value
+    return given if given is not None and found.value <= given else MARGIN * found.value
 
 
 def _estimate_value_bound(problem: Problem) -> tuple[float, str]:
@@ -143,7 +144,7 @@ def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
     (mu0,) = problem.survey(SURVEYED, 1, "mu0")
     guess = OCCUPATION_WEIGHT if is_unbounded(problem) else OCCUPATION_GUESS
     if problem.evaluable and starts_narrowly(problem):
-        mu0 = problem.initial_density(drawn_starts(problem, SEARCHED // 32, 1))
+        mu0 = problem.initial_density(drawn_starts(problem, SURVEYED // 32, 1))
     return guess * float(mu0.max()), f"a guess to train with, {guess:g} times sup mu0"
 
 

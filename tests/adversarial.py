@@ -289,7 +289,6 @@ FAMILY = {
     "hole 2-d rho=0.5": lambda: Hole(2, 0.003, discount=0.5),
     "hole 3-d q=1.5": lambda: Hole(3, 0.02, q=1.5, discount=6.0),
     "hole 5-d": lambda: Hole(5, 0.05),
-    "hole 5-d needle": lambda: Hole(5, 0.005),
     "hole rho=50": lambda: Hole(2, 0.002, discount=50.0),
     "hole rho=0.05": lambda: Hole(1, 0.002, discount=0.05),
     "well q=1.2": lambda: Lines(Line(dip(width=0.03)), q=1.2),
@@ -329,7 +328,6 @@ FAMILY = {
     "flat": lambda: Lines(Line(flat()), Line(flat(0.0))),
     "flat 5-d": lambda: Lines(*(Line(flat()) for _ in range(5))),
     "flat with a drift": lambda: Lines(Line(flat(), sink(0.3, 3.0)), Line(flat())),
-    "free": lambda: Lines(Line(flat(0.0)), Line(flat(0.0))),
     "dear": lambda: Lines(Line(dip(width=0.1, depth=1e3, level=1e3))),
     "cheap": lambda: Lines(Line(dip(width=0.1, depth=1e-4, level=1e-4))),
 }
