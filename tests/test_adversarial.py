@@ -39,8 +39,7 @@ VALUES, DENSITIES = tuple(values(Hole(1, 0.1))), tuple(densities(Hole(1, 0.1)))
 STILL = ("sup f", "mean f", "above")
 
 
-@pytest.mark.parametrize("value", ["sup f", "truth"])
-@pytest.mark.parametrize("name", FEW)
+@pytest.mark.parametrize(("name", "value"), [(n, ("sup f", "truth")[k % 2]) for k, n in enumerate(FEW)])
 def test_a_few_values_are_certified_truly(name, value):
     problem = FAMILY[name]()
     certificate = certified(problem, QUICK, value=values(problem)[value])
@@ -49,8 +48,7 @@ def test_a_few_values_are_certified_truly(name, value):
     assert certificate.contradiction is None
 
 
-@pytest.mark.parametrize("density", ["uniform", "lump"])
-@pytest.mark.parametrize("name", FEW)
+@pytest.mark.parametrize(("name", "density"), [(n, ("uniform", "lump")[k % 2]) for k, n in enumerate(FEW)])
 def test_a_few_densities_are_certified_truly(name, density):
     problem = FAMILY[name]()
     assert faults_of_idling(certified_with_density(problem, density, QUICK), problem, "density") == []
@@ -143,7 +141,7 @@ def test_recorded_samples_are_certified_truly(tmp_path, name, value):
 
 
 @pytest.mark.parametrize("horizon", ["truncated", "random"])
-@pytest.mark.parametrize("tilt", [1.0, 1.3])
+@pytest.mark.parametrize("tilt", [1.3, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_a_controller_that_slides_on_a_kink_of_V_costs_what_it_costs(tilt, horizon):
     """It jumps to and fro at the bottom of a cone, where `grad V . g` is never the rate at which `V` changes; simulated
     without `V` it costs half as much again as with it, were that not seen."""
@@ -152,7 +150,7 @@ def test_a_controller_that_slides_on_a_kink_of_V_costs_what_it_costs(tilt, horiz
     x = (torch.arange(2**14, dtype=torch.float64).unsqueeze(-1) + 0.5) / 2**14
     initial = [float(V(x).mean())] * 8
     law = ValueLaw(problem, V)
-    perf = lambda value, initial: simulate_performance(problem, law, 64, 8, 0, value, initial, horizon, 1e-2).perf
+    perf = lambda value, initial: simulate_performance(problem, law, 16, 8, 0, value, initial, horizon, 1e-2).perf
     (low, high), (least, most) = perf(V, initial).interval(0.999), perf(None, None).interval(0.999)
     assert high >= problem.truth[0]
     assert low <= most
@@ -172,7 +170,8 @@ def test_a_bound_of_the_cost_that_is_too_small_is_not_believed():
 
 def test_an_M_that_is_too_small_is_refuted_by_a_controller_that_gathers_mass():
     problem = Lines(Line(dip(0.4, 0.1)), occupation_bound=1.5)
-    certificate = certified(problem, replace(CHEAP, occupation_states=24), value=problem.formula)
+    valley = lambda x: 0.5 - 0.2 * (2.0 * torch.pi * (x[:, 0] - 0.4)).cos()
+    certificate = certified(problem, replace(CHEAP, occupation_states=24), value=valley)
     assert not certificate.counts("F_M")
     assert faults(certificate, problem) == []
 
