@@ -140,7 +140,7 @@ def test_recorded_samples_are_certified_truly(tmp_path, name, value):
     assert faults(certificate, problem) == []
 
 
-@pytest.mark.parametrize("horizon", ["truncated", "random"])
+@pytest.mark.parametrize("horizon", [pytest.param("truncated", marks=pytest.mark.slow), "random"])
 @pytest.mark.parametrize("tilt", [1.3, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_a_controller_that_slides_on_a_kink_of_V_costs_what_it_costs(tilt, horizon):
     """It jumps to and fro at the bottom of a cone, where `grad V . g` is never the rate at which `V` changes; simulated
