@@ -12,6 +12,7 @@ from ocp_torch.extremum import supremum
 from ocp_torch.needs import GIVEN, GUESSED, SEARCHED
 from ocp_torch.problems.blame import place
 from ocp_torch.problems.problem import MARGIN, Problem
+from ocp_torch.scan import odd_states
 from ocp_torch.starts import drawn_starts, starts_narrowly
 
 # Without any knowledge of mu*, M is this multiple of sup mu0 on recorded data, where there is no bound without M.
@@ -20,6 +21,8 @@ OCCUPATION_GUESS = 4.0
 OCCUPATION_WEIGHT = 40.0
 # States a problem is searched at for what it does not say.
 SURVEYED = 2**13
+# States scanned for a spike of `f`, for each that `Problem.scan_factor` asks for.
+SCANNED = 2**15
 
 FROM_CONFIGURATION, FROM_PROBLEM, ESTIMATED = "configuration", "problem", "estimated"
 
@@ -109,14 +112,17 @@ def is_unbounded(problem: Problem, occupation_bound: float | None = None) -> boo
 
 
 def state_cost_supremum(problem: Problem) -> float:
-    """`sup f`: the problem's own bound, or a sampled and climbed estimate with head-room."""
-    if problem.state_cost_bound is not None:
-        return problem.state_cost_bound
+    """`sup f`: the problem's own bound, unless more is met; or a sampled and climbed estimate with head-room."""
+    given = problem.state_cost_bound
+    if given is not None and not (problem.evaluable and problem.scan_factor):
+        return given
     (x,) = problem.survey(SURVEYED, 1, "x")
+    if problem.evaluable:
+        x = torch.cat([x, odd_states(problem, SCANNED * problem.scan_factor, 0)])
     found = supremum(problem.state_cost, x, differentiable=False)
     if not math.isfinite(found.value):
         raise ProblemError(f"state_cost is {found.value} at {place(found.x)}; it must be finite on the whole torus.")
-    return MARGIN * found.value
+    return given if given is not None and found.value <= given else MARGIN * found.value
 
 
 def _estimate_value_bound(problem: Problem) -> tuple[float, str]:

@@ -81,10 +81,13 @@ def climb(
 
 
 def _gradient(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """Gradient of ``function`` at each row of ``x``."""
+    """Gradient of ``function`` at each row of ``x``; 0 where it is one of constants, piece by piece."""
     with torch.enable_grad():
         x = x.detach().requires_grad_(True)
-        (gradient,) = torch.autograd.grad(function(x).sum(), x)
+        total = function(x).sum()
+        if not total.requires_grad:
+            return torch.zeros_like(x)
+        (gradient,) = torch.autograd.grad(total, x, materialize_grads=True)
     return gradient
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from ocp_torch.bounds import Bounds
 from ocp_torch.certificate.assumptions import Met, check_assumptions
@@ -23,7 +23,6 @@ from ocp_torch.certificate.progress import Progress, silent
 from ocp_torch.certificate.recorded import certify_recorded
 from ocp_torch.certificate.regularity import largest_jump
 from ocp_torch.certificate.rigorous import RigorousBound, proved_lower
-from ocp_torch.certificate.scan import odd_states
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.sides import LowerSide, lower_side, upper_side
 from ocp_torch.certificate.stage import fit_closed_loop
@@ -35,6 +34,7 @@ from ocp_torch.fields.fields import Fields
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
+from ocp_torch.scan import odd_states
 
 # Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
 # a controller that another one clearly beats.
@@ -86,11 +86,11 @@ def certify_fields(
     seed, count = run.seed, settings.replicates
     has_value, has_density = fields.value is not None, fields.control_density is not None
     lower = None
+    odd = odd_states(problem, settings.scanned(problem), seed)
     part = max(TANGENT_PART, problem.dim // 2)
     few = replicated_samples(problem, max(1, settings.points // part), count, seed, divergences=True)
     if has_value:
         sets = replicated_samples(problem, settings.points, count, seed, divergences=False)
-        odd = odd_states(problem, settings.scanned(problem), seed)
         lower = lower_side(
             problem, fields.value, sets, bounds.M, settings.ascents, settings.searches(bounds), seed, odd
         )
@@ -119,7 +119,7 @@ def certify_fields(
             )
     if settings.stage.steps:
         progress("closed-loop fit")
-        stage, notes = certification_stage(problem, trained, fields, bounds, settings, few, lower, best, seed)
+        stage, notes = certification_stage(problem, trained, fields, bounds, settings, few, lower, best, seed, odd)
         warnings += notes
     progress("assumptions")
     met = measured(problem, laws[best], finite.get(best), few, posed, settings)
@@ -240,8 +240,10 @@ def certification_stage(
     lower: LowerSide | None,
     kind: str,
     seed: int,
+    odd: Tensor,
 ) -> tuple[ClosedLoopBounds | None, list[str]]:
-    """Fit `mu` to the closed loop of the controller ``kind`` and evaluate its bounds; ``fields`` are float64 copies."""
+    """Fit `mu` to the closed loop of the controller ``kind`` and evaluate its bounds, suprema at the states ``odd`` too;
+    ``fields`` are float64 copies."""
     if not problem.gives_divergences:
         return None, ["no upper bound without simulation: this problem gives no divergences of a and B."]
     rough = control_laws(trained.occupation, problem, trained.fields, bounds)[kind]
@@ -254,7 +256,7 @@ def certification_stage(
     value = fields.value if fields.value is not None else fitted.value
     initial = lower.initial if lower is not None else None
     judge = lambda sets: closed_loop_bounds(
-        loop, value, fitted.log_occupation, loop.samples_of(sets), settings.ascents, kind, initial
+        loop, value, fitted.log_occupation, loop.samples_of(sets), settings.ascents, kind, initial, odd
     )
     return sharpened(judge, problem, sets, seed), []
 

@@ -32,7 +32,7 @@ from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.hidden import Flux, Hidden, hidden_divergence
 from ocp_torch.certificate.shifted import slack_function
 from ocp_torch.certificate.tails import widened
-from ocp_torch.extremum import Extremum, minimiser, supremum
+from ocp_torch.extremum import Extremum, batched, minimiser, supremum
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.samples import Samples
 
@@ -64,16 +64,22 @@ def closed_loop_bounds(
     ascents: int,
     controller: str,
     initial: list[float] | None = None,
+    odd: Tensor | None = None,
 ) -> ClosedLoopBounds:
-    """Evaluate both bounds on ``sets`` of samples of ``loop``; the suprema are sampled on them and climbed.
+    """Evaluate both bounds on ``sets`` of samples of ``loop``; the suprema are sampled on them, and at the states ``odd``
+    ``(K, d)`` too, and climbed.
 
     ``initial``, if given, is `E[V mu0]` per set from more states: it carries nearly all of the variance.
     """
     values = [_integrands(loop, value, log_occupation, samples) for samples in sets]
     states = torch.cat([samples.x for samples in sets])
     slack_all = torch.cat([slack for *_, slack, _ in values])
-    top = _climbed(value, torch.cat([v for v, *_ in values]), states, ascents)
+    tops = torch.cat([v for v, *_ in values])
     slack = slack_function(loop, value)
+    if odd is not None and len(odd):
+        states = torch.cat([states, odd])
+        tops, slack_all = torch.cat([tops, batched(value, odd)]), torch.cat([slack_all, batched(slack, odd)])
+    top = _climbed(value, tops, states, ascents)
     eps_lo = _climbed(slack, slack_all, states, ascents)
     eps_hi = _climbed(lambda x: -slack(x), -slack_all, states, ascents)
     C_V = top.value + eps_hi.value

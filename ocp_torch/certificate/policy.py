@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from ocp_torch.bounds import Bounds
 from ocp_torch.calculus import Field
@@ -24,7 +24,6 @@ from ocp_torch.certificate.estimate import integral, replicated_samples
 from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.performance import simulate_performance
 from ocp_torch.certificate.progress import Progress, silent
-from ocp_torch.certificate.scan import odd_states
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.sides import lower_side
 from ocp_torch.certificate.stage import fit_closed_loop
@@ -34,6 +33,7 @@ from ocp_torch.control_laws import ControlLaw, ValueLaw, zero_law
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samples import Samples
+from ocp_torch.scan import odd_states
 
 # The name under which its performance stands in a certificate.
 GIVEN = "given"
@@ -59,10 +59,11 @@ def certify_policy(
     wide = replicated_samples(problem, settings.points, count, seed, divergences=False)
     few = replicated_samples(problem, max(1, settings.points // part), count, seed, divergences=False)
     posed = check_problem(problem, wide)
+    odd = odd_states(problem, settings.scanned(problem), seed)
     warnings: list[str] = []
     if settings.stage.steps:
         progress("closed-loop fit")
-    evaluated, own = evaluate_policy(problem, law, network, bounds, settings, few, wide, seed)
+    evaluated, own = evaluate_policy(problem, law, network, bounds, settings, few, wide, seed, odd)
     if settings.stage.steps and evaluated is None:
         warnings.append("no bound on Perf without simulation: this problem gives no divergences of a and B.")
     simulate = lambda law, number, value=None, initial=None: simulate_performance(
@@ -72,7 +73,6 @@ def certify_policy(
     lower = None
     if value is not None:
         progress("bounds")
-        odd = odd_states(problem, settings.scanned(problem), seed)
         lower = lower_side(problem, value, wide, bounds.M, ascents, settings.searches(bounds), seed, odd)
     if number:
         progress("simulation")
@@ -137,8 +137,10 @@ def evaluate_policy(
     few: list[Samples],
     wide: list[Samples],
     seed: int,
+    odd: Tensor,
 ) -> tuple[ClosedLoopBounds | None, Field | None]:
-    """Bounds on `Perf(u)` from fields fitted to the closed loop of ``law``, and the fitted `V^u`; `None` without a fit."""
+    """Bounds on `Perf(u)` from fields fitted to the closed loop of ``law``, their suprema sought at the states ``odd`` too,
+    and the fitted `V^u`; `None` without a fit."""
     if not (settings.stage.steps and problem.gives_divergences):
         return None, None
     fitted = in_float64(fit_closed_loop(problem, law, None, network, bounds, settings.stage, seed))
@@ -146,6 +148,6 @@ def evaluate_policy(
     with torch.no_grad():
         initial = [integral(s, fitted.value(s.x) * s.mu0) for s in wide]
     judge = lambda sets: closed_loop_bounds(
-        loop, fitted.value, fitted.log_occupation, loop.samples_of(sets), settings.ascents, GIVEN, initial
+        loop, fitted.value, fitted.log_occupation, loop.samples_of(sets), settings.ascents, GIVEN, initial, odd
     )
     return sharpened(judge, problem, few, seed), fitted.value

@@ -10,6 +10,9 @@ from ocp_torch.certificate.stage import StageSettings
 from ocp_torch.errors import require_choice, require_flag, require_integer, require_number
 from ocp_torch.problems.problem import Problem
 
+# However few the states of a certificate, its problem is scanned as if there were so many: a feature that is missed is one
+# that every bound misses.
+LEAST_SCANNED = 2**17
 # How performance deals with the infinite horizon: stop late and bound the rest, or stop at an exponential time.
 TRUNCATED, RANDOM = "truncated", "random"
 
@@ -45,7 +48,7 @@ class CertificateSettings:
 
     def scanned(self, problem: Problem) -> int:
         """How many states the data of ``problem`` are scanned at for narrow features."""
-        return problem.scan_factor * self.points * self.replicates
+        return problem.scan_factor * max(self.points * self.replicates, LEAST_SCANNED)
 
     def searches(self, bounds: Bounds) -> bool:
         """Whether the bound without `M` is sought among functions made of `V` too, for a problem of these ``bounds``."""

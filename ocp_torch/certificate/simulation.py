@@ -12,7 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-# Maps states (N, d) to velocities (N, d) and rates (N,) to be discounted and integrated along the way.
+# Maps states (N, d) to velocities (N, d) and rates (N,), or several (N, k), to be discounted and integrated along the way.
 Dynamics = Callable[[Tensor], tuple[Tensor, Tensor]]
 # Maps rows of the batch and a number of steps to a result per trajectory (n,) and their end states (n, d).
 Integrate = Callable[[Tensor, int], tuple[Tensor, Tensor]]
@@ -40,7 +40,7 @@ def discounted_integral(
     time = lambda s: horizon * s**grading
     pace = lambda s: horizon * grading * s ** (grading - 1.0)
     weight = lambda s: rho * math.exp(-rho * time(s)) * pace(s)
-    x, total, ds = x0, torch.zeros_like(x0[:, 0]), 1.0 / steps
+    x, total, ds = x0, 0.0, 1.0 / steps
     for k in range(steps):
         start, middle, end = k * ds, (k + 0.5) * ds, (k + 1.0) * ds
         x, (r1, r2, r3, r4) = _step(dynamics, x, tuple(ds * pace(s) for s in (start, middle, end)))
@@ -49,7 +49,9 @@ def discounted_integral(
 
 
 @torch.no_grad()
-def rate_at(dynamics: Dynamics, x0: Tensor, rho: float, times: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+def rate_at(
+    dynamics: Dynamics, x0: Tensor, rho: float, times: Tensor, steps: int, wrap: bool = True
+) -> tuple[Tensor, Tensor]:
     r"""An estimate of `rho int e^{-rho t} rate(x_t) dt` per trajectory ``(N,)``, and its state ``(N, d)`` at a time of its
     own, by RK4; ``times`` ``(N,)`` are draws of `T ~ Exp(rho)`.
 
@@ -59,13 +61,14 @@ def rate_at(dynamics: Dynamics, x0: Tensor, rho: float, times: Tensor, steps: in
     window = max(1, steps // 4)
     h, ds = (times / steps).unsqueeze(-1), 1.0 / steps
     weight = lambda s: s * (rho * times * (1.0 - s)).exp()
-    x, total = x0, torch.zeros_like(x0[:, 0])
+    x, total = x0, 0.0
     for k in range(steps):
         x, (r1, r2, r3, r4) = _step(dynamics, x, (h, h, h))
         if k >= steps - window:
             s = k * ds
-            total = total + (weight(s) * r1 + 2.0 * weight(s + 0.5 * ds) * (r2 + r3) + weight(s + ds) * r4) / 6.0
-    return total / window, x.remainder(1.0)
+            of = [w if r1.dim() == 1 else w.unsqueeze(-1) for w in map(weight, (s, s + 0.5 * ds, s + ds))]
+            total = total + (of[0] * r1 + 2.0 * of[1] * (r2 + r3) + of[2] * r4) / 6.0
+    return total / window, x.remainder(1.0) if wrap else x
 
 
 def _step(dynamics: Dynamics, x: Tensor, h: tuple) -> tuple[Tensor, tuple[Tensor, ...]]:

@@ -2,8 +2,8 @@
 
 A network varies slowly; what is narrow in a slack comes from `f`, `a` or `B`. They are far cheaper to evaluate than `V` and
 its gradient, so that millions of states can be scanned: a set that takes the part `3 / N` of the torus is met by `N` states
-with 95 % probability. Kept are the states where a column of the data is smallest or largest, and where it differs most from
-its value nearby.
+with 95 % probability. Kept are the states where a column of the data is smallest or largest, those that are reached from
+there downhill and uphill, and the states where a column differs most from its value nearby.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ocp_torch.extremum import climb
 from ocp_torch.problems.problem import Problem
 from ocp_torch.samplers import derive_seed
 
@@ -18,11 +19,21 @@ from ocp_torch.samplers import derive_seed
 STREAM = 10
 # States scanned at once, states kept for each column and kind of oddity, and how far off a neighbour is.
 CHUNK, KEPT, NEARBY = 2**16, 16, 0.02
+# Steps downhill and uphill, along gradients where there are some and then in random directions.
+STEPS = 60
+
+
+def odd_states(problem: Problem, count: int, seed: int) -> Tensor:
+    """States ``(K, d)`` in float64 at which the data of ``problem`` are odd, found among ``count`` uniform ones; found once
+    for a problem, so that looks on the way cost no more."""
+    kept = vars(problem).setdefault("_odd_states", {})
+    if (count, seed) not in kept:
+        kept[count, seed] = _odd_states(problem, count, seed)
+    return kept[count, seed]
 
 
 @torch.no_grad()
-def odd_states(problem: Problem, count: int, seed: int) -> Tensor:
-    """States ``(K, d)`` in float64 at which the data of ``problem`` are odd, found among ``count`` uniform ones."""
+def _odd_states(problem: Problem, count: int, seed: int) -> Tensor:
     pairs = count // 2
     generator = torch.Generator().manual_seed(derive_seed(seed, STREAM))
     draw = lambda size: torch.rand(size, problem.dim, generator=generator, dtype=torch.float64)
@@ -37,8 +48,23 @@ def odd_states(problem: Problem, count: int, seed: int) -> Tensor:
         found["low"] = _highest(found.get("low"), -values, alone)
         found["high"] = _highest(found.get("high"), values, alone)
         found["step"] = _highest(found.get("step"), (here - there).abs(), together)
-    none = draw(0)
-    return torch.cat([none, *(states.reshape(-1, problem.dim) for _, states in found.values())]).unique(dim=0)
+    reached = [
+        _extremes(problem, found[name][1], sign) for name, sign in (("low", -1.0), ("high", 1.0)) if name in found
+    ]
+    kept = [states.reshape(-1, problem.dim) for _, states in found.values()]
+    return torch.cat([draw(0), *kept, *reached]).unique(dim=0)
+
+
+def _extremes(problem: Problem, states: Tensor, sign: float) -> Tensor:
+    """Where the columns are largest, or smallest for a ``sign`` of -1, that can be reached from ``states`` ``(K, C, d)``."""
+    column = torch.arange(states.shape[1]).repeat(len(states)).unsqueeze(-1)
+    own = lambda x: sign * _columns(problem, x).gather(1, column).squeeze(-1)
+    x = states.flatten(0, 1)
+    with torch.enable_grad():
+        smooth = own(x.detach().requires_grad_(True)).requires_grad
+    for differentiable in (True, False)[not smooth :]:
+        x, _ = climb(own, x, own(x), STEPS, differentiable=differentiable)
+    return x.remainder(1.0)
 
 
 def _columns(problem: Problem, x: Tensor) -> Tensor:
