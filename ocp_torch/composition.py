@@ -105,6 +105,7 @@ def prepared(data: dict, overrides: list[str], roots: tuple[Path, ...] = ()) -> 
 def composed(config_name: str, overrides: list[str], roots: tuple[Path, ...] = ()) -> dict:
     """What the job will be given; whatever Hydra or OmegaConf has against it becomes an `InputError` of one sentence."""
     overrides = with_own_defaults(config_name, overrides)
+    require_places(overrides)
     return prepared(_composed(config_name, overrides), overrides, roots)
 
 
@@ -112,7 +113,6 @@ def _composed(config_name: str, overrides: list[str], whole: bool = True) -> dic
     """The composed configuration as plain data; where not the ``whole`` is wanted, what is still missing stays `???`."""
     try:
         with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-            require_places(overrides)
             data = plain(compose(config_name, overrides), whole)
             return require_sections(data, config_name)
     except (HydraException, OmegaConfBaseException, ValueError, TypeError) as error:
@@ -156,6 +156,7 @@ def check_sweep(config_name: str, overrides: list[str], check: Callable[[dict], 
     """Raise `InputError` where a job of the sweep would not even compose, every value of every field, one at a time; or
     where ``check`` lets none through that has a value of some kind: words are, and numbers by their sign. What the problem
     makes of numbers, a sweep may be there to find out."""
+    require_places(overrides)
     try:
         options = BasicSweeper.split_arguments(parsed(overrides), None)[0]
     except HydraException as error:
@@ -163,7 +164,7 @@ def check_sweep(config_name: str, overrides: list[str], check: Callable[[dict], 
     defaults: dict[tuple, dict] = {}
     for one in dict.fromkeys(o for job in options for o in job):
         first = [o for o in next(job for job in options if one in job) if not o.startswith(("hydra.", "hydra/"))]
-        chosen = [o for o in first if is_choice(o)]
+        chosen = [o for o in first if is_choice(o) or o.lstrip("+").startswith("problem._target_=")]
         if (key := tuple(chosen)) not in defaults:
             defaults[key] = _composed(config_name, chosen, whole=False)
         require_kinds(_composed(config_name, first), defaults[key])

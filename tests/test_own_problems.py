@@ -174,7 +174,7 @@ def test_a_run_goes_on_with_the_arguments_it_has(finished, module):
 def test_a_problem_that_fails_late_leaves_a_sentence_and_the_best_look(how, words, stopped, module):
     folder, name = module
     run = folder / f"late_{how}"
-    mine = (f"problem._target_={name}.Ageing", f"problem.how={how}", "problem.calls=2500", f"hydra.run.dir={run}")
+    mine = (f"problem._target_={name}.Ageing", f"problem.how={how}", "problem.calls=4500", f"hydra.run.dir={run}")
     ended = train(*SMALL, *mine, "trainer.steps=400", "trainer.evaluate_every=20", cwd=folder)
     assert ended.status == 2
     for word in words.split("own.*"):

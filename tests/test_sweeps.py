@@ -26,12 +26,12 @@ class Flat(Problem):
 
     def state_cost(self, x):
         self.calls += 1
-        if self.mood == "failing" and self.calls > 12:
+        if self.mood == "failing" and self.calls > 250:
             raise RuntimeError("two\\nlines")
-        if self.mood == "messy" and self.calls > 12:
+        if self.mood == "messy":
             torch.set_default_dtype(torch.float64)
             torch.manual_seed(int(random.random() * 1e6)); numpy.random.seed(3); random.seed(5)
-        return 0.5 + 0.1 * torch.rand(len(x)).to(x)
+        return 0.5 + 0.1 * torch.cos(6.283185307179586 * x[:, 0])
 """
 
 
@@ -80,7 +80,7 @@ def test_whatever_a_job_does_the_others_run_as_if_alone_and_it_is_named(mine, tm
     assert folders.keys() == {"0", "1", "2"}
     assert all(p.name.endswith("_flat_dual_seed0") for p in folders.values())
     assert not (folders["1"] / "certificate.json").exists()
-    assert "Traceback" in (folders["1"] / "train.log").read_text()
+    assert "RuntimeError: two lines" in (folders["1"] / "train.log").read_text()
     alone = tmp_path / "alone"
     ended = train(*way[:-1], "+problem.mood=good", f"hydra.run.dir={alone}", cwd=tmp_path)
     assert ended.status == 0, ended
