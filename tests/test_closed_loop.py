@@ -122,6 +122,7 @@ def test_the_excess_is_what_the_bound_adds_to_its_integral():
     assert without + 1.1 * excess >= found.lagrangian.value
 
 
+@pytest.mark.slow
 @zoo.on(zoo.FEW_SMOOTH)
 def test_the_bounds_do_not_depend_on_the_mass_that_mu_was_given(problem):
     """Every multiple of `mu` is a candidate, and none is above the bound of `mu` itself by more than chance allows."""

@@ -204,6 +204,7 @@ def test_the_exact_truth_solves_its_equations_with_the_limit_reached(problem):
     assert torch.equal(remade.state_cost(x), problem.state_cost(x))
 
 
+@pytest.mark.slow
 @zoo.on(zoo.LIMITED)
 def test_the_bounds_at_the_exact_truth_are_the_optimum(problem):
     grid = lattice(problem.dim)

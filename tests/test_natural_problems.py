@@ -224,6 +224,7 @@ def test_relative_phases_follow_the_absolute_ones(goal):
     torch.testing.assert_close(fast[:, :-1] - fast[:, -1:], slow, **ROUNDING)
 
 
+@pytest.mark.slow
 def test_absolute_and_relative_phases_have_the_same_optimum():
     options = dict(oscillators=2, coupling=0.4, spread=0.8, seed=1)
     line = solve_reference(Kuramoto(**options), side=256)

@@ -159,11 +159,12 @@ def test_a_run_goes_on_with_the_arguments_it_has(finished, module):
     assert json.loads((finished / "certificate.json").read_text())["step"] == 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "words", "stopped"),
     [
         ("always", r"state_cost of own.*Ageing raised RuntimeError: licence expired ask your admin (own", "failed"),
-        pytest.param("somewhere", "raised ValueError: no such state at x = [0.9", "failed", marks=pytest.mark.slow),
+        ("somewhere", "raised ValueError: no such state at x = [0.9", "failed"),
         (
             "holes",
             "where the state cost of the problem is not finite; it must be finite on the whole torus",

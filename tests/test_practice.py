@@ -26,6 +26,7 @@ BETTER = {
 }
 
 
+@pytest.mark.slow
 @zoo.on(["circle rho=2", "manufactured 2-d mu0"])
 def test_a_simulated_cost_is_the_exact_value(problem):
     """The optimal controller costs `V*` but for the tail that the discount makes small."""

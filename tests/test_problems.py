@@ -176,6 +176,7 @@ def test_the_occupation_of_the_circle_is_bounded_exactly_above_discount_one(rho,
     assert (Circle(rho).occupation_bound < math.inf) == bounded
 
 
+@pytest.mark.slow
 @zoo.on(zoo.EXACT)
 def test_the_parameters_make_the_same_problem_again(problem):
     again, x = type(problem)(**problem.parameters), zoo.states(problem, 50)

@@ -70,6 +70,7 @@ def assert_true_within_its_error(make, side, close):
     return reference
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KINKED)
 def test_kinked_problems_are_solved_within_the_stated_error(name):
     reference = assert_true_within_its_error(*KINKED[name], close=5e-3)
@@ -159,6 +160,7 @@ def test_a_constant_cost_is_its_own_optimum():
     assert reference.error <= 1e-9
 
 
+@pytest.mark.slow
 def test_an_added_constant_and_a_shifted_torus_change_nothing_else():
     base = Manufactured(dim=1, seed=3)
     moved = Shell(
@@ -181,6 +183,7 @@ def test_an_uncontrolled_coordinate_that_rests_is_a_parameter():
     assert float((reference.value - reference.value[:, :1]).abs().max()) <= 1e-6
 
 
+@pytest.mark.slow
 def test_the_interpolated_control_is_the_optimal_one_off_the_kinks():
     for problem, side in ((Circle(), 256), (Manufactured(exponent=1.5, seed=1), 48)):
         x = zoo.states(problem, 300, off_kinks=True)

@@ -95,6 +95,7 @@ def test_random_numbers_that_a_problem_draws_itself_are_resumed_too(monkeypatch,
     assert drawn() == wanted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("schedule", ["cosine", "constant", "decay"])
 @pytest.mark.parametrize("method", ["dual", "pd"])
 def test_with_other_steps_a_run_is_one_of_the_new_length(method, schedule, tmp_path):
@@ -222,6 +223,7 @@ def test_a_finished_run_says_so_and_more_steps_go_on_in_its_own_folder(finished,
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_auto_finds_the_last_run_of_this_configuration_or_starts_it(finished, tmp_path):
     folder = tmp_path / "runs" / "mine"
     way = (*TINY, "seed=7", "trainer.steps=5", f"hydra.run.dir={folder}", "resume=auto")

@@ -331,6 +331,7 @@ def test_the_same_in_two_dimensions(name):
     assert bound.slack <= slack + 0.05 * float(V(x).abs().mean())
 
 
+@pytest.mark.slow
 def test_a_small_budget_gives_a_looser_bound_that_still_holds():
     problem, V = Manufactured(dim=1, exponent=1.5), network(1, 2, modes=4)
     bounds = [rigorous_lower_bound(problem, V, cells=cells, tolerance=1e-4) for cells in (1, 150, 20_000)]

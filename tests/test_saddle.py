@@ -49,6 +49,7 @@ def exact_fields(problem, **bumps) -> Fields:
     return Fields({name: Function(formula, bumps.get(name)) for name, formula in truth.items()})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("problem", SMOOTH.values(), ids=SMOOTH.keys())
 @pytest.mark.parametrize("coupling", [0.0, 1.0])
 def test_no_player_gains_by_leaving_the_truth(problem, coupling):

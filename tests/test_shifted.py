@@ -51,6 +51,7 @@ def test_the_multiple_is_the_best_on_a_line_of_multiples(problem):
 case = dict(name=st.sampled_from(zoo.FEW), seed=st.integers(0, 10**6), size=st.sampled_from([1e-2, 0.1, 1.0]))
 
 
+@pytest.mark.slow
 @settings(max_examples=6)
 @given(**case)
 def test_scaling_never_loses_and_never_passes_the_optimum(name, seed, size):

@@ -51,6 +51,7 @@ def wrong_law(problem):
     return lambda x: problem.exact_control(x) + mistake(x)
 
 
+@pytest.mark.slow
 @zoo.on((*zoo.FEW_SMOOTH, "manufactured 1-d q=1.2", "manufactured 2-d q=1.5", "manufactured 3-d interaction=3"))
 def test_the_exact_controller_performs_at_the_optimum(problem):
     perf = simulate_performance(problem, problem.exact_control, trajectories=64, replicates=8, seed=0).perf

@@ -74,6 +74,7 @@ class Flat(Problem):
         return torch.ones_like(x[:, 0])
 
 
+@pytest.mark.slow
 def test_what_the_drift_and_the_controls_couple_counts_as_well():
     problem = Manufactured(dim=6, interaction=5, seed=3)
     assert {tuple(k) for k in problem._V0.waves.tolist()} <= found_in(problem, 64)

@@ -441,6 +441,7 @@ METADATA = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", METADATA)
 def test_a_crafted_controller_costs_little(what, run):
     remade(run, METADATA[what])
