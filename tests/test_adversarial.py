@@ -24,6 +24,7 @@ from honesty import (
 )
 from ocp_torch import config
 from ocp_torch.bounds import resolve_bounds
+from ocp_torch.certificate import StageSettings
 from ocp_torch.certificate.performance import simulate_performance
 from ocp_torch.certificate.table import table
 from ocp_torch.config import build_certificate_settings, build_trainer
@@ -67,7 +68,7 @@ def test_a_few_densities_are_certified_truly(name, density):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "value", "effort", "seed"), some(24, FAMILY, VALUES, EFFORTS, (0, 1)))
+@pytest.mark.parametrize(("name", "value", "effort", "seed"), some(8, FAMILY, VALUES, EFFORTS, (0, 1)))
 def test_every_value_is_certified_truly(name, value, effort, seed):
     problem = FAMILY[name]()
     certificate = certified(problem, EFFORTS[effort], seed, value=values(problem, seed)[value])
@@ -77,17 +78,18 @@ def test_every_value_is_certified_truly(name, value, effort, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "density", "effort", "seed"), some(16, FAMILY, DENSITIES, EFFORTS, (0, 1)))
+@pytest.mark.parametrize(("name", "density", "effort", "seed"), some(8, FAMILY, DENSITIES, EFFORTS, (0, 1)))
 def test_every_density_is_certified_truly(name, density, effort, seed):
     problem = FAMILY[name]()
-    certificate = certified_with_density(problem, density, EFFORTS[effort], seed)
+    settings = replace(EFFORTS[effort], stage=StageSettings(steps=0))  # a fit would start from networks
+    certificate = certified_with_density(problem, density, settings, seed)
     found = faults(certificate, problem) if density == "rough" else faults_of_idling(certificate, problem, "density")
     assert found == []
     assert certificate.contradiction is None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "value"), some(10, FAMILY, (None, "sup f", "truth")))
+@pytest.mark.parametrize(("name", "value"), some(4, FAMILY, (None, "sup f", "truth")))
 def test_doing_nothing_is_certified_truly_as_a_given_controller(name, value):
     problem = FAMILY[name]()
     certificate = certified_idling(problem, THOROUGH, value=value)
@@ -96,7 +98,7 @@ def test_doing_nothing_is_certified_truly_as_a_given_controller(name, value):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "method", "seed"), some(9, FAMILY, ("dual", "primal", "pd"), (0, 1)))
+@pytest.mark.parametrize(("name", "method", "seed"), some(4, FAMILY, ("dual", "primal", "pd"), (0, 1)))
 def test_what_training_ends_with_is_certified_truly(name, method, seed, monkeypatch):
     problem = FAMILY[name]()
     assert faults(trained(problem, method, seed, monkeypatch), problem) == []
@@ -134,10 +136,11 @@ RECORDED = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "value"), some(6, RECORDED, ("sup f", "truth", "1.3 truth")))
+@pytest.mark.parametrize(("name", "value"), some(4, RECORDED, ("sup f", "truth", "1.3 truth")))
 def test_recorded_samples_are_certified_truly(tmp_path, name, value):
     problem = FAMILY[name]()
     data = Dataset(str(record(tmp_path, problem, 4000)))
+    values(problem)[value](torch.zeros(1, problem.dim, dtype=torch.float64))  # the oracle solves outside of transforms
     certificate = certificate_of(data, problem, 0, Exactly(values(problem)[value]), steps=20)
     assert faults(certificate, problem) == []
 
