@@ -1,11 +1,11 @@
 """Controllers for control-affine problems on the torus, with a certificate of how far from optimal they can be."""
 
-from ocp_torch.control_cost import PowerCost
-from ocp_torch.control_limit import LimitedCost
-from ocp_torch.controller import Controller, load_controller
+from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.problems import PROBLEMS, Callable, Circle, Dataset, Manufactured, Problem, Torus
-from ocp_torch.training.given import certify
+from ocp_torch.problems.control_cost import PowerCost
+from ocp_torch.problems.control_limit import LimitedCost
+from ocp_torch.runs.external import certify
 
 __version__ = "0.1.0"
 __all__ = [

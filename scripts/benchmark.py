@@ -5,8 +5,8 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 
-from ocp_torch.benchmark.contest import build, contest
-from ocp_torch.launch import job, launch
+from ocp_torch.cli.launch import job, launch
+from ocp_torch.studies.benchmark.contest import build, contest
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="benchmark")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 
-from ocp_torch.launch import job, launch
-from ocp_torch.training.given import certify_configured, read
+from ocp_torch.cli.launch import job, launch
+from ocp_torch.runs.external import certify_configured, read
 
 
 def certify(config: dict, folder) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from ocp_torch.cli.launch import fail
 from ocp_torch.errors import InputError, nearest, shown
-from ocp_torch.launch import fail
-from ocp_torch.reading import kind
-from ocp_torch.training.comparison import compare
+from ocp_torch.files.reading import kind
+from ocp_torch.runs.compare import compare
 
 
 def main(arguments: list[str]) -> None:

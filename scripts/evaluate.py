@@ -5,11 +5,11 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 
-from ocp_torch.certificate.possible import require_possible
+from ocp_torch.certificate.checks.possible import require_possible
+from ocp_torch.cli.launch import job, launch
 from ocp_torch.errors import require_integer
-from ocp_torch.launch import job, launch
-from ocp_torch.pictures import require_gif
-from ocp_torch.training.evaluation import animated, certify_saved, load_run, settings_for
+from ocp_torch.runs.evaluate import animated, certify_saved, load_run, settings_for
+from ocp_torch.runs.pictures import require_gif
 
 
 def check(config: dict):

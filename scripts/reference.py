@@ -5,8 +5,8 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 
-from ocp_torch.launch import job, launch
-from ocp_torch.reference.session import prepare
+from ocp_torch.cli.launch import job, launch
+from ocp_torch.studies.reference.session import prepare
 
 
 def refer(config: dict, folder) -> None:

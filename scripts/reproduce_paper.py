@@ -5,8 +5,8 @@ from __future__ import annotations
 import hydra
 from omegaconf import DictConfig
 
-from ocp_torch.launch import job, launch
-from ocp_torch.paper.reproduce import check, reproduce
+from ocp_torch.cli.launch import job, launch
+from ocp_torch.studies.paper.reproduce import check, reproduce
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="reproduce_paper")

@@ -9,8 +9,8 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during the slow imports e
 import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
-from ocp_torch.launch import job, launch  # noqa: E402
-from ocp_torch.training.start import prepare, train  # noqa: E402
+from ocp_torch.cli.launch import job, launch  # noqa: E402
+from ocp_torch.runs.start import prepare, train  # noqa: E402
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="train")

@@ -8,7 +8,7 @@ import numpy as np
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from omegaconf import OmegaConf
 
-from ocp_torch import composition
+from ocp_torch.cli import compose as composition
 
 
 def is_field(override: str) -> bool:

@@ -10,12 +10,12 @@ import torch
 
 import zoo
 from adversarial import gaussian
-from ocp_torch.bounds import resolve_bounds
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.certificate import known
-from ocp_torch.certificate.policy import GIVEN, certify_policy
-from ocp_torch.control_laws import NETWORK, zero_law
+from ocp_torch.certificate.external.external import GIVEN, certify_policy
+from ocp_torch.control.policies import NETWORK, zero_law
 from ocp_torch.fields import Fields, PeriodicMLP
+from ocp_torch.problems.constants import resolve_bounds
 from test_traps import Field
 
 # Standard errors by which what counts may be off.

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ocp_torch.certificate import Certificate
-from ocp_torch.certificate.assumptions import Assumptions
-from ocp_torch.certificate.contradictions import examined
+from ocp_torch.certificate.checks.assumptions import Assumptions
+from ocp_torch.certificate.checks.contradictions import examined
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.training.trainer import Trainer
 

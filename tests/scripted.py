@@ -10,8 +10,8 @@ from functools import cache
 
 import torch
 
+from ocp_torch.cli.launch import CHECKOUT, fail, launch
 from ocp_torch.errors import InputError
-from ocp_torch.launch import CHECKOUT, fail, launch
 
 # Script -> the name of its check, where it has one of Hydra's configurations.
 CHECKS = {

@@ -22,14 +22,14 @@ from honesty import (
     faults_of_idling,
     values,
 )
-from ocp_torch import config
-from ocp_torch.bounds import resolve_bounds
 from ocp_torch.certificate import StageSettings
-from ocp_torch.certificate.performance import simulate_performance
-from ocp_torch.certificate.table import table
-from ocp_torch.config import build_certificate_settings, build_trainer
-from ocp_torch.control_laws import ValueLaw
+from ocp_torch.certificate.report import table
+from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.control.policies import ValueLaw
 from ocp_torch.problems import Dataset
+from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.runs import build as config
+from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.training.monitor import Silent
 from test_config import configured
 from test_recording import Exactly, certificate_of, record

@@ -12,8 +12,8 @@ from hypothesis import settings as examples
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from ocp_torch.launch import CONFIGS, launch
-from ocp_torch.training.start import prepare
+from ocp_torch.cli.launch import CONFIGS, launch
+from ocp_torch.runs.start import prepare
 
 pytestmark = pytest.mark.usefixtures("quick_composition")
 EXAMPLES = int(os.environ.get("OCP_TORCH_EXAMPLES", "200"))

@@ -6,7 +6,7 @@ import stat
 
 import pytest
 
-from ocp_torch.composition import composed, register_resolvers
+from ocp_torch.cli.compose import composed, register_resolvers
 from scripted import CHECKS, entered
 from test_bad_configurations import leaves
 from test_training import session, small
@@ -165,7 +165,7 @@ REFUSED = {
 @pytest.mark.parametrize("arguments", REFUSED, ids=" ".join)
 def test_what_would_fail_late_or_silently_is_refused_by_name(arguments, tmp_path, monkeypatch):
     # As on a machine of 25 GB, whatever this one has.
-    monkeypatch.setattr("ocp_torch.memory.memory", lambda: 25e9)
+    monkeypatch.setattr("ocp_torch.files.memory.memory", lambda: 25e9)
     monkeypatch.chdir(tmp_path)
     assert_refused("train", list(arguments))
     assert REFUSED[arguments] in entered("train", *arguments)[2]

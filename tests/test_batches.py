@@ -9,13 +9,13 @@ import torch
 from torch import nn
 
 import zoo
-from ocp_torch import calculus, formulas
-from ocp_torch.bounds import resolve_bounds
 from ocp_torch.errors import InputError
 from ocp_torch.fields import VALUE, Fields, PeriodicMLP
+from ocp_torch.maths import calculus
+from ocp_torch.maths.sampling import UniformSampler
 from ocp_torch.objectives import Dual, primal
-from ocp_torch.problems import Problem
-from ocp_torch.samplers import UniformSampler
+from ocp_torch.problems import Problem, formulas
+from ocp_torch.problems.constants import resolve_bounds
 from ocp_torch.training.batches import VISITED, Batches
 
 

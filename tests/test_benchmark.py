@@ -8,25 +8,26 @@ import pytest
 import torch
 
 import zoo
-from ocp_torch import control_laws, formulas
-from ocp_torch.benchmark import measure
-from ocp_torch.benchmark.contest import build, contest
-from ocp_torch.benchmark.curve import Curve, Point, due, median_and_spread
-from ocp_torch.benchmark.kernels import KernelContender
-from ocp_torch.benchmark.measure import Judge, relative, tabulated
-from ocp_torch.benchmark.networks import NetworkContender
-from ocp_torch.benchmark.report import load, reference, save, table
-from ocp_torch.benchmark.require import require_rl
-from ocp_torch.bounds import resolve_bounds
-from ocp_torch.environment import make_environment, observe
+from ocp_torch.cli.launch import composed
+from ocp_torch.control import policies as control_laws
 from ocp_torch.errors import InputError
 from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields, SobolevField
-from ocp_torch.launch import composed
-from ocp_torch.paper import figures
-from ocp_torch.paper.recipes import RECIPES
-from ocp_torch.paper.reproduce import check, report, reproduce
-from ocp_torch.paper.runs import carry_out, circle, compare_with_exact
-from ocp_torch.samples import Samples
+from ocp_torch.gym.environment import make_environment, observe
+from ocp_torch.problems import formulas
+from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.samples import Samples
+from ocp_torch.studies.benchmark import measure
+from ocp_torch.studies.benchmark.contest import build, contest
+from ocp_torch.studies.benchmark.curve import Curve, Point, due, median_and_spread
+from ocp_torch.studies.benchmark.kernels import KernelContender
+from ocp_torch.studies.benchmark.measure import Judge, relative, tabulated
+from ocp_torch.studies.benchmark.networks import NetworkContender
+from ocp_torch.studies.benchmark.report import load, reference, save, table
+from ocp_torch.studies.benchmark.require import require_rl
+from ocp_torch.studies.paper import figures
+from ocp_torch.studies.paper.recipes import RECIPES
+from ocp_torch.studies.paper.reproduce import check, report, reproduce
+from ocp_torch.studies.paper.runs import carry_out, circle, compare_with_exact
 
 TINY = (
     "trainer.steps=6",
@@ -274,7 +275,7 @@ def test_the_environment_starts_from_the_initial_density():
 def test_sac_runs_as_a_contender():
     pytest.importorskip("gymnasium")
     pytest.importorskip("stable_baselines3")
-    from ocp_torch.benchmark.rl import RLContender
+    from ocp_torch.studies.benchmark.rl import RLContender
 
     problem, bounds = circle()
     made = RLContender("sac", problem, 0.5, steps=150, time_step=0.1, horizon=4.0)
@@ -325,10 +326,10 @@ def test_a_recipe_in_small_gives_its_numbers_and_figures(name, quick):
 def test_the_exact_kernel_does_more_work_at_each_step_and_features_do_not():
     """Counted instead of timed: the numbers that enter one evaluation."""
     problem, bounds = circle()
-    from ocp_torch.kernel import Iteration, step_sizes
-    from ocp_torch.kernel.bernoulli import BernoulliKernel
-    from ocp_torch.kernel.expansions import FeatureExpansion, KernelExpansion
-    from ocp_torch.kernel.iterations import SobolevFeatures
+    from ocp_torch.studies.kernel import Iteration, step_sizes
+    from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
+    from ocp_torch.studies.kernel.expansions import FeatureExpansion, KernelExpansion
+    from ocp_torch.studies.kernel.iterations import SobolevFeatures
 
     exact = Iteration(problem, "dual", bounds, (0,), kernel=BernoulliKernel(2), capacity=60)
     truncated = Iteration(problem, "dual", bounds, (0,), features=SobolevFeatures(1, modes=8))

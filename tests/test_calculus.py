@@ -4,9 +4,9 @@ import pytest
 import torch
 
 import zoo
-from ocp_torch import calculus
 from ocp_torch.fields import PeriodicMLP
-from ocp_torch.samples import Samples
+from ocp_torch.maths import calculus
+from ocp_torch.problems.samples import Samples
 
 # A step of 1e-5 leaves h^2 = 1e-10 times third derivatives (of order 1e3 here), and rounding of 1e-16 / 1e-5.
 STEP, TOLERANCE = 1e-5, dict(rtol=1e-6, atol=1e-6)

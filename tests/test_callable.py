@@ -11,17 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import zoo
-from ocp_torch import calculus
-from ocp_torch.bounds import resolve_bounds
-from ocp_torch.controller import load_controller
+from ocp_torch.cli.launch import again
+from ocp_torch.control.controller import load_controller
 from ocp_torch.errors import InputError
-from ocp_torch.launch import again
+from ocp_torch.maths import calculus
 from ocp_torch.objectives import primal, saddle
 from ocp_torch.objectives.saddle import Saddle
 from ocp_torch.problems import Callable
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.samples import Samples
-from ocp_torch.training.resume import OWN_TARGETS
+from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.samples import Samples
+from ocp_torch.runs.resume import OWN_TARGETS
 from test_config import outcome
 from test_training import session, small
 

@@ -7,17 +7,17 @@ import pytest
 import torch
 
 import zoo
-from ocp_torch.bounds import ESTIMATED, resolve_bounds
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.estimate import replicated_samples
-from ocp_torch.certificate.lagrangian import closed_loop_bounds
-from ocp_torch.config import build_trainer
-from ocp_torch.control_laws import ValueLaw
+from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
+from ocp_torch.control.policies import ValueLaw
 from ocp_torch.fields import Fields, PeriodicMLP
-from ocp_torch.needs import GUESSED, SEARCHED
 from ocp_torch.problems import Circle, Manufactured
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.samples import Samples
+from ocp_torch.problems.constants import ESTIMATED, resolve_bounds
+from ocp_torch.problems.needs import GUESSED, SEARCHED
+from ocp_torch.problems.samples import Samples
+from ocp_torch.runs.build import build_trainer
 from ocp_torch.training.monitor import Silent
 from test_config import configured
 

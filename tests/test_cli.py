@@ -13,7 +13,7 @@ import pytest
 from forked import command
 from ocp_torch import load_controller
 from ocp_torch.certificate import table
-from ocp_torch.launch import CHECKOUT, CONFIGS
+from ocp_torch.cli.launch import CHECKOUT, CONFIGS
 
 # Enough for a run of its own folder and certificate, and no more.
 SHORT = (

@@ -7,17 +7,18 @@ import pytest
 import torch
 
 import zoo
-from ocp_torch import calculus, formulas
-from ocp_torch.bounds import resolve_bounds
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
-from ocp_torch.certificate.lagrangian import Terms, _integrands, best_multiples, closed_loop_bounds
-from ocp_torch.certificate.performance import simulate_performance
-from ocp_torch.certificate.simulation import discounted_integral
-from ocp_torch.certificate.stage import StageSettings, fit_closed_loop, missing_price, relative_excess
-from ocp_torch.control_laws import ValueLaw
+from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.simulated.simulation import discounted_integral
+from ocp_torch.certificate.upper.lagrangian import Terms, _integrands, best_multiples, closed_loop_bounds
+from ocp_torch.certificate.upper.policy_evaluation import StageSettings, fit_closed_loop, missing_price, relative_excess
+from ocp_torch.control.policies import ValueLaw
 from ocp_torch.fields import Fields, PeriodicMLP
+from ocp_torch.maths import calculus
+from ocp_torch.problems import formulas
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.samples import Samples
+from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.samples import Samples
 
 
 def optimal_loop_samples(problem, count=2**13):

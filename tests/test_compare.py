@@ -11,8 +11,8 @@ from forked import command
 from looks import certificate
 from ocp_torch.certificate import Run
 from ocp_torch.errors import InputError
+from ocp_torch.runs.compare import COLUMNS, compare
 from ocp_torch.training.checkpoint import save_checkpoint
-from ocp_torch.training.comparison import COLUMNS, compare
 
 
 def finished(folder, gap, certified=None, **run):

@@ -7,11 +7,11 @@ from hypothesis import settings as examples
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from ocp_torch.config import build_certificate_settings, build_trainer
+from ocp_torch.cli.launch import CONFIGS, composed, known_fields, register_resolvers
 from ocp_torch.errors import InputError
-from ocp_torch.launch import CONFIGS, composed, known_fields, register_resolvers
 from ocp_torch.problems import Circle
-from ocp_torch.record import Recorder
+from ocp_torch.runs.build import build_certificate_settings, build_trainer
+from ocp_torch.runs.record import Recorder
 from ocp_torch.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("quick_composition")

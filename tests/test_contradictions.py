@@ -6,10 +6,10 @@ import pytest
 
 from looks import LOWER, certificate
 from ocp_torch.certificate import Run
-from ocp_torch.certificate.contradictions import examined
+from ocp_torch.certificate.checks.contradictions import examined
 from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.certificate.table import table
-from ocp_torch.training.comparison import compare
+from ocp_torch.certificate.report import table
+from ocp_torch.runs.compare import compare
 
 RUN = Run("circle", "dual")
 

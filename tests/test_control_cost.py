@@ -8,8 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ocp_torch.control_cost import PowerCost
 from ocp_torch.errors import InputError
+from ocp_torch.problems.control_cost import PowerCost
 
 EXPONENTS = (1.05, 1.2, 1.5, 1.8, 2.0)
 each_exponent = pytest.mark.parametrize("q", EXPONENTS)

@@ -9,29 +9,29 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import zoo
-from ocp_torch import calculus, formulas
-from ocp_torch.bounds import resolve_bounds
 from ocp_torch.certificate import CertificateSettings, StageSettings
-from ocp_torch.certificate.black_box import BlackBox
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
-from ocp_torch.certificate.lagrangian import closed_loop_bounds
-from ocp_torch.certificate.rigorous import obstacle, rigorous_lower_bound
+from ocp_torch.certificate.external.black_box import BlackBox
+from ocp_torch.certificate.proof.rigorous import obstacle, rigorous_lower_bound
 from ocp_torch.certificate.sides import lower_side, upper_side
-from ocp_torch.control_cost import PowerCost
-from ocp_torch.control_laws import CLOSED, NETWORK, SADDLE, admissible_density, control_laws, occupation_density
-from ocp_torch.control_limit import LimitedCost
-from ocp_torch.controller import load_controller
+from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
+from ocp_torch.control.controller import load_controller
+from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, admissible_density, control_laws, occupation_density
 from ocp_torch.errors import InputError
-from ocp_torch.kernel.rules import DualRule
+from ocp_torch.maths import calculus
+from ocp_torch.maths.taylor import Box
 from ocp_torch.objectives.primal import ClosedPrimal, NetworkPrimal
 from ocp_torch.objectives.saddle import Saddle
-from ocp_torch.problems import Circle, Manufactured, Torus
+from ocp_torch.problems import Circle, Manufactured, Torus, formulas
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.reference import solve_reference
-from ocp_torch.samples import Samples
-from ocp_torch.taylor import Box
-from ocp_torch.training.given import certify
-from ocp_torch.training.session import controller_of
+from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.control_cost import PowerCost
+from ocp_torch.problems.control_limit import LimitedCost
+from ocp_torch.problems.samples import Samples
+from ocp_torch.runs.external import certify
+from ocp_torch.runs.run import controller_of
+from ocp_torch.studies.kernel.rules import DualRule
+from ocp_torch.studies.reference import solve_reference
 from test_control_cost import BOUND, central_differences, columns, lowest, two_dimensional, value_and_gradients
 from test_problems import ROUNDING, exact_slack, lattice
 from test_training import session, small

@@ -12,8 +12,8 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from ocp_torch import Circle, Controller, InputError, Problem, load_controller
-from ocp_torch.config import build_trainer
-from ocp_torch.storage import DIGEST_KEY, METADATA_KEY, digest
+from ocp_torch.files.storage import DIGEST_KEY, METADATA_KEY, digest
+from ocp_torch.runs.build import build_trainer
 from test_config import configured
 
 pytestmark = pytest.mark.usefixtures("quick_composition")

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from forked import TINY, train
-from ocp_torch import storage
-from ocp_torch.composition import composed
+from ocp_torch.cli.compose import composed
 from ocp_torch.errors import InputError, StorageError
+from ocp_torch.files import storage
+from ocp_torch.runs.start import prepare
 from ocp_torch.training.checkpoint import MAGIC, SCHEMA, load_checkpoint, newest, save_checkpoint
 from ocp_torch.training.monitor import Silent
-from ocp_torch.training.start import prepare
 from test_training import small
 
 pytestmark = pytest.mark.usefixtures("quick_composition")

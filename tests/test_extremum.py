@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from ocp_torch.extremum import batched, supremum
-from ocp_torch.samplers import scrambled_sobol
+from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.supremum import batched, supremum
 
 TURN = 2.0 * math.pi
 each_dimension = pytest.mark.parametrize("dim", [1, 2, 4])

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 import zoo
-from ocp_torch import calculus
 from ocp_torch.errors import InputError
 from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fields, PeriodicMLP
+from ocp_torch.maths import calculus
 from ocp_torch.problems import Circle, Problem
 
 NAMES = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION)

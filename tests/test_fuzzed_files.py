@@ -13,17 +13,17 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ocp_torch.controller import load_controller
+from ocp_torch.control.controller import load_controller
 from ocp_torch.errors import InputError
-from ocp_torch.plain import NotPlain, json_object, looked_up, require_plain, yaml_mapping
+from ocp_torch.files.plain import NotPlain, json_object, looked_up, require_plain, yaml_mapping
+from ocp_torch.files.reading import read_json
+from ocp_torch.files.storage import load_tensors, save_tensors
 from ocp_torch.problems import Kuramoto
-from ocp_torch.reading import read_json
-from ocp_torch.recording import read
-from ocp_torch.storage import load_tensors, save_tensors
+from ocp_torch.problems.recorded.recording import read
+from ocp_torch.runs.compare import compare
+from ocp_torch.runs.evaluate import settings_for
+from ocp_torch.runs.resume import read_configuration, result_of
 from ocp_torch.training.checkpoint import load_checkpoint
-from ocp_torch.training.comparison import compare
-from ocp_torch.training.evaluation import settings_for
-from ocp_torch.training.resume import read_configuration, result_of
 from strangers import make_run, seal, signed
 
 pytestmark = pytest.mark.usefixtures("quick_composition")
@@ -230,8 +230,8 @@ def test_any_field_of_a_certificate_replaced_by_anything_is_shown_or_named(run, 
 
 @pytest.mark.slow
 def test_any_entry_of_a_checkpoint_replaced_by_anything_is_refused_or_goes_on(run, tmp_path):
-    from ocp_torch.composition import composed
-    from ocp_torch.training.start import prepare
+    from ocp_torch.cli.compose import composed
+    from ocp_torch.runs.start import prepare
 
     chance, folder = random.Random(4), tmp_path / "run"
     shutil.copytree(run, folder)

@@ -9,9 +9,9 @@ import torch
 
 from ocp_torch import InputError, certify
 from ocp_torch.certificate import CertificateSettings, StageSettings, table
-from ocp_torch.certificate.black_box import BlackBox
+from ocp_torch.certificate.external.black_box import BlackBox
 from ocp_torch.problems import Circle, Manufactured
-from ocp_torch.training.loading import load_law
+from ocp_torch.runs.loading import load_law
 from test_cli import assert_succeeded, certificate_in, script
 from test_controller import controllers
 from test_jumps import cost_of_switching

@@ -10,11 +10,11 @@ import torch
 from PIL import Image
 
 import zoo
-from ocp_torch.environment import clocks, make_environment, observe, require_gymnasium, state_of
 from ocp_torch.errors import InputError
+from ocp_torch.gym.environment import clocks, make_environment, observe, require_gymnasium, state_of
+from ocp_torch.gym.rollout import Agent, made, play, prepare, save_gif
 from ocp_torch.problems import PROBLEMS, Dataset, Manufactured
-from ocp_torch.record import Recorder
-from ocp_torch.rollout import Agent, made, play, prepare, save_gif
+from ocp_torch.runs.record import Recorder
 from test_training import session, small
 
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
@@ -270,7 +270,7 @@ def test_the_pendulum_is_gymnasiums_over_a_short_time(theirs):
 
 def test_a_saved_pendulum_controller_plays_gymnasiums_untouched(gymnasium, tmp_path):
     """The classical swing-up through the same maps: what does not swing up returns about -1200."""
-    from ocp_torch.practice import classical_law
+    from ocp_torch.runs.practice import classical_law
 
     pendulum = PROBLEMS["pendulum"](torque_cost=0.001, control_limit=1.0)
     law = classical_law(pendulum)

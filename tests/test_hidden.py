@@ -7,18 +7,18 @@ import torch
 
 import zoo
 from adversarial import JumpingMatrix, JumpSink
-from ocp_torch.bounds import resolve_bounds
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
+from ocp_torch.certificate.checks.hidden import Flux, hidden_divergence
+from ocp_torch.certificate.checks.regularity import largest_jump
 from ocp_torch.certificate.estimate import replicated_samples
-from ocp_torch.certificate.hidden import Flux, hidden_divergence
-from ocp_torch.certificate.lagrangian import closed_loop_bounds
-from ocp_torch.certificate.regularity import largest_jump
 from ocp_torch.certificate.sides import upper_side
-from ocp_torch.control_laws import CLOSED, NETWORK
+from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
+from ocp_torch.control.policies import CLOSED, NETWORK
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems import Dataset
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.samples import Samples
+from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.samples import Samples
 from test_recording import Exactly, certificate_of, record
 
 

@@ -16,12 +16,12 @@ import yaml
 from forked import command
 from looks import certificate
 from ocp_torch import load_controller
-from ocp_torch.composition import composed
+from ocp_torch.cli.compose import composed
 from ocp_torch.errors import InputError
-from ocp_torch.storage import load_tensors, save_tensors
+from ocp_torch.files.storage import load_tensors, save_tensors
+from ocp_torch.runs.run import controller_of
+from ocp_torch.runs.start import prepare
 from ocp_torch.training.checkpoint import MAGIC, SCHEMA, load_checkpoint
-from ocp_torch.training.session import controller_of
-from ocp_torch.training.start import prepare
 from test_training import small
 
 pytestmark = pytest.mark.usefixtures("quick_composition")
@@ -206,7 +206,7 @@ TARGETS = [
     "pickle.loads",
     "my_module.Mine",
     "../evil.Mine",
-    "ocp_torch.launch.fail",
+    "ocp_torch.cli.launch.fail",
     "",
     None,
     3,

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import zoo
-from ocp_torch.certificate.performance import simulate_performance
-from ocp_torch.certificate.regularity import largest_jump
+from ocp_torch.certificate.checks.regularity import largest_jump
+from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.problems import Circle, Problem
 
 

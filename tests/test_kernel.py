@@ -5,23 +5,23 @@ import pytest
 import torch
 
 import zoo
-from ocp_torch.benchmark.kernels import OCCUPATION
-from ocp_torch.benchmark.measure import Judge, relative
-from ocp_torch.bounds import resolve_bounds
-from ocp_torch.config import build_trainer
+from ocp_torch.cli.launch import composed
 from ocp_torch.errors import InputError
 from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields
 from ocp_torch.fields.sobolev import SobolevFeatures, SobolevField
-from ocp_torch.kernel import Iteration, step_sizes
-from ocp_torch.kernel.bernoulli import BernoulliKernel, bernoulli_polynomial
-from ocp_torch.kernel.rules import RULES
-from ocp_torch.kernel.stream import Datum
-from ocp_torch.launch import composed
 from ocp_torch.objectives import METHODS
-from ocp_torch.paper.runs import circle
 from ocp_torch.problems import Manufactured
-from ocp_torch.samples import Samples
+from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.samples import Samples
+from ocp_torch.runs.build import build_trainer
 from ocp_torch.steppers import schedule_maker
+from ocp_torch.studies.benchmark.kernels import OCCUPATION
+from ocp_torch.studies.benchmark.measure import Judge, relative
+from ocp_torch.studies.kernel import Iteration, step_sizes
+from ocp_torch.studies.kernel.bernoulli import BernoulliKernel, bernoulli_polynomial
+from ocp_torch.studies.kernel.rules import RULES
+from ocp_torch.studies.kernel.stream import Datum
+from ocp_torch.studies.paper.runs import circle
 from ocp_torch.training.monitor import Silent
 
 

@@ -137,7 +137,9 @@ def killed_in(name: str):
     """In the child: no further than the middle of this step of the end."""
 
     def before():
-        from ocp_torch.training import figures, monitor, session
+        from ocp_torch.runs import figures
+        from ocp_torch.runs import run as session
+        from ocp_torch.training import monitor
 
         def die(*_, **__):
             os.kill(os.getpid(), signal.SIGKILL)

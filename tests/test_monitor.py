@@ -4,11 +4,11 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ocp_torch.config import build_certificate_settings
-from ocp_torch.control_laws import occupation_density
-from ocp_torch.samples import Samples
+from ocp_torch.control.policies import occupation_density
+from ocp_torch.problems.samples import Samples
+from ocp_torch.runs.build import build_certificate_settings
+from ocp_torch.runs.run import run_session
 from ocp_torch.training.monitor import Monitor, liouville_residual
-from ocp_torch.training.session import run_session
 from ocp_torch.training.stages import Stages
 from test_training import METHODS, small
 

@@ -8,15 +8,15 @@ import pytest
 import torch
 
 import zoo
-from ocp_torch.certificate.simulation import discounted_integral
-from ocp_torch.controller import problem_name
+from ocp_torch.certificate.simulated.simulation import discounted_integral
+from ocp_torch.control.controller import problem_name
 from ocp_torch.errors import InputError
-from ocp_torch.extremum import supremum
-from ocp_torch.practice import metrics
+from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems import PROBLEMS, Arm, Dubins, Kuramoto, Pendulum, PhaseNeurons, RobotArm, Unicycle
-from ocp_torch.problems.local import discounted_riccati, occupation_bound_at_rest
-from ocp_torch.reference.reference import solve_reference
-from ocp_torch.samples import Samples
+from ocp_torch.problems.exact.local import discounted_riccati, occupation_bound_at_rest
+from ocp_torch.problems.samples import Samples
+from ocp_torch.runs.practice import metrics
+from ocp_torch.studies.reference.reference import solve_reference
 
 ROUNDING = dict(rtol=1e-9, atol=1e-9)
 TURN = 2.0 * math.pi

@@ -5,11 +5,11 @@ import json
 import pytest
 import torch
 
-from ocp_torch.controller import load_controller
-from ocp_torch.practice import metrics
-from ocp_torch.samplers import derive_seed
-from ocp_torch.training.evaluation import law_of
-from ocp_torch.training.practice import METRICS, STREAM
+from ocp_torch.control.controller import load_controller
+from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.runs.evaluate import law_of
+from ocp_torch.runs.metrics import METRICS, STREAM
+from ocp_torch.runs.practice import metrics
 from test_training import session, small
 
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")

@@ -12,10 +12,10 @@ import yaml
 import own_problems
 from forked import TINY, command, train
 from ocp_torch import load_controller
-from ocp_torch.composition import composed, register_resolvers, with_own_defaults
-from ocp_torch.config import build_problem, build_trainer
+from ocp_torch.cli.compose import composed, register_resolvers, with_own_defaults
 from ocp_torch.errors import InputError
-from ocp_torch.training.comparison import performance
+from ocp_torch.runs.build import build_problem, build_trainer
+from ocp_torch.runs.compare import performance
 from ocp_torch.training.monitor import Silent
 
 pytestmark = pytest.mark.usefixtures("cheap_looks")

@@ -7,12 +7,12 @@ import torch
 from PIL import Image
 
 import zoo
-from ocp_torch.control_laws import zero_law
+from ocp_torch.control.policies import zero_law
 from ocp_torch.errors import InputError
-from ocp_torch.pictures import animate, motion
-from ocp_torch.practice import classical_law, metrics, metrics_table, simulate
-from ocp_torch.practice.metrics import admissible, measure, random_starts
 from ocp_torch.problems import Arm, Circle, Unicycle
+from ocp_torch.runs.pictures import animate, motion
+from ocp_torch.runs.practice import classical_law, metrics, metrics_table, simulate
+from ocp_torch.runs.practice.metrics import admissible, measure, random_starts
 
 # Whether the number should be larger than with no control.
 BETTER = {
@@ -103,7 +103,7 @@ def test_every_system_has_a_picture_that_is_drawn(problem, tmp_path):
 
 @pytest.mark.slow
 def test_an_animation_is_a_gif_whose_frames_differ(tmp_path, monkeypatch):
-    from ocp_torch.pictures import animation
+    from ocp_torch.runs.pictures import animation
 
     monkeypatch.setattr(animation, "STRIDE", 80)
     kuramoto = zoo.build("kuramoto n=3")

@@ -5,11 +5,11 @@ import torch
 
 import hostile_problems
 from hostile_problems import LEGAL, REFUSED, Good, with_
-from ocp_torch.config import build_problem
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Callable
 from ocp_torch.problems.check import check_once
 from ocp_torch.problems.mass import sampled_mass
+from ocp_torch.runs.build import build_problem
 
 
 @pytest.mark.parametrize("name", REFUSED)

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 import zoo
-from ocp_torch import calculus, formulas
 from ocp_torch.certificate.sides import lower_side, upper_side
 from ocp_torch.errors import InputError
-from ocp_torch.extremum import supremum
-from ocp_torch.problems import Circle, Manufactured, Problem, Torus
-from ocp_torch.samplers import evaluation_points
-from ocp_torch.samples import Samples
+from ocp_torch.maths import calculus
+from ocp_torch.maths.sampling import evaluation_points
+from ocp_torch.maths.supremum import supremum
+from ocp_torch.problems import Circle, Manufactured, Problem, Torus, formulas
+from ocp_torch.problems.samples import Samples
 
 # Pure float64 arithmetic, with no approximation but rounding.
 ROUNDING = dict(rtol=1e-9, atol=1e-9)

@@ -15,23 +15,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import zoo
-from ocp_torch import recording
-from ocp_torch.bounds import resolve_bounds
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
-from ocp_torch.certificate.recorded import closed_loop_samples, groups
-from ocp_torch.config import build_certificate_settings
-from ocp_torch.control_laws import NETWORK, control_laws
-from ocp_torch.controller import load_controller
+from ocp_torch.certificate.external.recorded import closed_loop_samples, groups
+from ocp_torch.control.controller import load_controller
+from ocp_torch.control.policies import NETWORK, control_laws
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.objectives import Dual, primal, saddle
 from ocp_torch.problems import Circle, Dataset, Manufactured
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.record import Recorder, prepare
-from ocp_torch.samples import Samples
+from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.recorded import recording
+from ocp_torch.problems.samples import Samples
+from ocp_torch.runs.build import build_certificate_settings
+from ocp_torch.runs.evaluate import certify_saved, load_run
+from ocp_torch.runs.external import certify as certify_given
+from ocp_torch.runs.record import Recorder, prepare
 from ocp_torch.training.checkpoint import load_checkpoint
-from ocp_torch.training.evaluation import certify_saved, load_run
-from ocp_torch.training.given import certify as certify_given
 from ocp_torch.training.monitor import Silent
 from test_config import outcome
 from test_training import session, small

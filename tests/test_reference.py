@@ -11,12 +11,12 @@ import torch
 import zoo
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Circle, Manufactured, Problem, Torus
-from ocp_torch.reference import linear, semi_lagrangian, solve_reference
-from ocp_torch.reference.files import save_reference
-from ocp_torch.reference.grid import Grid
-from ocp_torch.reference.richardson import extrapolate
-from ocp_torch.reference.semi_lagrangian import SemiLagrangian, discounted_weights
-from ocp_torch.reference.session import prepare, table
+from ocp_torch.studies.reference import linear, semi_lagrangian, solve_reference
+from ocp_torch.studies.reference.files import save_reference
+from ocp_torch.studies.reference.grid import Grid
+from ocp_torch.studies.reference.richardson import extrapolate
+from ocp_torch.studies.reference.semi_lagrangian import SemiLagrangian, discounted_weights
+from ocp_torch.studies.reference.session import prepare, table
 from test_controller import controllers
 
 TURN = 2.0 * math.pi

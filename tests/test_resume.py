@@ -12,15 +12,15 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from forked import TINY, train
 from looks import quick
-from ocp_torch.composition import composed
-from ocp_torch.config import build_trainer
+from ocp_torch.cli.compose import composed
 from ocp_torch.errors import InputError
+from ocp_torch.runs.build import build_trainer
+from ocp_torch.runs.resume import find_run, saved_configuration
+from ocp_torch.runs.start import prepare
+from ocp_torch.runs.start import train as start
 from ocp_torch.training import trainer as trainer_module
 from ocp_torch.training.checkpoint import load_checkpoint, save_checkpoint
 from ocp_torch.training.monitor import Silent
-from ocp_torch.training.resume import find_run, saved_configuration
-from ocp_torch.training.start import prepare
-from ocp_torch.training.start import train as start
 from test_config import configured
 from test_training import METHODS, SMALL, differences, small, state_of
 
@@ -189,7 +189,7 @@ def test_sizes_by_dimension_are_those_the_run_began_with(tmp_path, monkeypatch):
     """Defaults may change between two versions; a run does not."""
     import dataclasses
 
-    from ocp_torch import budgets
+    from ocp_torch.training import budgets
 
     rest = [o for o in TINY if not o.startswith(("model.width", "trainer.batch"))]
     config = composed("train", [*rest, "trainer.steps=2"])

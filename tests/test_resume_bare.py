@@ -7,9 +7,9 @@ import pytest
 import yaml
 
 from forked import TINY, train
-from ocp_torch import composition
+from ocp_torch.cli import compose as composition
+from ocp_torch.runs.resume import read_configuration, saved_configuration
 from ocp_torch.training.checkpoint import load_checkpoint
-from ocp_torch.training.resume import read_configuration, saved_configuration
 
 # Everything but the defaults: what a command line of `resume` alone would compose is another run.
 OTHER = ("problem=torus", "problem.dim=2", "problem.shear=none", "seed=3", *TINY[1:])

@@ -11,19 +11,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import zoo
-from ocp_torch import calculus
-from ocp_torch.bounds import resolve_bounds
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields, table
-from ocp_torch.certificate.activations import SERIES
-from ocp_torch.certificate.network_model import SmoothModel, activate, embed, network_model, product
-from ocp_torch.certificate.rigorous import cell_models, obstacle, rigorous_lower_bound
-from ocp_torch.certificate.shifted import slack_function
-from ocp_torch.enclosure import Lipschitz, contradiction
+from ocp_torch.certificate.lower.shifted import slack_function
+from ocp_torch.certificate.proof.activations import SERIES
+from ocp_torch.certificate.proof.network_model import SmoothModel, activate, embed, network_model, product
+from ocp_torch.certificate.proof.rigorous import cell_models, obstacle, rigorous_lower_bound
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.fields.mlp import ACTIVATIONS
+from ocp_torch.maths import calculus
+from ocp_torch.maths.enclosure import Lipschitz, contradiction
+from ocp_torch.maths.taylor import Box, TaylorModel
 from ocp_torch.problems import Circle, Manufactured, Torus
-from ocp_torch.taylor import Box, TaylorModel
+from ocp_torch.problems.constants import resolve_bounds
 
 # Every problem of the zoo in at most two dimensions that encloses its data, and a few odd ones.
 LOW = [n for n in zoo.EXACT if zoo.build(n).dim <= 2]

@@ -6,9 +6,9 @@ import torch
 from PIL import Image
 
 from ocp_torch.errors import InputError
-from ocp_torch.pictures import motion
-from ocp_torch.practice import classical_law, metrics
 from ocp_torch.problems import Arm, RobotArm
+from ocp_torch.runs.pictures import motion
+from ocp_torch.runs.practice import classical_law, metrics
 
 IDENTITY = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 

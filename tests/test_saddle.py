@@ -9,14 +9,14 @@ import torch
 from torch import nn
 
 import zoo
-from ocp_torch.bounds import resolve_bounds
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
+from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.objectives import primal, saddle
 from ocp_torch.objectives.saddle import AugmentedSaddle, Saddle
 from ocp_torch.problems import Manufactured
-from ocp_torch.samplers import scrambled_sobol
-from ocp_torch.samples import Samples
+from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.samples import Samples
 
 SMOOTH = {
     "drift": Manufactured(dim=2, initial_contrast=0.3),

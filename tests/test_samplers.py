@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from ocp_torch import samplers
-from ocp_torch.samplers import SobolSampler, UniformSampler, derive_seed, evaluation_points, scrambled_sobol
+from ocp_torch.maths import sampling as samplers
+from ocp_torch.maths.sampling import SobolSampler, UniformSampler, derive_seed, evaluation_points, scrambled_sobol
 
 each_sampler = pytest.mark.parametrize("make", [UniformSampler, SobolSampler])
 each_precision = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from adversarial import short_way
-from ocp_torch.bounds import resolve_bounds
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.sides import lower_side
 from ocp_torch.problems import Circle, Problem
-from ocp_torch.scan import odd_states
+from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.scan import odd_states
 
 
 class Needle(Problem):

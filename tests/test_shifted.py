@@ -9,17 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import zoo
-from ocp_torch.bounds import resolve_bounds
-from ocp_torch.calculus import value_and_gradient
 from ocp_torch.certificate.estimate import replicated_samples
-from ocp_torch.certificate.mollified import DIRECTIONS, EVALUATIONS, Mollified
-from ocp_torch.certificate.recombined import Program, recombined
+from ocp_torch.certificate.lower.mollified import DIRECTIONS, EVALUATIONS, Mollified
+from ocp_torch.certificate.lower.recombined import Program, recombined
+from ocp_torch.certificate.lower.shifted import TOP, SlackParts, climbed, scaled_by, slack_function
 from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.certificate.shifted import TOP, SlackParts, climbed, scaled_by, slack_function
 from ocp_torch.certificate.sides import lower_side
 from ocp_torch.fields import PeriodicMLP
+from ocp_torch.maths.calculus import value_and_gradient
 from ocp_torch.problems import Circle
-from ocp_torch.samples import Samples
+from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.samples import Samples
 
 
 def parts_of(problem, value, count: int = 400) -> SlackParts:
@@ -218,8 +218,8 @@ def test_the_slack_of_a_recombination_is_that_of_its_field():
 
 @pytest.mark.parametrize("name", ["manufactured 2-d q=1.5", "manufactured 1-d q=2"])
 def test_a_last_layer_chosen_anew_finds_the_subsolution_that_it_can_represent(name, monkeypatch):
-    monkeypatch.setattr("ocp_torch.certificate.recombined.STATES", 1024)
-    monkeypatch.setattr("ocp_torch.certificate.mollified.RADII", (1.0 / 64.0,))
+    monkeypatch.setattr("ocp_torch.certificate.lower.recombined.STATES", 1024)
+    monkeypatch.setattr("ocp_torch.certificate.lower.mollified.RADII", (1.0 / 64.0,))
     problem = zoo.build(name)
     value = perturbed(problem)
     sets = replicated_samples(problem, 1024, 8, seed=0, divergences=False)

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 import zoo
-from ocp_torch import calculus
 from ocp_torch.errors import InputError
 from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fields, PeriodicMLP, SobolevField
 from ocp_torch.fields.sobolev import COMFORTABLE_FREQUENCIES, MOST_FREQUENCIES, SobolevFeatures
-from ocp_torch.kernel.bernoulli import BernoulliKernel
+from ocp_torch.maths import calculus
 from ocp_torch.problems import Problem
 from ocp_torch.steppers.stepper import project_on_ball
+from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
 
 
 def random_field(dim, outputs=None, seed=0, **options) -> SobolevField:

@@ -8,13 +8,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ocp_torch import calculus
-from ocp_torch.certificate.control_variate import integrals
+from ocp_torch.certificate.simulated.control_variate import integrals
 from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields, PeriodicMLP
-from ocp_torch.fields.spectrum import prominent_waves
+from ocp_torch.fields.waves import prominent_waves
+from ocp_torch.maths import calculus
+from ocp_torch.maths.sampling import evaluation_points
 from ocp_torch.problems import Manufactured, Problem, Torus
-from ocp_torch.samplers import evaluation_points
-from ocp_torch.samples import Samples
+from ocp_torch.problems.samples import Samples
 
 TURN = 2.0 * math.pi
 

@@ -8,19 +8,19 @@ import torch
 
 import zoo
 from adversarial import TURN, NarrowStart, gaussian, short_way
-from ocp_torch.bounds import OCCUPATION_WEIGHT, resolve_bounds
+from ocp_torch.certificate.checks.wellposed import check_problem
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
-from ocp_torch.certificate.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
 from ocp_torch.certificate.sides import lower_side
-from ocp_torch.certificate.wellposed import check_problem
-from ocp_torch.control_laws import zero_law
-from ocp_torch.environment import make_environment
-from ocp_torch.mixtures import Mixture, fitted_mixture, worth
-from ocp_torch.practice.metrics import random_starts
+from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
+from ocp_torch.control.policies import zero_law
+from ocp_torch.gym.environment import make_environment
+from ocp_torch.maths.mixtures import Mixture, fitted_mixture, worth
+from ocp_torch.maths.sampling import evaluation_points
 from ocp_torch.problems import Callable, Problem
-from ocp_torch.samplers import evaluation_points
-from ocp_torch.samples import Samples
-from ocp_torch.starts import drawn_starts, initial_points, start_law
+from ocp_torch.problems.constants import OCCUPATION_WEIGHT, resolve_bounds
+from ocp_torch.problems.samples import Samples
+from ocp_torch.problems.starts import drawn_starts, initial_points, start_law
+from ocp_torch.runs.practice.metrics import random_starts
 
 NARROW = {
     "1-d": ([0.37], 0.004),

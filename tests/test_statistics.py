@@ -9,7 +9,7 @@ from ocp_torch.certificate import CertificateSettings
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.student import t_factor
 from ocp_torch.errors import InputError
-from ocp_torch.samplers import evaluation_points
+from ocp_torch.maths.sampling import evaluation_points
 
 TURN = 2.0 * math.pi
 # Two-sided, from the usual tables.

@@ -11,7 +11,7 @@ from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.objectives import Objective
 from ocp_torch.problems import Circle
-from ocp_torch.samples import Samples
+from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import Extragradient, NonFiniteError, Simultaneous, averaged, optimizer_maker, schedule_maker
 from ocp_torch.steppers.stepper import project_on_ball
 

@@ -8,16 +8,16 @@ import torch
 
 from looks import LOWER, certificate, quick
 from ocp_torch import load_controller
-from ocp_torch.config import build_certificate_settings
 from ocp_torch.errors import InputError
 from ocp_torch.objectives import Objective
 from ocp_torch.problems import Circle
-from ocp_torch.samples import Samples
+from ocp_torch.problems.samples import Samples
+from ocp_torch.runs.build import build_certificate_settings
+from ocp_torch.runs.run import run_session
 from ocp_torch.steppers import NonFiniteError
+from ocp_torch.training.health import Look, Watch, best_constant
 from ocp_torch.training.monitor import Silent
-from ocp_torch.training.session import run_session
 from ocp_torch.training.trainer import Trainer
-from ocp_torch.training.watch import Look, Watch, best_constant
 from test_training import small
 
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
@@ -120,7 +120,7 @@ def test_fields_that_became_worse_are_not_handed_out(tmp_path, monkeypatch):
         def evaluated(self, trainer, certificate):
             saved[trainer.step] = {n: t.clone() for n, t in trainer.averaged_fields.state_dict().items()}
 
-    monkeypatch.setattr("ocp_torch.training.session.Monitor.evaluated", Saver.evaluated)
+    monkeypatch.setattr("ocp_torch.runs.run.Monitor.evaluated", Saver.evaluated)
     tried, made = run(trainer, tmp_path, monkeypatch, lambda t: 0.1 + abs(t.step - 8) / 100.0)
     ((step, fields),) = tried
     assert step == 20

@@ -17,27 +17,27 @@ from safetensors.torch import save_file
 from forked import command
 from guarded import guarded, refusal
 from ocp_torch import load_controller
-from ocp_torch.arrays import read_npz
 from ocp_torch.certificate import table
-from ocp_torch.composition import composed
-from ocp_torch.control_laws import CLOSED
+from ocp_torch.cli.compose import composed
+from ocp_torch.cli.launch import Record, checked
+from ocp_torch.control.policies import CLOSED
 from ocp_torch.errors import InputError, visible
-from ocp_torch.launch import Record, checked
+from ocp_torch.files.arrays import read_npz
+from ocp_torch.files.reading import kind, read_json
+from ocp_torch.files.storage import digest, load_tensors, save_tensors
 from ocp_torch.problems import Kuramoto, Torus
-from ocp_torch.problems.target import resolved
-from ocp_torch.problems.urdf import read_chain
-from ocp_torch.reading import kind, read_json
-from ocp_torch.recording import read
-from ocp_torch.reference.session import prepare as prepare_reference
-from ocp_torch.storage import digest, load_tensors, save_tensors
-from ocp_torch.training import figures
+from ocp_torch.problems.recorded.recording import read
+from ocp_torch.problems.simulator.target import resolved
+from ocp_torch.problems.systems.urdf import read_chain
+from ocp_torch.runs import figures
+from ocp_torch.runs.compare import compare
+from ocp_torch.runs.evaluate import certify_saved, load_run, settings_for
+from ocp_torch.runs.loading import load_law
+from ocp_torch.runs.resume import read_configuration, saved_configuration
+from ocp_torch.runs.run import summary
+from ocp_torch.runs.start import prepare
+from ocp_torch.studies.reference.session import prepare as prepare_reference
 from ocp_torch.training.checkpoint import load_checkpoint
-from ocp_torch.training.comparison import compare
-from ocp_torch.training.evaluation import certify_saved, load_run, settings_for
-from ocp_torch.training.loading import load_law
-from ocp_torch.training.resume import read_configuration, saved_configuration
-from ocp_torch.training.session import summary
-from ocp_torch.training.start import prepare
 from strangers import changed, make_run, seal, signed
 
 pytestmark = pytest.mark.usefixtures("quick_composition")
@@ -190,7 +190,7 @@ def test_notes_of_a_checkpoint_and_of_a_controller_are_printed_escaped(run):
 def test_a_problem_name_of_a_controller_is_printed_escaped(run, monkeypatch):
     remade(run, lambda m: m["certificate"].update(problem=ESCAPE, method=ESCAPE))
     said = []
-    monkeypatch.setattr("ocp_torch.training.evaluation.log.info", lambda text, *a: said.append(text % a))
+    monkeypatch.setattr("ocp_torch.runs.evaluate.log.info", lambda text, *a: said.append(text % a))
     controller = load_controller(run / "controller.safetensors")
     small = {
         "points": 64,

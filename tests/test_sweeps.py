@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from forked import TINY, train
-from ocp_torch.launch import isolated
+from ocp_torch.cli.launch import isolated
 from ocp_torch.training.checkpoint import load_checkpoint
 from test_training import differences
 

@@ -8,16 +8,16 @@ import torch
 
 import zoo
 from adversarial import Spike, gaussian
-from ocp_torch.bounds import resolve_bounds
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
+from ocp_torch.certificate.checks.tails import rarity, sharpened, widened
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
-from ocp_torch.certificate.lagrangian import closed_loop_bounds
-from ocp_torch.certificate.performance import simulate_performance
-from ocp_torch.certificate.tails import rarity, sharpened, widened
-from ocp_torch.control_laws import NETWORK, zero_law
+from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
+from ocp_torch.control.policies import NETWORK, zero_law
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.starts import evaluation_law
+from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.starts import evaluation_law
 from test_traps import Field
 
 SPIKES = {

@@ -10,12 +10,12 @@ from matplotlib.image import imread
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ocp_torch.certificate import certify
-from ocp_torch.config import build_certificate_settings, build_trainer
-from ocp_torch.controller import load_controller
+from ocp_torch.control.controller import load_controller
 from ocp_torch.errors import InputError
+from ocp_torch.runs.build import build_certificate_settings, build_trainer
+from ocp_torch.runs.run import run_session
 from ocp_torch.training.checkpoint import load_checkpoint
 from ocp_torch.training.monitor import Silent
-from ocp_torch.training.session import run_session
 from test_config import configured
 
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 import zoo
-from ocp_torch.bounds import resolve_bounds
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
+from ocp_torch.certificate.checks.wellposed import check_problem
 from ocp_torch.certificate.estimate import replicated_samples
-from ocp_torch.certificate.wellposed import check_problem
-from ocp_torch.control_laws import NETWORK
+from ocp_torch.control.policies import NETWORK
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems import Circle, Manufactured
+from ocp_torch.problems.constants import resolve_bounds
 
 # Bounds must be true whatever is spent: here few starts, steps that are large, and nothing fitted.
 CHEAP = CertificateSettings(

@@ -7,13 +7,13 @@ from functools import partial
 import pytest
 
 import zoo
-from ocp_torch import calculus, formulas
-from ocp_torch.bounds import OCCUPATION_WEIGHT, resolve_bounds
-from ocp_torch.budgets import DENSITY_BATCH, fill
 from ocp_torch.fields import VALUE, Fields, PeriodicMLP
+from ocp_torch.maths import calculus
 from ocp_torch.objectives import Dual
-from ocp_torch.problems import Arm, Circle, Torus
-from ocp_torch.samples import Samples
+from ocp_torch.problems import Arm, Circle, Torus, formulas
+from ocp_torch.problems.constants import OCCUPATION_WEIGHT, resolve_bounds
+from ocp_torch.problems.samples import Samples
+from ocp_torch.training.budgets import DENSITY_BATCH, fill
 
 
 def test_which_problems_are_known_to_be_unbounded():

@@ -10,19 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import zoo
-from ocp_torch import calculus, formulas
-from ocp_torch.bounds import Bounds, resolve_bounds
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
-from ocp_torch.certificate.lagrangian import closed_loop_bounds
-from ocp_torch.certificate.shifted import slack_function
+from ocp_torch.certificate.lower.shifted import slack_function
 from ocp_torch.certificate.sides import lower_side, upper_side
-from ocp_torch.control_laws import CLOSED, NETWORK, occupation_density
+from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
+from ocp_torch.control.policies import CLOSED, NETWORK, occupation_density
 from ocp_torch.fields import Fields
+from ocp_torch.maths import calculus
 from ocp_torch.objectives import Dual, primal, saddle
 from ocp_torch.objectives.primal import ClosedPrimal, NetworkPrimal
-from ocp_torch.problems import Problem
+from ocp_torch.problems import Problem, formulas
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.samples import Samples
+from ocp_torch.problems.constants import Bounds, resolve_bounds
+from ocp_torch.problems.samples import Samples
 
 # Eight scramblings: beyond six standard errors no sampling noise is left to blame.
 ERRORS = 6.0

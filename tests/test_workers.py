@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from ocp_torch.problems.workers import Workers
+from ocp_torch.problems.simulator.workers import Workers
 
 linux = pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="looks for processes in /proc")
 

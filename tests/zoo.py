@@ -19,7 +19,7 @@ from ocp_torch.problems import (
     Torus,
     Unicycle,
 )
-from ocp_torch.problems.torus import SHEARS
+from ocp_torch.problems.exact.torus import SHEARS
 
 TURN = 2.0 * math.pi
 

@@ -2,10 +2,10 @@
 
 from ocp_torch.certificate.certificate import Certificate, Run
 from ocp_torch.certificate.certify import Trained, certify_fields, in_float64
-from ocp_torch.certificate.policy import certify_policy
+from ocp_torch.certificate.external.external import certify_policy
+from ocp_torch.certificate.report import table
 from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.certificate.stage import StageSettings
-from ocp_torch.certificate.table import table
+from ocp_torch.certificate.upper.policy_evaluation import StageSettings
 
 __all__ = [
     "Certificate",

@@ -7,10 +7,10 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ocp_torch.certificate.assumptions import Assumptions
+from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
 from ocp_torch.errors import InputError, require_integer, require_number, visible
-from ocp_torch.needs import GUESSED, Need
+from ocp_torch.problems.needs import GUESSED, Need
 
 SCHEMA = 2
 # Of a problem or a method, in characters.

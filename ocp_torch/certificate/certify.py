@@ -11,30 +11,37 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from ocp_torch.bounds import Bounds
-from ocp_torch.certificate.assumptions import Met, check_assumptions
 from ocp_torch.certificate.certificate import Certificate, Run
-from ocp_torch.certificate.contradictions import examined
+from ocp_torch.certificate.checks.assumptions import Met, check_assumptions
+from ocp_torch.certificate.checks.contradictions import examined
+from ocp_torch.certificate.checks.regularity import largest_jump
+from ocp_torch.certificate.checks.tails import notes_on, sharpened
+from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
-from ocp_torch.certificate.lagrangian import ClosedLoopBounds, closed_loop_bounds
-from ocp_torch.certificate.occupation import a_priori_sup_occupation, estimated_sup_occupation
-from ocp_torch.certificate.performance import Simulated, simulate_performance
+from ocp_torch.certificate.external.recorded import certify_recorded
 from ocp_torch.certificate.progress import Progress, silent
-from ocp_torch.certificate.recorded import certify_recorded
-from ocp_torch.certificate.regularity import largest_jump
-from ocp_torch.certificate.rigorous import RigorousBound, proved_lower
+from ocp_torch.certificate.proof.rigorous import RigorousBound, proved_lower
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.sides import LowerSide, lower_side, upper_side
-from ocp_torch.certificate.stage import fit_closed_loop
-from ocp_torch.certificate.tails import notes_on, sharpened
-from ocp_torch.certificate.wellposed import WellPosed, check_problem
-from ocp_torch.control_laws import CLOSED, ControlLaw, admissible_density, control_laws, occupation_density, zero_law
+from ocp_torch.certificate.simulated.occupation import a_priori_sup_occupation, estimated_sup_occupation
+from ocp_torch.certificate.simulated.performance import Simulated, simulate_performance
+from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds, closed_loop_bounds
+from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
+from ocp_torch.control.policies import (
+    CLOSED,
+    ControlLaw,
+    admissible_density,
+    control_laws,
+    occupation_density,
+    zero_law,
+)
 from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
 from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.problems.constants import Bounds
 from ocp_torch.problems.problem import Problem
-from ocp_torch.samples import Samples
-from ocp_torch.scan import odd_states
+from ocp_torch.problems.samples import Samples
+from ocp_torch.problems.scan import odd_states
 
 # Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
 # a controller that another one clearly beats.

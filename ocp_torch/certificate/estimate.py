@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.student import t_factor
-from ocp_torch.mixtures import Mixture
+from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.problems.problem import Problem
-from ocp_torch.samples import Samples
-from ocp_torch.starts import evaluation_law
+from ocp_torch.problems.samples import Samples
+from ocp_torch.problems.starts import evaluation_law
 
 # How often an interval covers the truth where nobody asks for another level.
 CONFIDENCE = 0.95

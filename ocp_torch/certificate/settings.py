@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ocp_torch.bounds import Bounds
 from ocp_torch.certificate.estimate import CONFIDENCE
-from ocp_torch.certificate.stage import StageSettings
+from ocp_torch.certificate.upper.policy_evaluation import StageSettings
 from ocp_torch.errors import require_choice, require_flag, require_integer, require_number
+from ocp_torch.problems.constants import Bounds
 from ocp_torch.problems.problem import Problem
 
 # However few the states of a certificate, its problem is scanned as if there were so many: a feature that is missed is one

@@ -8,17 +8,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ocp_torch import calculus, formulas
-from ocp_torch.calculus import CHUNK, Field
+from ocp_torch.certificate.checks.hidden import Flux, Hidden, hidden_divergence
+from ocp_torch.certificate.checks.tails import rarity, widened
 from ocp_torch.certificate.estimate import Estimate, integral
-from ocp_torch.certificate.hidden import Flux, Hidden, hidden_divergence
-from ocp_torch.certificate.mollified import mollified_shift
-from ocp_torch.certificate.recombined import recombined
-from ocp_torch.certificate.shifted import Shift, slack_parts
-from ocp_torch.certificate.tails import rarity, widened
-from ocp_torch.control_laws import Density
+from ocp_torch.certificate.lower.mollified import mollified_shift
+from ocp_torch.certificate.lower.recombined import recombined
+from ocp_torch.certificate.lower.shifted import Shift, slack_parts
+from ocp_torch.control.policies import Density
+from ocp_torch.maths import calculus
+from ocp_torch.maths.calculus import CHUNK, Field
+from ocp_torch.problems import formulas
 from ocp_torch.problems.problem import Problem
-from ocp_torch.samples import Samples
+from ocp_torch.problems.samples import Samples
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def lower_side(
     seed: int = 0,
     odd: Tensor | None = None,
 ) -> LowerSide:
-    r"""`F_M(V) = E[V mu0 - M max(Q, 0)]` (section 4.1) and the shifted bound (`ocp_torch.certificate.shifted`).
+    r"""`F_M(V) = E[V mu0 - M max(Q, 0)]` (section 4.1) and the shifted bound (`ocp_torch.certificate.lower.shifted`).
 
     With ``search`` the latter is sought among functions made of `V` too, which takes many times as long: with its last
     layer chosen anew (`recombined`, on states of ``seed``), and averages over neighbours of the better of the two

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ocp_torch.errors import InputError
 from ocp_torch.fields.embedding import FourierEmbedding
-from ocp_torch.fields.spectrum import STATES, prominent_waves
+from ocp_torch.fields.waves import STATES, prominent_waves
 from ocp_torch.problems.problem import Problem
 
 VALUE, CONTROL_DENSITY, LOG_OCCUPATION = "value", "control_density", "log_occupation"

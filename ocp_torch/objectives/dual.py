@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ocp_torch import calculus, formulas
-from ocp_torch.bounds import Bounds
 from ocp_torch.errors import require_number
 from ocp_torch.fields.fields import VALUE, Fields
+from ocp_torch.maths import calculus
 from ocp_torch.objectives.objective import Objective
+from ocp_torch.problems import formulas
+from ocp_torch.problems.constants import Bounds
 from ocp_torch.problems.problem import Problem
-from ocp_torch.samples import Samples
+from ocp_torch.problems.samples import Samples
 
 # Where no `M` is known: the part of `M` that a round starts with, and the part of the round in which it grows.
 LEAST_WEIGHT, GROWTH = 1.0 / 20.0, 0.7

@@ -7,12 +7,16 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor
 
-from ocp_torch import calculus, formulas
-from ocp_torch.bounds import Bounds
-from ocp_torch.calculus import Field
 from ocp_torch.fields.fields import Fields
+from ocp_torch.maths import calculus
+from ocp_torch.maths.calculus import Field
+from ocp_torch.problems import formulas
+from ocp_torch.problems.constants import Bounds
 from ocp_torch.problems.problem import Problem
-from ocp_torch.samples import Samples
+from ocp_torch.problems.samples import Samples
+
+# How a method turns its fields into mu: Lemma 2, Lemma 3, or a network for log mu.
+CLOSED, SADDLE, NETWORK = "closed", "saddle", "network"
 
 
 class Objective(ABC):

@@ -5,12 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ocp_torch import calculus, formulas
-from ocp_torch.bounds import Bounds
 from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
+from ocp_torch.maths import calculus
 from ocp_torch.objectives.objective import Objective
+from ocp_torch.problems import formulas
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.samples import Samples
+from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.samples import Samples
 
 
 class PolicyEvaluation(Objective):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ocp_torch import control_laws, formulas
-from ocp_torch.bounds import Bounds
 from ocp_torch.errors import InputError, require_choice
 from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, Fields
-from ocp_torch.objectives.objective import Objective
+from ocp_torch.objectives.objective import CLOSED, NETWORK, Objective
 from ocp_torch.objectives.saddle import Saddle
+from ocp_torch.problems import formulas
+from ocp_torch.problems.constants import Bounds
 from ocp_torch.problems.problem import Problem
-from ocp_torch.samples import Samples
+from ocp_torch.problems.samples import Samples
 
 
 class ClosedPrimal(Objective):
@@ -19,7 +19,7 @@ class ClosedPrimal(Objective):
 
     players = {"density": (CONTROL_DENSITY,)}
     needs_divergences = True
-    occupation = control_laws.CLOSED
+    occupation = CLOSED
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         w, inflow = formulas.controlled_inflow(samples, fields.control_density, self.rho)
@@ -31,7 +31,7 @@ class NetworkPrimal(Objective):
 
     players = {"density": (CONTROL_DENSITY, LOG_OCCUPATION)}
     needs_divergences = True
-    occupation = control_laws.NETWORK
+    occupation = NETWORK
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         w, inflow = formulas.controlled_inflow(samples, self.admissible(fields), self.rho)

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from ocp_torch import calculus, control_laws, formulas
-from ocp_torch.bounds import Bounds
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fields
+from ocp_torch.maths import calculus
 from ocp_torch.objectives.dual import value_loss
-from ocp_torch.objectives.objective import Objective
+from ocp_torch.objectives.objective import NETWORK, SADDLE, Objective
+from ocp_torch.problems import formulas
+from ocp_torch.problems.constants import Bounds
 from ocp_torch.problems.problem import Problem
-from ocp_torch.samples import Samples
+from ocp_torch.problems.samples import Samples
 
 
 class Saddle(Objective):
@@ -26,7 +27,7 @@ class Saddle(Objective):
     """
 
     players = {"value": (VALUE,), "density": (CONTROL_DENSITY,)}
-    occupation = control_laws.SADDLE
+    occupation = SADDLE
 
     def __init__(self, problem: Problem, bounds: Bounds, augmentation: float = 0.0) -> None:
         super().__init__(problem, bounds)
@@ -70,7 +71,7 @@ class AugmentedSaddle(Objective):
     """
 
     players = {"value": (VALUE,), "density": (CONTROL_DENSITY, LOG_OCCUPATION)}
-    occupation = control_laws.NETWORK
+    occupation = NETWORK
 
     def __init__(
         self,

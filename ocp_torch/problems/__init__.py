@@ -1,18 +1,18 @@
 """Control-affine problems on the torus. `PROBLEMS` maps the names a file may hold to the classes it may build."""
 
-from ocp_torch.problems.arm import Arm
-from ocp_torch.problems.callable import Callable
-from ocp_torch.problems.circle import Circle
-from ocp_torch.problems.dataset import Dataset
-from ocp_torch.problems.dubins import Dubins
-from ocp_torch.problems.kuramoto import Kuramoto
-from ocp_torch.problems.manufactured import Manufactured
-from ocp_torch.problems.pendulum import Pendulum
-from ocp_torch.problems.phase_neurons import PhaseNeurons
+from ocp_torch.problems.exact.circle import Circle
+from ocp_torch.problems.exact.manufactured import Manufactured
+from ocp_torch.problems.exact.torus import Torus
 from ocp_torch.problems.problem import Problem
-from ocp_torch.problems.robot import RobotArm
-from ocp_torch.problems.torus import Torus
-from ocp_torch.problems.unicycle import Unicycle
+from ocp_torch.problems.recorded.dataset import Dataset
+from ocp_torch.problems.simulator.simulator import Callable
+from ocp_torch.problems.systems.arm import Arm
+from ocp_torch.problems.systems.dubins import Dubins
+from ocp_torch.problems.systems.kuramoto import Kuramoto
+from ocp_torch.problems.systems.pendulum import Pendulum
+from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
+from ocp_torch.problems.systems.robot import RobotArm
+from ocp_torch.problems.systems.unicycle import Unicycle
 
 # `Callable` is not among them: a file may not name a function to be imported.
 PROBLEMS = {

@@ -12,13 +12,13 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ocp_torch.control_limit import control_cost
 from ocp_torch.errors import InputError, ProblemError, require_integer, require_number
-from ocp_torch.extremum import supremum
+from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.blame import failing_state, named, origin, place, words
+from ocp_torch.problems.control_limit import control_cost
 from ocp_torch.problems.mass import sampled_mass
 from ocp_torch.problems.problem import MOST_COORDINATES, Problem
-from ocp_torch.samplers import scrambled_sobol
 
 # Shape of the answer beyond N, in the letters of the documentation.
 DATA = {"state_cost": "", "drift": "d", "control_matrix": "dm", "initial_density": ""}

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from ocp_torch import calculus
+from ocp_torch.maths import calculus
 from ocp_torch.problems.problem import Problem
-from ocp_torch.samples import Samples
+from ocp_torch.problems.samples import Samples
 
 
 class ClosedLoop(Problem):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ocp_torch.samplers import derive_seed, scrambled_sobol
+from ocp_torch.maths.sampling import derive_seed, scrambled_sobol
 
 Density = Callable[[Tensor], Tensor]
 

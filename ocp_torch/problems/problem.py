@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch import calculus
-from ocp_torch.control_limit import control_cost
-from ocp_torch.enclosure import Enclosure, Lipschitz, lipschitz_enclosure
 from ocp_torch.errors import InputError, require_integer, require_number
-from ocp_torch.samplers import scrambled_sobol
-from ocp_torch.samples import Samples
-from ocp_torch.taylor import Box
+from ocp_torch.maths import calculus
+from ocp_torch.maths.enclosure import Enclosure, Lipschitz, lipschitz_enclosure
+from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.taylor import Box
+from ocp_torch.problems.control_limit import control_cost
+from ocp_torch.problems.samples import Samples
 
 # Beyond this, B alone would fill the memory.
 MOST_COORDINATES = 1024

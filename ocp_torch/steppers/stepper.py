@@ -16,8 +16,8 @@ from torch.optim.lr_scheduler import LRScheduler
 from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
 from ocp_torch.objectives.objective import Objective
-from ocp_torch.samples import Samples
-from ocp_torch.steppers.culprit import BROKEN_PROBLEM, NonFiniteError, culprit
+from ocp_torch.problems.samples import Samples
+from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM, NonFiniteError, culprit
 
 Draw = Callable[[], Samples]
 Visit = Callable[[], None]

@@ -7,13 +7,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ocp_torch.control_laws import ValueLaw
+from ocp_torch.control.policies import ValueLaw
 from ocp_torch.errors import InputError, require_number
 from ocp_torch.fields import VALUE, Fields
+from ocp_torch.maths.sampling import derive_seed
 from ocp_torch.objectives import Objective
 from ocp_torch.problems import Problem
-from ocp_torch.samplers import derive_seed
-from ocp_torch.samples import Samples
+from ocp_torch.problems.samples import Samples
 
 VISITS_STREAM = 9
 # The part of a batch that is visited states, where no `M` is known and nobody said otherwise.

@@ -12,9 +12,9 @@ from pathlib import Path
 import torch
 
 from ocp_torch.errors import InputError, StorageError
-from ocp_torch.reading import LARGEST_FILE, kind, opened
-from ocp_torch.storage import write_atomically
-from ocp_torch.training.archive import After, unpacked
+from ocp_torch.files.archive import After, unpacked
+from ocp_torch.files.reading import LARGEST_FILE, kind, opened
+from ocp_torch.files.storage import write_atomically
 
 SCHEMA = 2
 # The file is one line, this word with the schema and a digest, and then what torch.save wrote.

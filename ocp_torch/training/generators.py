@@ -7,7 +7,7 @@ import random
 import numpy as np
 import torch
 
-from ocp_torch.samplers import derive_seed
+from ocp_torch.maths.sampling import derive_seed
 
 # Branch of the seed tree for the global generators, beside samplers, weights and the certification stage.
 GLOBAL_STREAM = 4

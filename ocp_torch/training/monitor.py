@@ -12,10 +12,11 @@ from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 from tqdm import tqdm
 
-from ocp_torch import calculus, formulas
 from ocp_torch.certificate import Certificate, CertificateSettings
-from ocp_torch.control_laws import admissible_density, occupation_density
-from ocp_torch.samples import Samples
+from ocp_torch.control.policies import admissible_density, occupation_density
+from ocp_torch.maths import calculus
+from ocp_torch.problems import formulas
+from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import StepReport
 from ocp_torch.training.stages import Stages, in_words, rough_seconds
 

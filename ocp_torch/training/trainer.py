@@ -11,7 +11,6 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from ocp_torch.bounds import Bounds
 from ocp_torch.certificate import (
     Certificate,
     CertificateSettings,
@@ -24,17 +23,18 @@ from ocp_torch.certificate.progress import Progress, silent
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.fields.fields import typical_sizes
+from ocp_torch.maths.sampling import derive_seed
 from ocp_torch.objectives import Objective
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import blamed
-from ocp_torch.samplers import derive_seed
+from ocp_torch.problems.constants import Bounds
 from ocp_torch.steppers import NonFiniteError, Stepper
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.checkpoint import BEST, load_checkpoint, save_checkpoint
+from ocp_torch.training.health import Look, Watch, hopeless
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.signals import Signals
 from ocp_torch.training.state import gather, restore
-from ocp_torch.training.watch import Look, Watch, hopeless
 
 # What a look at the bounds during training costs: enough for a curve, not for a claim.
 QUICK = CertificateSettings(

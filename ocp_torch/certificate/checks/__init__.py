@@ -1,0 +1,1 @@
+"""What the bounds rest on, held against what could refute it."""

@@ -1,0 +1,139 @@
+"""Are a controller, and the problem, regular? Jumps and layers, found by halving segments until only they are left to see."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ocp_torch.control.policies import ControlLaw
+from ocp_torch.maths.supremum import batched
+from ocp_torch.problems.problem import Problem
+
+SEGMENTS = 768
+# Lines of each length, half of them along an axis, the states on each, and how many of their pieces are followed by kind.
+LINES, LENGTHS, ON_LINE, FOLLOWED = 48, (1.0, 0.1, 0.01, 1e-3), 65, 64
+# Halvings, after which the longest segment is 3e-11 long: what still changes across it is no slope. After the first of them
+# those with the largest change go on.
+HALVINGS, FIRST_HALVINGS, KEPT = 34, 14, 384
+# A change relative to the largest value met that counts as a jump; above the noise of a controller in float32.
+NOTICEABLE = 1e-5
+# A layer across which so much of the largest value changes within that length is to sampled states the same as a jump.
+LAYER, STEEP = 1e-4, 0.5
+
+CONTROLLER, DRIFT, MATRIX, LOOP = "controller", "drift", "control matrix", "closed loop"
+
+
+@dataclass(frozen=True)
+class Jump:
+    """The largest jump found, `|u(x+) - u(x-)|`, where, and of what; ``size`` is 0 where none was. ``width`` is the length of
+    the segment it was seen across."""
+
+    size: float
+    x: Tensor
+    what: str = CONTROLLER
+    width: float = 0.0
+
+    @property
+    def in_problem(self) -> bool:
+        """Whether it is one of the data, not of a controller's."""
+        return self.what in (DRIFT, MATRIX)
+
+    @property
+    def verb(self) -> str:
+        return "jumps" if self.width < 0.1 * LAYER else f"changes within {self.width:.1g}"
+
+
+@torch.no_grad()
+def largest_jump(
+    law: ControlLaw, dim: int, seed: int = 0, problem: Problem | None = None, near: Tensor | None = None
+) -> Jump:
+    """Follow, on segments of all lengths, the half across which the control changes more; with ``problem`` also its drift,
+    control matrix and closed loop, and layers of them too steep for sampled states to resolve.
+
+    Pieces come from random segments and lines, half of these through states of ``near`` ``(N, d)``, on which the pieces that
+    change most and most unlike their neighbours are followed. For a Lipschitz function the change halves with the length; a
+    jump that is followed stays. One much smaller than what changes nearby anyway, or on a tiny set, can be missed.
+    """
+    functions: dict[str, Callable[[Tensor], Tensor]] = {CONTROLLER: law}
+    if problem is not None:
+        functions[LOOP] = lambda x: problem.velocity(x, law(x))
+        functions[MATRIX] = lambda x: problem.control_matrix(x).flatten(1)
+        if not problem.driftless:
+            functions[DRIFT] = problem.drift
+    generator = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.rand(*shape, dtype=torch.float64, generator=generator)
+    left = draw(SEGMENTS, dim)
+    direction = torch.nn.functional.normalize(torch.randn(SEGMENTS, dim, dtype=torch.float64, generator=generator))
+    right = left + direction * 10.0 ** (-3.0 * draw(SEGMENTS, 1)) * 0.5
+    sizes = {name: max(float(batched(f, left).norm(dim=-1).max()), 1e-300) for name, f in functions.items()}
+    together = lambda x: torch.cat([f(x) / sizes[name] for name, f in functions.items()], dim=-1)
+    first, last = _pieces(together, dim, generator, near)
+    left, right = torch.cat([left, first]), torch.cat([right, last])
+    steep = 0.0, left[0], 0.0
+    value_left, value_right = batched(together, left), batched(together, right)
+    for k in range(HALVINGS):
+        middle = 0.5 * (left + right)
+        value = batched(together, middle)
+        nearer = ((value - value_left).norm(dim=-1) > (value_right - value).norm(dim=-1)).unsqueeze(-1)
+        left, value_left = torch.where(nearer, left, middle), torch.where(nearer, value_left, value)
+        right, value_right = torch.where(nearer, middle, right), torch.where(nearer, value, value_right)
+        change = (value_right - value_left).norm(dim=-1).nan_to_num(nan=0.0)
+        length = (right - left).norm(dim=-1)
+        narrow = torch.where(length <= LAYER, change, 0.0)
+        if float(narrow.max()) > steep[0]:
+            at = int(narrow.argmax())
+            steep = float(narrow[at]), left[at].clone(), float(length[at])
+        if k == FIRST_HALVINGS:
+            top = change.topk(min(KEPT, len(change))).indices
+            left, right, value_left, value_right = (part[top] for part in (left, right, value_left, value_right))
+    jump = _largest(functions, sizes, left, right, NOTICEABLE)
+    if jump.size > 0.0 or problem is None or steep[0] < STEEP:
+        return jump
+    away = 0.5 * LAYER * torch.nn.functional.normalize(torch.ones(1, dim, dtype=torch.float64))
+    return _largest(functions, sizes, steep[1] - away, steep[1] + away, 0.5 * STEEP, LAYER)
+
+
+def _largest(functions, sizes: dict[str, float], left: Tensor, right: Tensor, least: float, width: float = 0.0) -> Jump:
+    """Of which function the change from ``left`` to ``right`` is largest for its size, if above ``least`` of it."""
+    best = Jump(0.0, left[0].remainder(1.0))
+    relative = least
+    for name in (DRIFT, MATRIX, CONTROLLER, LOOP):
+        if name not in functions:
+            continue
+        change = (functions[name](right) - functions[name](left)).norm(dim=-1).nan_to_num(nan=0.0)
+        worst = int(change.argmax())
+        # The data come first: what jumps in them jumps in the closed loop too.
+        if float(change[worst]) > relative * sizes[name]:
+            relative = max(2.0 * float(change[worst]) / sizes[name], least)
+            best = Jump(float(change[worst]), left[worst].remainder(1.0), name, width)
+    return best
+
+
+def _pieces(function, dim: int, generator: torch.Generator, near: Tensor | None) -> tuple[Tensor, Tensor]:
+    """The ends of pieces of lines across which ``function`` changes most, and most unlike the pieces beside them."""
+    draw = lambda *shape: torch.rand(*shape, dtype=torch.float64, generator=generator)
+    starts, ends = [], []
+    for length in LENGTHS:
+        middle = draw(LINES, dim)
+        if near is not None and len(near):
+            rows = torch.randint(len(near), (LINES // 2,), generator=generator)
+            # Somewhere on the line, not always on the same of its states.
+            middle[: LINES // 2] = near[rows] + 0.3 * length * (draw(LINES // 2, dim) - 0.5) / dim**0.5
+        direction = torch.randn(LINES, dim, dtype=torch.float64, generator=generator)
+        axis = torch.randint(dim, (LINES,), generator=generator)
+        direction[::2] = torch.nn.functional.one_hot(axis[::2], dim).to(direction)
+        direction = torch.nn.functional.normalize(direction)
+        along = length * (torch.linspace(-0.5, 0.5, ON_LINE, dtype=torch.float64))
+        x = middle.unsqueeze(1) + along[:, None] * direction.unsqueeze(1)  # (LINES, ON_LINE, d)
+        step = batched(function, x.flatten(0, 1)).unflatten(0, (LINES, ON_LINE)).diff(dim=1)
+        change = step.norm(dim=-1).nan_to_num(nan=0.0)
+        unlike = torch.zeros_like(change)
+        unlike[:, 1:-1] = (step[:, 1:-1] - 0.5 * (step[:, :-2] + step[:, 2:])).norm(dim=-1).nan_to_num(nan=0.0)
+        for score in (change, unlike):
+            picked = score.flatten().topk(FOLLOWED).indices
+            starts.append(x[:, :-1].flatten(0, 1)[picked])
+            ends.append(x[:, 1:].flatten(0, 1)[picked])
+    return torch.cat(starts), torch.cat(ends)

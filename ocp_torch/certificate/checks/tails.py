@@ -1,0 +1,92 @@
+r"""Do a few states carry a mean? Then its standard error is not to be trusted, and more states are wanted where those are.
+
+Of `N` contributions whose fourth moment is `k` times the square of their second, about `N / k` make the scatter. Where that
+is few, states are drawn from a density fitted to what is rare, with exact weights; what stays rare widens the interval: where
+`n` were met there may be `n + 2 sqrt(n) + 3` (Poisson).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Protocol, TypeVar
+
+import torch
+from torch import Tensor
+
+from ocp_torch.certificate.estimate import Estimate, replicated_samples
+from ocp_torch.maths.mixtures import Mixture, concentrated
+from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.samples import Samples
+from ocp_torch.problems.starts import UNIFORM_STATES, evaluation_law
+
+# Below so many states behind the scatter a mean is carried by a few; smaller kurtoses than that say nothing.
+FEW, KURTOSIS = 30.0, 30.0
+# What a few carry is let pass up to that part of the answer.
+MATERIAL = 1e-3
+# How often states are drawn anew; branch of the seed tree for them.
+ROUNDS, STREAM = 3, 6
+
+
+def rarity(contributions: Tensor, size: float) -> float:
+    """By how much the mean of ``contributions`` ``(N,)`` may be off because a few carry it; 0 where many do, or where what
+    they carry is small beside ``size``, the answer's."""
+    away = (contributions - contributions.mean()).double()
+    square = float(away.square().mean())
+    if not square > 0.0 or not math.isfinite(square):
+        return 0.0
+    kurtosis = float((away.square() / square).square().mean())
+    behind = max(len(away) / kurtosis, 1.0)
+    if kurtosis < KURTOSIS or behind >= FEW:
+        return 0.0
+    carried = float(away.abs().topk(int(FEW)).values.sum()) / len(away)
+    return carried * (2.0 * math.sqrt(behind) + 3.0) / behind if carried > MATERIAL * abs(size) else 0.0
+
+
+def widened(estimate: Estimate, contributions: list[Tensor]) -> Estimate:
+    """``estimate`` with its interval widened by the `rarity` of what it is the mean of."""
+    rare = rarity(torch.cat(contributions), estimate.value)
+    return replace(estimate, bias=(estimate.bias or 0.0) + rare) if rare > 0.0 else estimate
+
+
+def notes_on(estimates: dict[str, Estimate | None]) -> list[str]:
+    """Which of ``estimates``, without a bias of their own, were `widened`."""
+    return [
+        f"a few sampled states carry {name}: its interval is widened by {e.bias:.2g}."
+        for name, e in estimates.items()
+        if e is not None and e.bias
+    ]
+
+
+class Judged(Protocol):
+    """A result with the weighted integrands per set of each of its means, as parts of the answer."""
+
+    contributions: list[list[Tensor]]
+
+
+R = TypeVar("R", bound=Judged)
+
+
+def sharpened(evaluate: Callable[[list[Samples]], R], problem: Problem, sets: list[Samples], seed: int) -> R:
+    """``evaluate`` on ``sets`` of samples of ``problem``, or, while few of them carry a mean, on others of the same number,
+    drawn from a density fitted to what those few show."""
+    found = evaluate(sets)
+    for k in range(ROUNDS):
+        rare = [c for c in found.contributions if rarity(torch.cat(c), 1.0) > 0.0]
+        if not rare:
+            break
+        away = sum((torch.cat(c) - torch.cat(c).mean()).abs() for c in rare)
+        x, weight = (torch.cat([getattr(s, name) for s in sets]) for name in ("x", "weight"))
+        law = concentrated(x, away, 1.0 / weight)
+        known = evaluation_law(problem)
+        laws = [law for law in (law, known) if not law.is_uniform]
+        if not laws:
+            break
+        law = Mixture.join([law.scaled((1.0 - UNIFORM_STATES) / len(laws)) for law in laws])
+        divergences = sets[0].div_a is not None
+        fresh = derive_seed(seed, STREAM, k)
+        sets = replicated_samples(problem, len(sets[0]), len(sets), fresh, divergences, law)
+        found = evaluate(sets)
+    return found

@@ -1,0 +1,130 @@
+"""Is the problem what every bound takes it for? Periodic, with `f >= 0` and a probability density `mu0`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ocp_torch.certificate.estimate import Estimate, integral
+from ocp_torch.errors import ProblemError
+from ocp_torch.maths.mixtures import worth
+from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.supremum import supremum
+from ocp_torch.problems.blame import place
+from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.samples import Samples
+
+# States for periodicity and the seam, and at most so many coordinates of the latter.
+PROBES, MOST_SEAMS = 256, 32
+# Relative differences that rounding does not explain; half the width of the gap across which the seam is looked at.
+ROUNDING, SEAM_STEP, SEAM_JUMP = 1e-6, 1e-9, 1e-5
+# How far the sampled mass of mu0 may be from 1, beside its confidence interval at that level.
+MASS_TOLERANCE, MASS_LEVEL = 1e-4, 0.9999
+# What the states' masses must be worth, as a part of as many equal ones: below, a few states carry mu0 and no mass is known.
+LEAST_WORTH = 0.02
+
+
+@dataclass(frozen=True)
+class WellPosed:
+    """What was found: ``sound`` where the problem is one (no bound stands without), ``nonnegative`` where `f >= 0` (`J`
+    and `G` need it), ``smooth_seam`` where `a` and `B` do not jump from 1 to 0 (what takes their divergence needs it)."""
+
+    sound: bool
+    nonnegative: bool
+    smooth_seam: bool
+    smallest_cost: float
+    mass: float
+    warnings: list[str]
+
+
+@torch.no_grad()
+def check_problem(problem: Problem, sets: list[Samples]) -> WellPosed:
+    """Compare values a period apart, on both sides of the seam, and against 0 and 1; on ``sets`` and climbed from there.
+
+    Raises `InputError` where a function is not finite.
+    """
+    for name in ("f", "a", "B", "mu0"):
+        for samples in sets:
+            bad = ~torch.isfinite(getattr(samples, name)).reshape(len(samples), -1).all(dim=-1)
+            if bool(bad.any()):
+                at = place(samples.x[bad][0])
+                raise ProblemError(f"{_NAMES[name]} is not finite at {at}; it must be finite on the whole torus.")
+    warnings: list[str] = []
+    sizes = {name: max(float(getattr(samples, name).abs().max()) for samples in sets) for name in _NAMES}
+    shifted, seams = _periods(problem, sizes), _seams(problem, sizes)
+    for name, size in shifted.items():
+        warnings.append(
+            f"no bound is used: {_NAMES[name]} is not periodic, it changes by {size:.3g} when whole numbers are added to x."
+        )
+    for name, size in seams.items():
+        if name not in shifted:
+            cost = ": bounds that take its divergence are not used" if name in ("a", "B") else ", as a function may"
+            warnings.append(f"{_NAMES[name]} jumps by {size:.3g} where a coordinate passes from 1 to 0{cost}.")
+    smallest = _smallest(problem.state_cost, sets, "f")
+    nonnegative = smallest >= -ROUNDING * max(float(samples.f.abs().max()) for samples in sets)
+    if not nonnegative:
+        warnings.append(f"J and G are not used: the state cost falls to {smallest:.3g}, but they need f >= 0.")
+    mass = Estimate.of([integral(samples, samples.mu0) for samples in sets])
+    least = _smallest(problem.initial_density, sets, "mu0")
+    positive = least >= -ROUNDING * abs(mass.value)
+    if not positive:
+        warnings.append(f"no bound is used: the initial density falls to {least:.3g}, but must not be negative.")
+    carried = worth(torch.cat([s.weight * s.mu0 for s in sets]).clamp_min(0.0))
+    whole = abs(mass.value - 1.0) <= MASS_TOLERANCE + mass.half_width(MASS_LEVEL)
+    if not whole:
+        warnings.append(
+            f"no bound is used: the initial density integrates to {mass.value:.4g} over what a search found of it, but must "
+            "to 1."
+        )
+    elif carried < LEAST_WORTH:
+        warnings.append(
+            "no bound is used: hardly any sampled state carries mass of the initial density, which is too narrow for its "
+            f"integral to be known (all states are worth as much as {100.0 * carried:.2g} % of them)."
+        )
+    sound = not shifted and positive and whole and carried >= LEAST_WORTH
+    return WellPosed(sound, nonnegative, not {"a", "B"} & set(seams), smallest, mass.value, warnings)
+
+
+_NAMES = {"f": "state_cost", "a": "drift", "B": "control_matrix", "mu0": "initial_density"}
+
+
+def _differences(problem: Problem, x: Tensor, y: Tensor, tolerance: float, sizes: dict[str, float]) -> dict[str, float]:
+    """The largest difference of each function between rows of ``x`` and ``y``, where it is above that part of its largest
+    value anywhere: at the seam a function that is odd is nearly 0."""
+    here, there = (Samples.of(problem, z, divergences=False) for z in (x, y))
+    found = {}
+    for name in _NAMES:
+        left, right = getattr(here, name), getattr(there, name)
+        size = float((left - right).abs().max())
+        if not size <= tolerance * max(sizes[name], float(left.abs().max()), float(right.abs().max())):
+            found[name] = size
+    return found
+
+
+def _periods(problem: Problem, sizes: dict[str, float]) -> dict[str, float]:
+    x = scrambled_sobol(PROBES, problem.dim, 2, torch.float64)
+    whole = torch.randint(-2, 4, x.shape, generator=torch.Generator().manual_seed(0)).to(x)
+    return _differences(problem, x, x + whole, ROUNDING, sizes)
+
+
+def _seams(problem: Problem, sizes: dict[str, float]) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for i in range(min(problem.dim, MOST_SEAMS)):
+        after = scrambled_sobol(PROBES // 4, problem.dim, 3 + i, torch.float64)
+        after[:, i] = SEAM_STEP
+        before = after.clone()
+        before[:, i] = 1.0 - SEAM_STEP
+        for name, size in _differences(problem, after, before, SEAM_JUMP, sizes).items():
+            found[name] = max(size, found.get(name, 0.0))
+    return found
+
+
+def _smallest(function, sets: list[Samples], name: str) -> float:
+    """The smallest value of ``function``: on ``sets``, and downhill from the lowest of those states."""
+    values, states = torch.cat([getattr(s, name) for s in sets]), torch.cat([s.x for s in sets])
+    lowest = states[values.topk(min(16, len(values)), largest=False).indices]
+    return min(
+        -supremum(lambda x: -function(x), lowest, ascents=16, steps=40, differentiable=False).value, float(values.min())
+    )

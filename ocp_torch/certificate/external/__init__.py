@@ -1,0 +1,1 @@
+"""Certificates of what was not trained here: a controller somebody brings, recorded samples."""

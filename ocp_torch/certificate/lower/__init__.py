@@ -1,0 +1,1 @@
+"""Lower bounds on `OPT`, one a file."""

@@ -1,0 +1,152 @@
+r"""A lower bound that needs no `M`: `E[W mu0] - sup Q_W <= OPT` for any smooth `W`, here for `W = theta V`.
+
+A constant `c` added to `W` adds `c` to its slack, so `W - sup Q_W` is a subsolution of the HJB equation. For `V` scaled by
+`theta` the slack `Q_{theta V} = theta (V - grad V . a / rho) - f + R*(-theta B^T grad V / rho)` is convex in `theta` at
+every state, so the bound is concave in `theta`: its maximum is found by a search on a line. (Scaling `V - c` instead of `V`
+changes nothing.) Where `V` has large slack, at kinks for instance, a `theta` below 1 trades a little of `E[V mu0]` for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.simulated.control_variate import integrals
+from ocp_torch.maths import calculus
+from ocp_torch.maths.calculus import Field, chunked_gradient
+from ocp_torch.maths.supremum import Extremum, minimiser, supremum
+from ocp_torch.problems import formulas
+from ocp_torch.problems.control_cost import PowerCost
+from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.samples import Samples
+
+# The largest theta that is tried.
+TOP = 1.5
+
+
+@dataclass(frozen=True)
+class SlackParts:
+    """What the slack of every `theta V` at sampled states is made of."""
+
+    x: Tensor  # (N, d)
+    initial: Tensor  # (N,) V mu0
+    value: Tensor  # (N,) V - grad V . a / rho
+    f: Tensor  # (N,)
+    push: Tensor  # (N, m) -B^T grad V / rho
+    cost: PowerCost
+
+    @classmethod
+    def of(cls, samples: Samples, value: Tensor, gradient: Tensor, cost: PowerCost, rho: float) -> SlackParts:
+        transported = value - formulas.along(samples, gradient) / rho
+        push = -formulas.pull_back(samples, gradient) / rho
+        return cls(samples.x, value * samples.mu0, transported, samples.f, push, cost)
+
+    @staticmethod
+    def join(parts: list[SlackParts]) -> SlackParts:
+        names = ("x", "initial", "value", "f", "push")
+        return SlackParts(*(torch.cat([getattr(p, n) for p in parts]) for n in names), parts[0].cost)
+
+    def slack(self, theta: float) -> Tensor:
+        """`Q_{theta V}`, ``(N,)``."""
+        return theta * self.value - self.f + self.cost.conjugate(theta * self.push)
+
+
+def slack_parts(problem: Problem, value: Field, sets: list[Samples]) -> list[SlackParts]:
+    """The parts on each of ``sets``."""
+    evaluated = [(s, *chunked_gradient(value, s.x)) for s in sets]
+    return [SlackParts.of(s, v, g, problem.control_cost, problem.discount) for s, v, g in evaluated]
+
+
+@dataclass(frozen=True)
+class Shift:
+    """`E[theta W mu0] - sup Q_{theta W}`, for `W` the average of `V` at ``radius``, or `V` itself where that is 0."""
+
+    theta: float
+    largest: Extremum
+    initial: list[float]  # E[W mu0] per set
+    radius: float = 0.0
+    name: str = "V"
+
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        value: Field,
+        sets: list[Samples],
+        parts: list[SlackParts],
+        ascents: int,
+        radius: float = 0.0,
+        beside: Sequence[SlackParts] = (),
+    ) -> Shift:
+        """The best multiple of ``value``, whose ``parts`` on ``sets`` are known; the supremum is sought ``beside`` too."""
+        initial = integrals([s.x for s in sets], [p.initial for p in parts], [s.weight for s in sets])
+        everywhere = SlackParts.join([*parts, *beside])
+        theta, largest = best_shift(problem, value, everywhere, sum(initial) / len(initial), ascents)
+        return cls(theta, largest, initial, radius)
+
+    @property
+    def estimate(self) -> Estimate:
+        """The bound; a negative supremum shifts `W` up."""
+        return Estimate.of([self.theta * e - self.largest.value for e in self.initial])
+
+    @property
+    def bound(self) -> float:
+        return self.theta * sum(self.initial) / len(self.initial) - self.largest.value
+
+    @property
+    def sentence(self) -> str:
+        """What the slack is of."""
+        return f"sup Q of {self.theta:.4g} {self.name}" + (
+            f", averaged {self.radius:.2g} around," if self.radius else ""
+        )
+
+
+def slack_function(problem: Problem, value: Field):
+    """`x -> Q(x)` for the whole torus, differentiable in `x` where the problem is."""
+
+    def slack(x: Tensor) -> Tensor:
+        samples = Samples.of(problem, x, divergences=False) if not x.requires_grad else _live(problem, x)
+        v, gradient = calculus.value_and_gradient(value, x)
+        return formulas.hjb_slack(samples, v, gradient, problem.control_cost, problem.discount)
+
+    return slack
+
+
+def _live(problem: Problem, x: Tensor) -> Samples:
+    """Samples whose data carry derivatives in `x`; only suprema over `x` want that."""
+    one = torch.ones_like(x[:, 0])
+    return Samples(x, problem.state_cost(x), problem.drift(x), problem.control_matrix(x), one, one)
+
+
+def climbed(problem: Problem, value: Field, parts: SlackParts, theta: float, ascents: int) -> Extremum:
+    """`sup Q_{theta V}`: the largest of all sampled states, then local ascents from the worst; an estimate from below."""
+    start = parts.x[parts.slack(theta).topk(min(ascents, len(parts.x))).indices]
+    scaled = value if theta == 1.0 else lambda x: theta * value(x)
+    found = supremum(slack_function(problem, scaled), start, ascents=ascents)
+    return Extremum(found.value, found.x, len(parts.x), found.ascents)
+
+
+def best_shift(
+    problem: Problem, value: Field, parts: SlackParts, initial: float, ascents: int
+) -> tuple[float, Extremum]:
+    r"""`theta` and `sup Q_{theta V}`: 1, or the maximiser of `theta initial - max Q_{theta V}` over the sampled states.
+
+    The supremum at the chosen `theta` is searched for anew, and 1 stays where that shows no gain. Where `f < 0` is met
+    the problem breaks its promise, `0` is no subsolution to scale towards, and `theta` is 1.
+    """
+    plain = climbed(problem, value, parts, 1.0, ascents)
+    if bool((parts.f < 0.0).any()):
+        return 1.0, plain
+    theta = scaled_by(parts, initial)
+    scaled = climbed(problem, value, parts, theta, ascents)
+    gains = theta * initial - scaled.value > initial - plain.value
+    return (theta, scaled) if gains else (1.0, plain)
+
+
+def scaled_by(parts: SlackParts, initial: float) -> float:
+    """The `theta` in `[0, TOP]` that maximises the sampled bound, concave in `theta`."""
+    return minimiser(lambda theta: float(parts.slack(theta).max()) - theta * initial, 0.0, TOP)

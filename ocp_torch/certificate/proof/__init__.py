@@ -1,0 +1,1 @@
+"""Lower bounds by interval arithmetic, for networks in one and two dimensions."""

@@ -1,0 +1,1 @@
+"""What a controller costs, and where it goes, by simulation."""

@@ -1,0 +1,116 @@
+r"""The occupation density of a closed loop: along the flow, its supremum, and what is known of that beforehand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ocp_torch.certificate.simulated.simulation import Dynamics, discounted_integral
+from ocp_torch.control.policies import ControlLaw
+from ocp_torch.maths.supremum import supremum
+from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.problems.problem import Problem
+
+# The integral over the past is taken in pieces of so many discount times, until the last one adds next to nothing; what
+# has not settled after so many pieces is extrapolated.
+PIECE, PIECES, SETTLED = 5.0, 8, 1e-2
+# Of the states looked at, the highest are looked at again from close by.
+TOP, NEARBY = 6, 48
+# Step of a difference quotient of the velocity: truncation is then about 1e-7 of its second derivatives, rounding 1e-9.
+DIFFERENCE = 1e-7
+
+
+def velocity_and_divergence(velocity: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, Tensor]:
+    """`g(x)` ``(N, d)`` and `div g(x)` ``(N,)`` by differences, all in one call of ``velocity``, in float64.
+
+    Cheaper than derivatives of a controller that is a derivative itself, by far where it is no network.
+    """
+    dim, moves = x.shape[1], DIFFERENCE * torch.eye(x.shape[1], dtype=x.dtype)
+    here, *moved = velocity(torch.cat([x, *(x + move for move in moves)])).chunk(dim + 1)
+    return here, sum((g[:, i] - here[:, i]) / DIFFERENCE for i, g in enumerate(moved))
+
+
+def _backward(problem: Problem, law: ControlLaw) -> Dynamics:
+    """The flow back in time with the logarithm of the density's growth as one more coordinate."""
+    velocity = lambda y: problem.velocity(y, law(y))
+
+    def backward(state: Tensor) -> tuple[Tensor, Tensor]:
+        y, log_factor = state[:, :-1], state[:, -1]
+        forward, spread = velocity_and_divergence(velocity, y)
+        motion = torch.cat([-forward, -spread.unsqueeze(-1)], dim=-1)
+        return motion, problem.initial_density(y) * log_factor.clamp_max(60.0).exp()
+
+    return backward
+
+
+def occupation_along_flow(problem: Problem, law: ControlLaw, x: Tensor, horizon: float, steps: int) -> Tensor:
+    r"""`mu^u(x) = rho int e^{-rho t} mu0(y_t) exp(-int_0^t div g(y_s) ds) dt` along `dy/dt = -g(y)`, `y_0 = x`; ``(N,)``.
+
+    The density of a flow changes by its divergence (the representation behind Proposition 8 of the paper); valid for a
+    Lipschitz closed loop `g = a + B u`. The logarithm of the second factor is carried as one more coordinate.
+    """
+    start = torch.cat([x, x.new_zeros(len(x), 1)], dim=-1)
+    density, _ = discounted_integral(_backward(problem, law), start, problem.discount, horizon, steps)
+    return density
+
+
+def settled_occupation(problem: Problem, law: ControlLaw, x: Tensor) -> Tensor:
+    """`mu^u` ``(N,)`` as `occupation_along_flow`, as far back as it takes; infinite where the past adds ever more.
+
+    Where the flow contracts nearly as fast as the discount forgets, the integral settles slowly, and geometrically: what
+    is left is extrapolated from the last pieces.
+    """
+    rho, dynamics = problem.discount, _backward(problem, law)
+    horizon = PIECE / rho
+    with torch.no_grad():
+        speed = float(problem.velocity(x, law(x)).norm(dim=-1).max())
+    steps = int(min(150, max(20, math.ceil(horizon * max(rho / 0.25, speed / 0.1)))))
+    state = torch.cat([x, x.new_zeros(len(x), 1)], dim=-1)
+    pieces: list[Tensor] = []
+    for _ in range(PIECES):
+        piece, state = discounted_integral(dynamics, state, rho, horizon, steps, wrap=False)
+        pieces.append(piece)
+        # From here on the discount of the time that has passed is part of the factor.
+        state = torch.cat([state[:, :-1].remainder(1.0), state[:, -1:] - PIECE], dim=-1)
+        if bool((piece <= SETTLED * sum(pieces)).all()):
+            return sum(pieces)
+    before, last = sum(pieces[-4:-2]), sum(pieces[-2:])
+    ratio = last / before.clamp_min(1e-300)
+    rest = torch.where(ratio < 1.0, last * ratio / (1.0 - ratio), math.inf)
+    return sum(pieces) + torch.where(last > SETTLED * sum(pieces), rest, 0.0)
+
+
+def estimated_sup_occupation(problem: Problem, law: ControlLaw, end_states: Tensor, states: int) -> float:
+    """The largest `mu^u` met: at the ends of trajectories, where mass accumulates, at uniform states, and then near the
+    highest of them."""
+    count = max(1, 2 * states // 3)
+    picked = end_states[:: max(1, len(end_states) // count)][:count]
+    generator = torch.Generator().manual_seed(0)
+    uniform = torch.rand(states - len(picked), problem.dim, dtype=picked.dtype, generator=generator)
+    x = torch.cat([picked, uniform])
+    met = lambda x: settled_occupation(problem, law, x).nan_to_num(nan=math.inf, posinf=math.inf)
+    density = met(x)
+    if not bool(torch.isfinite(density).all()):
+        return math.inf
+    top = x[density.topk(min(TOP, len(x))).indices]
+    around = top[torch.arange(NEARBY) % len(top)]
+    steps = torch.randn(around.shape, dtype=x.dtype, generator=generator) / math.sqrt(problem.dim)
+    sizes = 10.0 ** (-1.0 - 2.0 * torch.rand(NEARBY, 1, dtype=x.dtype, generator=generator))
+    nearby = settled_occupation(problem, law, (around + sizes * steps).remainder(1.0)).nan_to_num(
+        nan=math.inf, posinf=math.inf
+    )
+    return max(float(density.max()), float(nearby.max()))
+
+
+def a_priori_sup_occupation(problem: Problem, law: ControlLaw, points: Tensor) -> float | None:
+    r"""`sup mu^u <= rho sup mu0 / (rho - sup(-div g))` where that is positive, else `None`; both suprema as met at
+    ``points`` and climbed. For a Lipschitz closed loop only: contraction on a jump has no divergence to show it."""
+    if not problem.gives_divergences:
+        return None
+    loop = ClosedLoop(problem, law)
+    largest = lambda function: supremum(function, points, ascents=16, steps=20, differentiable=False).value
+    excess = problem.discount - max(0.0, largest(lambda x: -loop.drift_divergence(x)))
+    return problem.discount * largest(problem.initial_density) / excess if excess > 0.0 else None

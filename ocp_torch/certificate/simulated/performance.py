@@ -1,0 +1,196 @@
+r"""`Perf(u) = E_{x0 ~ mu0} rho int e^{-rho t} (f + R(u)) dt` by simulation, with `V` as control variate where there is one.
+
+For any smooth `V`, `V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt` exactly along the closed loop, with the Bellman slack
+`Q_u = V - f - R(u) - grad V . (a + B u) / rho`. So `Perf(u) = E[V mu0] - E int rho e^{-rho t} Q_u`, and what is left to
+simulate, with all its errors, is as small as `Q_u`.
+
+On a sliding mode, where a controller jumps to and fro at a kink of `V`, no step is small enough for `grad V . (a + B u)` to
+be the rate at which `V` changes: the sum of it is carried along, and taken for `V` where the two do not
+become the same (`Sliding`).
+
+The infinite horizon is truncated, with the tail bounded; or each trajectory stops at a time `T ~ Exp(rho)` of its own,
+and `E[rate(x_T)]` is the discounted integral, without a tail.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ocp_torch.certificate.checks.tails import widened
+from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
+from ocp_torch.certificate.simulated.simulation import Dynamics, Integrate, discounted_integral, rate_at, refined
+from ocp_torch.control.policies import ControlLaw, ValueLaw
+from ocp_torch.maths import calculus
+from ocp_torch.maths.calculus import Field
+from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.problems import formulas
+from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.samples import Samples
+from ocp_torch.problems.starts import initial_points
+
+# A kink of V is met at the start of a trajectory or never, and what is late counts little: early steps are shorter.
+GRADING = 2.0
+# Simulation sets come after those of the bounds in the stream of evaluation points.
+SIMULATION_REPLICATE = 1000
+# What is left of the discount when simulation stops, times the rate's supremum, relative to the answer.
+TAIL = 2e-5
+# The answer is taken to be at least this part of the mean state cost at the starts.
+LEAST = 0.1
+# What the sum of `grad V . g` is off `V` by must shrink to that part of it when steps are halved; a sixteenth is expected.
+SETTLING = 0.25
+# States to which the starts' mean cost is compared, how many standard errors apart the two must be, and by how many times
+# that the interval is widened: trajectories may stay where no start was.
+COMPARED, UNLIKELY, UNSEEN_ROOM = 2**15, 2.5, 2.0
+# Head-room on the rate's supremum, met at starts and ends, for the states after the end.
+RATE_ROOM = 2.0
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A performance, and what the trajectories showed: the largest value at a start (where known) and the end states."""
+
+    perf: Estimate
+    largest_value: float | None
+    end_states: Tensor
+
+
+def _dynamics(problem: Problem, law: ControlLaw, value: Field | None) -> Dynamics:
+    """The closed loop and what it costs; with ``value`` its slack `-Q_u`, and as one more coordinate `z`, the sum of
+    `grad V . g` from `V` at the start on, with `z - V` as a second rate."""
+    cost, rho = problem.control_cost, problem.discount
+
+    def dynamics(state: Tensor) -> tuple[Tensor, Tensor]:
+        if value is None:
+            u = law(state)
+            return problem.velocity(state, u), problem.state_cost(state) + cost.cost(u)
+        x, summed = state[:, :-1], state[:, -1]
+        samples = Samples.of(problem, x, divergences=False)
+        v, gradient = calculus.value_and_gradient(value, x)
+        own = isinstance(law, ValueLaw) and law.value is value
+        u = law.control(samples.B, gradient) if own else law(x)
+        velocity = samples.a + torch.einsum("ndm,nm->nd", samples.B, u)
+        slack = formulas.bellman_slack(samples, v, gradient, u, cost, rho)
+        change = (gradient * velocity).sum(dim=-1, keepdim=True)
+        return torch.cat([velocity, change], dim=-1), torch.stack([-slack, summed - v], dim=-1)
+
+    return dynamics
+
+
+class Sliding:
+    """Results by `-Q_u`, or, where the sum `z` of `grad V . g` stays off `V` however fine the steps, with that taken off.
+
+    For every `z` with `z = V` at the start, the integral of `f + R(u) - z + z' / rho`, discounted, is the cost less that `V`.
+    On a sliding mode, where a controller jumps to and fro at a kink of `V`, no step is small enough for `grad V . g` to be
+    the rate at which `V` changes. Along smooth trajectories `z - V` vanishes with the steps.
+    """
+
+    def __init__(self, integrate: Integrate, count: int, allowed: float) -> None:
+        self.integrate, self.allowed = integrate, allowed
+        self.off = torch.full((count,), math.inf, dtype=torch.float64)
+        self.stays = torch.zeros(count, dtype=torch.bool)
+
+    def __call__(self, rows: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+        rates, end = self.integrate(rows, steps)
+        off = rates[:, 1].abs()
+        self.stays[rows] = (off > self.allowed) & (off > SETTLING * self.off[rows])
+        self.off[rows] = off
+        return self.corrected(rates, rows), end
+
+    def corrected(self, rates: Tensor, rows: Tensor) -> Tensor:
+        """The first column of ``rates`` ``(n, 2)`` of ``rows``, less the second where that is to be taken off."""
+        return torch.where(self.stays[rows], rates[:, 0] - rates[:, 1], rates[:, 0])
+
+
+def starting_points(
+    problem: Problem, trajectories: int, replicates: int, seed: int, extra: int = 0
+) -> tuple[Tensor, Tensor]:
+    """The starts of all replicates, one after the other, ``(replicates * trajectories, d + extra)``, and the mass of `mu0`
+    that each stands for (see `initial_points`)."""
+    sets = [initial_points(problem, trajectories, SIMULATION_REPLICATE + r, seed, extra) for r in range(replicates)]
+    return torch.cat([x for x, _ in sets]), torch.cat([mass for _, mass in sets])
+
+
+@torch.no_grad()
+def unseen_cost(problem: Problem, x0: Tensor, mass: Tensor, seed: int) -> float:
+    """By how much `E[f mu0]` over the starts ``x0`` ``(N, d)`` and their ``mass`` differs from what many more states say,
+    where that is more than chance: a spike or a hole of `f` that no start has met, or that too few have."""
+    if not problem.scan_factor:
+        return 0.0
+    x, weight = initial_points(problem, COMPARED, SIMULATION_REPLICATE - 1, seed)
+    seen, there = mass * problem.state_cost(x0), weight * problem.state_cost(x)
+    noise = math.hypot(float(seen.std()) / math.sqrt(len(seen)), float(there.std()) / math.sqrt(len(there)))
+    off = abs(float(seen.mean() - there.mean()))
+    return off if off > UNLIKELY * noise + 1e-9 * float(there.abs().mean()) else 0.0
+
+
+def simulate_performance(
+    problem: Problem,
+    law: ControlLaw,
+    trajectories: int,
+    replicates: int,
+    seed: int,
+    value: Field | None = None,
+    initial: list[float] | None = None,
+    horizon: str = TRUNCATED,
+    tolerance: float = CertificateSettings.tolerance,
+) -> Simulated:
+    """Perf of ``law`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts, near `mu0`.
+
+    With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is
+    added. Steps are halved until a trajectory changes by less than ``tolerance``, relative to the answer, or all of them by
+    little beside the standard error. ``bias`` is the error of integration (`refined`) plus, where the ``horizon`` is
+    truncated, the discount left there times the rate's supremum as met along the trajectories, with head-room.
+    """
+    dim, rho = problem.dim, problem.discount
+    random = horizon == RANDOM
+    points, mass = starting_points(problem, trajectories, replicates, seed, extra=int(random))
+    x0 = points[:, :dim]
+    dynamics = _dynamics(problem, law, value)
+    with torch.no_grad():
+        base = value(x0) if value is not None else torch.zeros_like(x0[:, 0])
+        state = x0 if value is None else torch.cat([x0, base.unsqueeze(-1)], dim=-1)
+        velocity, rate = dynamics(state)
+        velocity, rate = velocity[:, :dim], rate.reshape(len(x0), -1)[:, 0]
+    if not (torch.isfinite(velocity).all() and torch.isfinite(rate).all()):
+        return Simulated(Estimate(math.nan, math.nan), math.nan, x0)
+    # By the slack's definition `V - Q_u = f + R(u) + grad V . g / rho`: the answer's size also where `E[V mu0]` is far off.
+    size = max(float((mass * (base + rate)).mean().abs()), LEAST * float((mass * problem.state_cost(x0)).mean()), 1e-12)
+    largest_rate = RATE_ROOM * float(rate.abs().max())
+    if random:
+        times = -torch.log1p(-points[:, dim]) / rho
+        longest = float(times.max())
+        integrate = lambda rows, count: rate_at(dynamics, state[rows], rho, times[rows], count, wrap=False)
+    else:
+        longest = max(math.log(max(largest_rate / (TAIL * size), math.e)), 1.0) / rho
+        integrate = lambda rows, count: discounted_integral(
+            dynamics, state[rows], rho, longest, count, wrap=False, grading=GRADING
+        )
+    if value is not None:
+        integrate = Sliding(integrate, len(x0), tolerance * size)
+    speed = float(velocity.norm(dim=-1).max())
+    steps = max(8, 2 * math.ceil(0.5 * longest * max(rho / 0.4, speed / 0.2)))
+    generator = torch.Generator().manual_seed(derive_seed(seed, SIMULATION_REPLICATE))
+    means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
+    noise = lambda results: Estimate.of(means(results).tolist()).se
+    result, end, bias = refined(integrate, mass, steps, tolerance * size, generator, noise)
+    ended = end[:, :dim].remainder(1.0)
+    with torch.no_grad():
+        rate = dynamics(end)[1]
+        rate = rate if value is None else integrate.corrected(rate, torch.arange(len(rate)))
+        largest_rate = max(largest_rate, RATE_ROOM * float(rate.abs().max()))
+    if not random:
+        bias += math.exp(-rho * longest) * largest_rate * float(mass.mean())
+    bias += UNSEEN_ROOM * unseen_cost(problem, x0, mass, seed)
+    parts = means(result).tolist()
+    totals = [part + (initial[r % len(initial)] if initial else 0.0) for r, part in enumerate(parts)]
+    perf = Estimate.of(totals, bias=bias)
+    # Few evenly spread starts may all count alike where the cost jumps. A stratum holds one of `n` starts, so that a
+    # replicate's mean is off by its spread over `n`; where V takes the spread away this is nothing.
+    least = float((mass * result).std()) / (trajectories * math.sqrt(replicates))
+    perf = widened(replace(perf, se=max(perf.se, least)), [mass * result])
+    return Simulated(perf, None if random else float((base + result).max()), ended)

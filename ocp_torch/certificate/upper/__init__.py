@@ -1,0 +1,1 @@
+"""Upper bounds on what a controller costs, without simulation, one a file."""

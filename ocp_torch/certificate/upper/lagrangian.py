@@ -1,0 +1,182 @@
+r"""Upper bounds on `Perf(u)` for one given controller, from any `V` and any `mu >= 0`, without simulation.
+
+Write `Q_u` for the Bellman slack of `V` and `r = mu0 - mu - div(mu g_u) / rho` for the Liouville residual of `mu`, and let
+`mu^u` be the true occupation density, so that `Perf(u) = E_{mu^u}[f + R(u)]`.
+
+1. Along the closed loop `d/dt (e^{-rho t} V(x_t)) = -rho e^{-rho t} (Q_u + f + R(u))(x_t)`. Integrated from 0 to infinity:
+   `V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt`, hence `V - eps_lo <= V^u <= V + eps_hi` with
+   `eps_lo = sup max(Q_u, 0)` and `eps_hi = sup max(-Q_u, 0)`.
+2. `V^u` has Bellman slack 0, so by parts `E[V^u mu0] = E[(f + R(u)) mu + V^u r]` for every `mu`: with `V^u = V + (V^u - V)`,
+   `Perf(u) = E[(f + R(u)) mu + V r] + E[(V^u - V) r]`, and by 1 the last term is at most
+   `eps_hi E[max(r, 0)] + eps_lo E[max(-r, 0)]`. That sum is the **Lagrangian bound**: wrong by a product of two errors.
+3. By parts again `E[(f + R(u)) mu + V r] = E[V mu0 - mu Q_u]`: the same number with far less variance.
+4. `0 <= V^u <= C_V` with `C_V = sup V + eps_hi` gives `J = E[(f + R(u)) mu + C_V max(r, 0)]`, with `w = mu u`, for the
+   smallest `C_V` that these facts prove for this very controller.
+5. All this holds for every multiple `s mu` too, with residual `mu0 - s (mu0 - r)`, and each bound is convex in `s`. Where
+   `Q_u` is deep on one side only, as at kinks, a little more mass (`s > 1`) makes the dear side of `r` rare. Each half
+   of the sets is evaluated with the `s` that is best on the other half: the search does not flatter the bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from ocp_torch.certificate.checks.hidden import Flux, Hidden, hidden_divergence
+from ocp_torch.certificate.checks.tails import widened
+from ocp_torch.certificate.estimate import Estimate, integral
+from ocp_torch.certificate.lower.shifted import slack_function
+from ocp_torch.maths.calculus import CHUNK, Field, chunked_gradient
+from ocp_torch.maths.supremum import Extremum, batched, minimiser, supremum
+from ocp_torch.problems import formulas
+from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.problems.samples import Samples
+
+# Multiples of mu that are tried.
+MULTIPLES = (0.0, 2.0)
+
+
+@dataclass(frozen=True)
+class ClosedLoopBounds:
+    """The bounds of one closed loop and the suprema they rest on, as found."""
+
+    lagrangian: Estimate
+    J: Estimate
+    C_V: float
+    eps_hi: Extremum
+    eps_lo: Extremum
+    residual: float  # E[|r|]
+    below: Estimate  # of Perf(u) from below: 2. with the signs turned
+    sandwich: tuple[Estimate, Estimate]  # E[V mu0] - eps_lo <= Perf(u) <= E[V mu0] + eps_hi, by 1. alone
+    hidden: Hidden | None = None  # a divergence that the residual does not see: only the sandwich stands then
+    contributions: list[list[torch.Tensor]] = field(default_factory=list)  # of `lagrangian` and `J`, parts of each
+
+
+def closed_loop_bounds(
+    loop: ClosedLoop,
+    value: Field,
+    log_occupation: Field,
+    sets: list[Samples],
+    ascents: int,
+    controller: str,
+    initial: list[float] | None = None,
+    odd: Tensor | None = None,
+) -> ClosedLoopBounds:
+    """Evaluate both bounds on ``sets`` of samples of ``loop``; the suprema are sampled on them, and at the states ``odd``
+    ``(K, d)`` too, and climbed.
+
+    ``initial``, if given, is `E[V mu0]` per set from more states: it carries nearly all of the variance.
+    """
+    values = [_integrands(loop, value, log_occupation, samples) for samples in sets]
+    states = torch.cat([samples.x for samples in sets])
+    slack_all = torch.cat([slack for *_, slack, _ in values])
+    tops = torch.cat([v for v, *_ in values])
+    slack = slack_function(loop, value)
+    if odd is not None and len(odd):
+        states = torch.cat([states, odd])
+        tops, slack_all = torch.cat([tops, batched(value, odd)]), torch.cat([slack_all, batched(slack, odd)])
+    top = _climbed(value, tops, states, ascents)
+    eps_lo = _climbed(slack, slack_all, states, ascents)
+    eps_hi = _climbed(lambda x: -slack(x), -slack_all, states, ascents)
+    C_V = top.value + eps_hi.value
+    terms = [Terms(samples, *parts[:3]) for samples, parts in zip(sets, values, strict=True)]
+    lagrangian, below, J, residual, low, high = [], [], [], [], [], []
+    hi, lo = eps_hi.value, eps_lo.value
+    excess = best_multiples(terms, lambda t, s: t.lagrangian(s, hi, lo))
+    shortfall = best_multiples(terms, lambda t, s: -t.lagrangian(s, -lo, -hi))
+    penalised = best_multiples(terms, lambda t, s: t.J(s, C_V))
+    for i, own in enumerate(terms):
+        started = integral(own.samples, own.v * own.samples.mu0) if initial is None else initial[i]
+        lagrangian.append(started + excess[i])
+        below.append(started - shortfall[i])
+        J.append(started + penalised[i])
+        mass = integral(own.samples, own.samples.mu0)
+        low.append(started - lo * mass)
+        high.append(started + hi * mass)
+        residual.append(integral(own.samples, own.r.abs()))
+    mean_residual = sum(residual) / len(residual)
+    weighted = lambda integrand: [t.samples.weight * integrand(t) for t in terms]
+    of_lagrangian, of_below = (weighted(lambda t, s=s: t.lagrangian_integrand(1.0, *s)) for s in ((hi, lo), (-lo, -hi)))
+    of_J = weighted(lambda t: t.J_integrand(1.0, C_V))
+    found = widened(Estimate.of(lagrangian, controller=controller), of_lagrangian)
+    penalised_by = widened(Estimate.of(J), of_J)
+    parts_of = lambda estimate, values: [v / (abs(estimate.value) or 1.0) for v in values]
+    return ClosedLoopBounds(
+        found,
+        penalised_by,
+        C_V,
+        eps_hi,
+        eps_lo,
+        mean_residual,
+        widened(Estimate.of(below), of_below),
+        (Estimate.of(low), Estimate.of(high)),
+        hidden_divergence([flux for *_, flux in values]),
+        [parts_of(found, of_lagrangian), parts_of(penalised_by, of_J)],
+    )
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What the bounds on one set of states are made of: `V`, `mu Q_u` and `r`, each ``(N,)``."""
+
+    samples: Samples
+    v: Tensor
+    spent: Tensor
+    r: Tensor
+
+    def residual(self, scale: float) -> Tensor:
+        """The residual of ``scale`` times `mu`."""
+        return self.samples.mu0 - scale * (self.samples.mu0 - self.r)
+
+    def lagrangian(self, scale: float, hi: float, lo: float) -> float:
+        """`E[hi max(r, 0) + lo max(-r, 0) - mu Q_u]` of ``scale`` times `mu`: the bound of 2. without `E[V mu0]`."""
+        return integral(self.samples, self.lagrangian_integrand(scale, hi, lo))
+
+    def lagrangian_integrand(self, scale: float, hi: float, lo: float) -> torch.Tensor:
+        """What `lagrangian` is the mean of, ``(N,)``."""
+        r = self.residual(scale)
+        return hi * r.clamp_min(0.0) + lo * (-r).clamp_min(0.0) - scale * self.spent
+
+    def J(self, scale: float, C_V: float) -> float:
+        """The bound of 4., without `E[V mu0]`."""
+        return integral(self.samples, self.J_integrand(scale, C_V))
+
+    def J_integrand(self, scale: float, C_V: float) -> torch.Tensor:
+        """What `J` is the mean of, ``(N,)``."""
+        r = self.residual(scale)
+        return C_V * r.clamp_min(0.0) - self.v * r - scale * self.spent
+
+    @staticmethod
+    def join(terms: list[Terms]) -> Terms:
+        """All states of ``terms`` in one."""
+        columns = (torch.cat([getattr(t, name) for t in terms]) for name in ("v", "spent", "r"))
+        return Terms(Samples.concatenate([t.samples for t in terms]), *columns)
+
+
+def best_multiples(terms: list[Terms], bound: Callable[[Terms, float], float]) -> list[float]:
+    """``bound`` of each of ``terms`` with the multiple of `mu` that makes it smallest on the other half of them."""
+    halves = [Terms.join(terms[k::2]) for k in (0, 1)]
+    scales = [minimiser(partial(bound, half), *MULTIPLES) for half in halves]
+    return [bound(t, scales[1 - i % 2]) for i, t in enumerate(terms)]
+
+
+@torch.no_grad()
+def _integrands(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples):
+    """`V`, `mu Q_u`, `r` and `Q_u` at the states of ``samples``, and the flux `mu g_u`."""
+    v, gradient = chunked_gradient(value, samples.x)
+    slack = formulas.hjb_slack(samples, v, gradient, loop.control_cost, loop.discount)
+    pairs = [formulas.drifting_loss(part, log_occupation, loop.discount) for part in samples.split(CHUNK)]
+    mu, spent = torch.cat([m for m, _ in pairs]), torch.cat([s for _, s in pairs])
+    flux = Flux(samples.x, samples.weight, spent - mu, mu.unsqueeze(-1) * samples.a / loop.discount)
+    return v, mu * slack, samples.mu0 - spent, slack, flux
+
+
+def _climbed(function, values: torch.Tensor, states: torch.Tensor, ascents: int) -> Extremum:
+    """`sup max(function, 0)`: from the largest of the sampled ``values``, upwards."""
+    start = states[values.topk(min(ascents, len(values))).indices]
+    found = supremum(function, start, ascents=ascents)
+    return Extremum(max(found.value, 0.0), found.x, len(states), found.ascents)

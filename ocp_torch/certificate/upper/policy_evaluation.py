@@ -1,0 +1,150 @@
+"""The certification stage: fit `mu` (and `V`, where there is none) to the closed loop of the controller handed out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+from ocp_torch.certificate.upper.lagrangian import MULTIPLES, Terms
+from ocp_torch.control.policies import ControlLaw
+from ocp_torch.errors import require_integer, require_number
+from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
+from ocp_torch.maths import calculus
+from ocp_torch.maths.calculus import CHUNK, Field
+from ocp_torch.maths.sampling import SobolSampler, derive_seed
+from ocp_torch.maths.supremum import minimiser
+from ocp_torch.objectives.policy_evaluation import PolicyEvaluation
+from ocp_torch.problems import formulas
+from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.samples import Samples
+from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
+from ocp_torch.steppers.optimizers import LARGEST_RATE
+
+# Branch of the seed tree for the stage's states and weights, beside those of training and evaluation.
+STAGE_STREAM = 3
+# The closed loop's data are computed once on so many states at most: their divergences cost more than a step.
+POOL = 2**16
+# Beyond that ratio of the two suprema of the slack the residual is not weighed any more lopsidedly.
+MOST_LOPSIDED = 16.0
+# Where the stage looks at its own excess after a round.
+EXCESS_STATES = 4096
+
+
+@dataclass(frozen=True)
+class StageSettings:
+    """Budget of the certification stage. Raises `InputError` on a wrong value."""
+
+    steps: int = 600  # least-squares steps in the first round; 0 for no stage
+    rounds: int = (
+        2  # rounds at most, each twice as long as the one before; the next starts only while `good_excess` is not met
+    )
+    good_excess: float = (
+        1e-3  # part of the Lagrangian bound that comes from the residual, where no further round is needed
+    )
+    batch: int = 256  # states per step
+    lr: float = 1.0e-2  # learning rate, with cosine decay in each round
+
+    def __post_init__(self) -> None:
+        require_integer("certificate.stage.steps", self.steps, 0)
+        require_integer("certificate.stage.rounds", self.rounds, 1, maximum=16)
+        require_number("certificate.stage.good_excess", self.good_excess, above=0.0)
+        require_integer("certificate.stage.batch", self.batch, 1)
+        require_number("certificate.stage.lr", self.lr, above=0.0, at_most=LARGEST_RATE)
+
+
+def fit_closed_loop(
+    problem: Problem,
+    law: ControlLaw,
+    fields: Fields | None,
+    network: Callable[..., torch.nn.Module],
+    bounds: Bounds,
+    settings: StageSettings,
+    seed: int,
+    pool: Pool | None = None,
+) -> Fields:
+    """Fields with `log mu^u`, and with `V^u` where ``fields`` hold no `V`, of the closed loop of ``law``.
+
+    ``fields`` are the trained ones, ``law`` one of theirs in their precision; their `log mu`, if any, is the start. With no
+    ``fields`` the law is somebody's own, in float64, and both `mu` and `V` are fitted in float32. ``pool``
+    is where samples of the closed loop come from, by default from evaluations at Sobol points.
+    """
+    like = torch.zeros(()) if fields is None else next(fields.parameters())
+    loop = ClosedLoop(problem, law)
+    with_value = fields is None or fields.value is None
+    names = (LOG_OCCUPATION, VALUE) if with_value else (LOG_OCCUPATION,)
+    fitted = Fields.build(problem, names, network, derive_seed(seed, STAGE_STREAM, 0)).to(like)
+    if fields is not None and fields.log_occupation is not None:
+        fitted.log_occupation.load_state_dict(fields.log_occupation.state_dict())
+    pool = pool or Pool(loop, derive_seed(seed, STAGE_STREAM, 1), like, double=fields is None)
+    draw = lambda: pool.draw(settings.batch)
+    pool.grow(min(POOL, settings.steps * settings.batch))
+    price = 1.0 if with_value else missing_price(loop, fields.value, pool.samples.take(slice(EXCESS_STATES)))
+    objective = PolicyEvaluation(loop, bounds, with_value, price)
+    optimizer = optimizer_maker("soap", settings.lr, betas=(0.95, 0.95))
+    makers = {player: optimizer for player in objective.players}
+    stepper = Simultaneous(fitted, objective, makers, schedule_maker("cosine", settings.steps))
+    average = averaged(fitted, decay=0.98)
+    for k in range(settings.rounds):
+        steps = settings.steps * 2**k
+        pool.grow(min(POOL, steps * settings.batch))
+        for _ in range(steps):
+            stepper.step(draw, lambda: average.update_parameters(fitted))
+        value = average.module.value if with_value else fields.value
+        excess = relative_excess(loop, value, average.module.log_occupation, pool.samples.take(slice(EXCESS_STATES)))
+        if excess <= settings.good_excess:
+            break
+    return average.module
+
+
+class Pool:
+    """Samples of a closed loop that are drawn from again and again, and grow when more are wanted.
+
+    The loop is evaluated in float64 if ``double``; samples are kept in the precision and on the device of ``like``.
+    """
+
+    def __init__(self, loop: ClosedLoop, seed: int, like: torch.Tensor, double: bool = False) -> None:
+        self.loop, self.like = loop, like
+        self.states = SobolSampler(loop.dim, seed, torch.float64 if double else like.dtype)
+        self.samples: Samples | None = None
+        self.drawn = 0
+
+    def grow(self, count: int) -> None:
+        """Fresh states up to ``count`` in all."""
+        missing = count - (0 if self.samples is None else len(self.samples))
+        if missing > 0:
+            fresh = self.states.draw(missing).to(self.like.device).split(CHUNK)
+            kept = [] if self.samples is None else [self.samples]
+            self.samples = Samples.concatenate([*kept, *(Samples.of(self.loop, x).to(self.like) for x in fresh)])
+
+    def draw(self, count: int) -> Samples:
+        """The next ``count`` of them, round and round: consecutive Sobol points are spread evenly."""
+        index = (self.drawn + torch.arange(count, device=self.like.device)) % len(self.samples)
+        self.drawn += count
+        return self.samples.take(index)
+
+
+@torch.no_grad()
+def missing_price(loop: ClosedLoop, value: Field, samples: Samples) -> float:
+    """How much more a positive residual should weigh than a negative one: the root of `eps_hi / eps_lo`, within limits."""
+    v, gradient = calculus.value_and_gradient(value, samples.x)
+    slack = formulas.hjb_slack(samples, v, gradient, loop.control_cost, loop.discount)
+    hi, lo = float((-slack).max().clamp_min(1e-30)), float(slack.max().clamp_min(1e-30))
+    return math.sqrt(min(max(hi / lo, 1.0 / MOST_LOPSIDED), MOST_LOPSIDED))
+
+
+@torch.no_grad()
+def relative_excess(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples) -> float:
+    """What the residual costs the Lagrangian bound on ``samples``, relative to `|E[V mu0]|`: the bound's part above
+    `E[V mu0 - mu Q_u]`, for the best multiple of `mu`."""
+    v, gradient = calculus.value_and_gradient(value, samples.x)
+    slack = formulas.hjb_slack(samples, v, gradient, loop.control_cost, loop.discount)
+    mu, spent = formulas.drifting_loss(samples, log_occupation, loop.discount)
+    terms = Terms(samples, v, mu * slack, samples.mu0 - spent)
+    hi, lo = float((-slack).max().clamp_min(0.0)), float(slack.max().clamp_min(0.0))
+    least = terms.lagrangian(minimiser(lambda s: terms.lagrangian(s, hi, lo), *MULTIPLES), hi, lo)
+    return (least + float(samples.mean(terms.spent))) / max(abs(float(samples.mean(v * samples.mu0))), 1e-30)

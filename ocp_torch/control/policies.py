@@ -1,0 +1,92 @@
+"""Controllers as functions of the state: from `V` alone, from `w / mu`, or zero; and the densities `mu` they need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from ocp_torch.fields.fields import Fields
+from ocp_torch.maths import calculus
+from ocp_torch.maths.calculus import Field
+from ocp_torch.objectives.objective import CLOSED, NETWORK, SADDLE
+from ocp_torch.problems import formulas
+from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.control_cost import PowerCost
+from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.samples import Samples
+
+# A control law maps states (N, d) to controls (N, m); a density maps them to (N,).
+ControlLaw = Callable[[Tensor], Tensor]
+Density = Callable[[Tensor], Tensor]
+
+
+class ValueLaw:
+    """`u = grad R*(-B^T grad V / rho)` (Proposition 2): optimal when `V = V*`."""
+
+    def __init__(self, problem: Problem, value: Field) -> None:
+        self.problem, self.value = problem, value
+
+    def __call__(self, x: Tensor) -> Tensor:
+        _, gradient = calculus.value_and_gradient(self.value, x)
+        return self.control(self.problem.control_matrix(x), gradient)
+
+    def control(self, B: Tensor, gradient: Tensor) -> Tensor:
+        """The control where `grad V` is known already."""
+        pull = torch.einsum("ndm,nd->nm", B, gradient)
+        return self.problem.control_cost.argmax(-pull / self.problem.discount)
+
+
+def admissible_density(kind: str, problem: Problem, fields: Fields, bounds: Bounds) -> Field:
+    """`w` of trained fields, within what a limit on the control allows: `mu` of Lemma 2 leaves room for any `w` already."""
+    w = fields.control_density
+    return (
+        w if kind == CLOSED else problem.control_cost.admissible(w, occupation_density(kind, problem, fields, bounds))
+    )
+
+
+def density_law(control_density: Field, occupation: Density, cost: PowerCost) -> ControlLaw:
+    """`u = w / mu`, within the limit of ``cost``; 0 where `mu` is 0 (nobody is there) or infinite (mass stands still)."""
+
+    def law(x: Tensor) -> Tensor:
+        mu = occupation(x)
+        usable = (mu > 0) & torch.isfinite(mu)
+        mu = torch.where(usable, mu, 1.0)
+        return torch.where(usable.unsqueeze(-1), cost.within(control_density(x), mu) / mu.unsqueeze(-1), 0.0)
+
+    return law
+
+
+def zero_law(problem: Problem) -> ControlLaw:
+    """`u = 0`, what the certificate calls doing nothing."""
+    return lambda x: x.new_zeros(len(x), problem.control_dim)
+
+
+def occupation_density(kind: str, problem: Problem, fields: Fields, bounds: Bounds) -> Density:
+    """`mu(x)` of trained fields: ``closed`` (Lemma 2, no drift), ``saddle`` (Lemma 3) or ``network`` (`exp log mu`)."""
+    cost, rho = problem.control_cost, problem.discount
+
+    def closed(x: Tensor) -> Tensor:
+        samples = Samples.of(problem, x)
+        w, inflow = formulas.controlled_inflow(samples, fields.control_density, rho)
+        return cost.primal_occupation(w, samples.f, bounds.C_V, inflow)
+
+    def saddle(x: Tensor) -> Tensor:
+        value, gradient = calculus.value_and_gradient(fields.value, x)
+        beta = problem.state_cost(x) - value + (gradient * problem.drift(x)).sum(dim=-1) / rho
+        return cost.saddle_occupation(fields.control_density(x), beta, bounds.M)
+
+    return {CLOSED: closed, SADDLE: saddle, NETWORK: lambda x: fields.log_occupation(x).exp()}[kind]
+
+
+def control_laws(kind: str | None, problem: Problem, fields: Fields, bounds: Bounds) -> dict[str, ControlLaw]:
+    """The controllers trained fields give: ``value`` if they hold `V`, ``density`` if they hold `w`."""
+    laws = {}
+    if fields.value is not None:
+        laws["value"] = ValueLaw(problem, fields.value)
+    # Lemmas 2 and 3 give mu from the cost at the state itself.
+    if fields.control_density is not None and (kind == NETWORK or problem.evaluable):
+        mu = occupation_density(kind, problem, fields, bounds)
+        laws["density"] = density_law(fields.control_density, mu, problem.control_cost)
+    return laws

@@ -1,0 +1,140 @@
+"""Files that survive: atomic writes, and one safetensors file with JSON metadata and a digest over everything in it."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from ocp_torch.errors import InputError, StorageError
+from ocp_torch.files.plain import NotPlain, json_object
+from ocp_torch.files.reading import LARGEST_FILE, kind, opened
+
+METADATA_KEY, DIGEST_KEY = "ocp_torch", "sha256"
+# More than the header of any controller or recording has, in bytes, and more tensors than a network has.
+LARGEST_HEADER, MOST_TENSORS = 2**24, 2**14
+
+
+def write_atomically(path: Path, write: Callable[[Path], None], make_room: Callable[[], None] | None = None) -> None:
+    """Let ``write`` fill a temporary file beside ``path``, then put it in place in one step: old or new, never half.
+
+    ``make_room`` is called in between, once the new file is whole and on the disk. File and folder are on the disk when it
+    returns. Raises `StorageError` when there is no room or no permission.
+    """
+    temporary: Path | None = None
+    if os.path.lexists(path) and not path.is_file():
+        raise StorageError(f"{path} is no file but a folder or a device, which nothing may replace.")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        os.close(handle)
+        temporary = Path(name)
+        write(temporary)
+        sync(temporary)
+        temporary.chmod(0o644)
+        if make_room is not None:
+            make_room()
+        os.replace(temporary, path)
+        sync(path.parent)
+    except (OSError, SafetensorError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise StorageError(f"{path} cannot be written: {reason}; what was saved before is untouched.") from None
+    finally:
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+
+
+def sync(path: Path) -> None:
+    """Make the contents of a file, or the names in a folder, survive a loss of power."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def sweep_temporaries(folder: Path) -> None:
+    """Remove what a process that was killed in `write_atomically` left half-written in ``folder``."""
+    for leftover in folder.glob(".*"):
+        if re.fullmatch(r"\..+\.(pt|json|safetensors|yaml)\.[a-z0-9_]{8}", leftover.name):
+            with contextlib.suppress(OSError):
+                leftover.unlink()
+
+
+def finite(data):
+    """``data`` with infinities and NaN, which JSON cannot hold, as the words inf, -inf and nan."""
+    if isinstance(data, dict):
+        return {key: finite(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [finite(value) for value in data]
+    return str(data) if isinstance(data, float) and not math.isfinite(data) else data
+
+
+def digest(tensors: dict[str, Tensor], metadata: str) -> str:
+    """SHA-256 over names, types, shapes and bytes of ``tensors`` and over ``metadata``."""
+    sha = hashlib.sha256(metadata.encode())
+    for name in sorted(tensors):
+        tensor = tensors[name].detach().cpu().contiguous()
+        sha.update(f"{name}:{tensor.dtype}:{tuple(tensor.shape)};".encode())
+        sha.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return sha.hexdigest()
+
+
+def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict) -> None:
+    """Write ``tensors`` and JSON ``metadata`` to ``path`` atomically, with their digest."""
+    text = json.dumps(finite(metadata), allow_nan=False)
+    tensors = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    header = {METADATA_KEY: text, DIGEST_KEY: digest(tensors, text)}
+    write_atomically(path, lambda temporary: save_file(tensors, str(temporary), metadata=header))
+
+
+def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict]:
+    """Read what `save_tensors` wrote; runs no code from the file.
+
+    Raises `InputError` when the file is missing, is not a safetensors file of ours, or does not match its digest.
+    """
+    if kind(path) is None:
+        raise InputError(f"{path} does not exist; give the path of a controller.safetensors file.")
+    tensors, header = read_safetensors(path)
+    if METADATA_KEY not in header or DIGEST_KEY not in header:
+        raise InputError(f"{path} is a safetensors file, but was not written by ocp_torch.")
+    if digest(tensors, header[METADATA_KEY]) != header[DIGEST_KEY]:
+        raise InputError(f"{path} is damaged: its contents do not match the digest it carries.")
+    try:
+        return tensors, json_object(header[METADATA_KEY])
+    except NotPlain as error:
+        raise InputError(f"{path} is damaged: in its metadata, {error}.") from None
+
+
+def read_safetensors(path: Path, most: int = LARGEST_FILE) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The tensors and the header's words of a safetensors file of at most ``most`` bytes. Raises `InputError` where it is
+    none, or a crafted one."""
+    with opened(path, most) as file:
+        length = int.from_bytes(file.read(8), "little")
+    if length > LARGEST_HEADER:
+        raise InputError(f"{path} is not a readable safetensors file: its header claims to have {length:,} bytes.")
+    try:
+        with safe_open(str(path), framework="pt", device="cpu") as file:
+            names = list(file.keys())
+            if len(names) > MOST_TENSORS:
+                raise InputError(f"{path} holds {len(names):,} tensors, but at most {MOST_TENSORS:,} are read.")
+            return {name: file.get_tensor(name) for name in names}, file.metadata() or {}
+    except InputError:
+        raise
+    except Exception as error:  # the library has no one type for damage
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise InputError(
+            f"{path} is not a readable safetensors file ({reason}); it is damaged or of another kind."
+        ) from None

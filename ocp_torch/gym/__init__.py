@@ -1,0 +1,52 @@
+"""Our problems as Gymnasium environments: `import ocp_torch.gym`, then `gymnasium.make("ocp_torch/Circle-v0")`.
+
+Arguments of the problem and of `make_environment` are given to `gymnasium.make`; a problem of your own is
+`gymnasium.make("ocp_torch/Problem-v0", problem=MyProblem())`. Needs the optional extra `gym`; without it `InputError`.
+"""
+
+from __future__ import annotations
+
+import os
+
+from ocp_torch.errors import InputError, call, require_choice
+from ocp_torch.gym.environment import make_environment, require_gymnasium
+from ocp_torch.problems import PROBLEMS, Problem
+
+# Arguments of the environment; every other one is the problem's.
+ENVIRONMENT = ("control_bound", "time_step", "horizon", "render_mode")
+
+__all__ = ["make", "names", "register"]
+
+
+def names() -> dict[str, str]:
+    """Environment id -> name of the problem, for all that can be simulated."""
+    return {f"ocp_torch/{c.__name__}-v0": name for name, c in PROBLEMS.items() if c.evaluable}
+
+
+def make(problem: str | Problem | None = None, **options):
+    """The environment of ``problem``, a name in `PROBLEMS` or an instance; ``options`` are arguments of both of them.
+
+    Starts are random until ``reset(seed=...)``.
+    """
+    if problem is None:
+        raise InputError("problem is missing; give one of your own, as in problem=MyProblem().")
+    own = {k: options.pop(k) for k in ENVIRONMENT if k in options}
+    own["seed"] = int.from_bytes(os.urandom(4), "little")
+    if isinstance(problem, Problem):
+        if options:
+            raise InputError(f"{next(iter(options))} is no argument of an environment; the problem is made already.")
+        return make_environment(problem, **own)
+    return make_environment(call(PROBLEMS[require_choice("problem", problem, PROBLEMS)], "problem", options), **own)
+
+
+def register() -> None:
+    """Put all of them into Gymnasium's registry."""
+    gymnasium = require_gymnasium()
+    for environment, name in names().items():
+        if environment not in gymnasium.registry:
+            gymnasium.register(environment, entry_point="ocp_torch.gym:make", kwargs={"problem": name})
+    if "ocp_torch/Problem-v0" not in gymnasium.registry:
+        gymnasium.register("ocp_torch/Problem-v0", entry_point="ocp_torch.gym:make")
+
+
+register()

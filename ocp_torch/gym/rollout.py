@@ -1,0 +1,184 @@
+"""A saved controller as an agent in a Gymnasium environment, ours or anybody's."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ocp_torch.control.controller import Controller
+from ocp_torch.errors import InputError, require_integer
+from ocp_torch.files.storage import write_atomically
+from ocp_torch.gym.environment import require_gymnasium
+from ocp_torch.runs.evaluate import load_run
+
+log = logging.getLogger(__name__)
+
+# Frames of a video at most, and steps of an episode: an environment may have no end.
+MOST_FRAMES, MOST_STEPS = 600, 100_000
+
+
+class Agent:
+    """``controller`` in the environment ``env`` (its id is ``name``): observations to states, controls to actions.
+
+    An environment of ours says how itself; for any other the controller's problem does, by `Problem.from_observation` and
+    `Problem.to_action`. Raises `InputError` where neither does, or what they give does not fit.
+    """
+
+    def __init__(self, controller: Controller, env, name: str) -> None:
+        self.controller, self.name, self.space = controller, name, env.action_space
+        own = env.unwrapped
+        if hasattr(own, "from_observation"):
+            if own.problem.dim != controller.problem.dim or own.problem.control_dim != controller.problem.control_dim:
+                raise InputError(
+                    f"{name} has d = {own.problem.dim}, m = {own.problem.control_dim}, but the controller is for "
+                    f"d = {controller.problem.dim}, m = {controller.problem.control_dim}."
+                )
+            self._state, self._action = own.from_observation, own.to_action
+        else:
+            problem = controller.problem
+            self._state = lambda observation: problem.from_observation(name, observation)
+            self._action = lambda control: problem.to_action(name, control)
+
+    def act(self, observation) -> np.ndarray:
+        """The action for ``observation``."""
+        d = self.controller.problem.dim
+        state = np.asarray(self._state(observation), dtype=np.float64)
+        if state.shape != (d,) or not np.isfinite(state).all():
+            raise InputError(f"from_observation gave {state} for {self.name}, but must give {d} finite coordinates.")
+        control = self.controller(state[None])[0]
+        action = np.asarray(self._action(control), dtype=self.space.dtype)
+        if action.shape != self.space.shape:
+            raise InputError(
+                f"to_action gave shape {action.shape} for {self.name}, whose actions have shape {self.space.shape}."
+            )
+        return np.clip(action, self.space.low, self.space.high) if hasattr(self.space, "low") else action
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """Undiscounted ``returns`` and ``lengths`` per episode."""
+
+    returns: np.ndarray
+    lengths: np.ndarray
+
+    @property
+    def mean(self) -> float:
+        return float(self.returns.mean())
+
+    @property
+    def se(self) -> float:
+        """Standard error of the mean; 0 for one episode."""
+        count = len(self.returns)
+        return float(self.returns.std(ddof=1) / math.sqrt(count)) if count > 1 else 0.0
+
+    def __str__(self) -> str:
+        low, high = self.returns.min(), self.returns.max()
+        return (
+            f"return {self.mean:.6g} ± {self.se:.2g} (standard error of {len(self.returns)} episodes), from {low:.6g} to "
+            f"{high:.6g}; {self.lengths.mean():.1f} steps each"
+        )
+
+
+@dataclass(frozen=True)
+class RolloutJob:
+    """What was asked for, checked."""
+
+    controller: Controller
+    env: str
+    episodes: int
+    seed: int
+    video: Path | None
+
+    def run(self) -> Rollouts:
+        """Play, print, and draw."""
+        env = made(self.env, None)
+        try:
+            found = play(self.controller, env, self.env, self.episodes, self.seed)
+        finally:
+            env.close()
+        log.info("%s: %s", self.env, found)
+        if self.video is not None:
+            self._film()
+        return found
+
+    def _film(self) -> None:
+        """The first episode again, with pictures."""
+        env = made(self.env, "rgb_array")
+        frames: list[np.ndarray] = []
+        try:
+            play(self.controller, env, self.env, 1, self.seed, frames)
+            rate = env.metadata.get("render_fps", 15)
+        finally:
+            env.close()
+        save_gif(self.video, frames, rate)
+        log.info("%d frames in %s", len(frames), self.video)
+
+
+def made(name: str, render_mode: str | None):
+    """The environment ``name``. Raises `InputError` where Gymnasium has none, or cannot make it here."""
+    gymnasium = require_gymnasium()
+    import ocp_torch.gym  # noqa: F401 (registers ours)
+
+    try:
+        return gymnasium.make(name, **({} if render_mode is None else {"render_mode": render_mode}))
+    except InputError:
+        raise
+    except Exception as error:  # whatever a stranger's environment may raise
+        reason = next(iter(str(error).splitlines()), "no message").rstrip(".?!")
+        raise InputError(f"env is {name!r}, which cannot be made: {reason}.") from None
+
+
+def play(controller: Controller, env, name: str, episodes: int, seed: int, frames: list | None = None) -> Rollouts:
+    """``episodes`` of them, seeded ``seed``, ``seed + 1``, ...; pictures of all states are put into ``frames``."""
+    agent = Agent(controller, env, name)
+    returns, lengths = [], []
+    for k in range(episodes):
+        observation, _ = env.reset(seed=seed + k)
+        total, count, over = 0.0, 0, False
+        while not over and count < MOST_STEPS:
+            if frames is not None and len(frames) < MOST_FRAMES:
+                frames.append(_picture(env, name))
+            observation, reward, ended, cut, _ = env.step(agent.act(observation))
+            total, count, over = total + float(reward), count + 1, ended or cut
+        returns.append(total)
+        lengths.append(count)
+    return Rollouts(np.array(returns), np.array(lengths))
+
+
+def _picture(env, name: str) -> np.ndarray:
+    try:
+        picture = np.asarray(env.render())
+    except Exception as error:  # whatever a stranger's environment may raise
+        reason = next(iter(str(error).splitlines()), "no message").rstrip(".?!")
+        raise InputError(f"{name} cannot be drawn here: {reason}.") from None
+    if picture.ndim != 3 or picture.shape[2] not in (3, 4):
+        raise InputError(f"{name} gives no pictures (its render gave shape {picture.shape}); leave video out.")
+    return picture[..., :3].astype(np.uint8)
+
+
+def save_gif(path: Path, frames: list[np.ndarray], rate: float) -> None:
+    """Write ``frames`` as a GIF of ``rate`` pictures a second."""
+    images = [Image.fromarray(frame) for frame in frames]
+    options = dict(format="GIF", save_all=True, append_images=images[1:], duration=round(1000.0 / rate), loop=0)
+    write_atomically(path, lambda temporary: images[0].save(temporary, **options))
+
+
+def prepare(config: dict) -> RolloutJob:
+    """Check every field. Raises `InputError` for a wrong one."""
+    controller = load_run(config)
+    video = None if config["video"] is None else Path(str(config["video"]))
+    if video is not None and video.suffix != ".gif":
+        raise InputError(f"video is {str(video)!r}, but must be a file whose name ends in .gif.")
+    name = str(config["env"])
+    env = made(name, None)
+    try:
+        Agent(controller, env, name).act(env.reset(seed=0)[0])
+    finally:
+        env.close()
+    episodes = require_integer("episodes", config["episodes"], 1, maximum=10**6)
+    return RolloutJob(controller, name, episodes, require_integer("seed", config["seed"], 0), video)

@@ -1,9 +1,0 @@
-"""The paper's methods in a reproducing-kernel space, as written there: exact kernel or truncated features, in NumPy."""
-
-from ocp_torch.kernel.expansions import FeatureExpansion, KernelExpansion
-from ocp_torch.kernel.iterations import Iteration, mirror_prox, sgd
-from ocp_torch.kernel.rules import RULES
-from ocp_torch.kernel.steps import step_sizes
-from ocp_torch.kernel.stream import Stream
-
-__all__ = ["RULES", "FeatureExpansion", "Iteration", "KernelExpansion", "Stream", "mirror_prox", "sgd", "step_sizes"]

@@ -1,0 +1,1 @@
+"""Mathematics that knows of no problem: derivatives, suprema, integrals, point sets, seeds. Imports `errors` alone."""

@@ -1,7 +1,0 @@
-"""Pictures of controlled systems: a scene for each, still or moving. The only rooms that draw know Matplotlib."""
-
-from ocp_torch.pictures.animation import animate, require_gif
-from ocp_torch.pictures.picture import Moving, motion, moving
-from ocp_torch.pictures.scenes import scene
-
-__all__ = ["Moving", "animate", "motion", "moving", "require_gif", "scene"]

@@ -1,0 +1,151 @@
+"""The three constants the bounds rest on, `M`, `C_V` and `C_u`, and where each came from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from ocp_torch.errors import ProblemError, require_number
+from ocp_torch.maths.supremum import supremum
+from ocp_torch.problems.blame import place
+from ocp_torch.problems.needs import GIVEN, GUESSED, SEARCHED
+from ocp_torch.problems.problem import MARGIN, Problem
+from ocp_torch.problems.scan import odd_states
+from ocp_torch.problems.starts import drawn_starts, starts_narrowly
+
+# Without any knowledge of mu*, M is this multiple of sup mu0 on recorded data, where there is no bound without M.
+OCCUPATION_GUESS = 4.0
+# And where training aims at the bound without M: what won on flows that contract onto a goal.
+OCCUPATION_WEIGHT = 40.0
+# States a problem is searched at for what it does not say.
+SURVEYED = 2**13
+# States scanned for a spike of `f`, for each that `Problem.scan_factor` asks for.
+SCANNED = 2**15
+
+FROM_CONFIGURATION, FROM_PROBLEM, ESTIMATED = "configuration", "problem", "estimated"
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """`M >= sup mu*`, `C_V >= sup V*`, `C_u >= sup |u*|` and, per name, its source.
+
+    Where ``unbounded``, no `M` is known to be large enough: it is but a weight of training, which then aims at the bound
+    that needs none.
+    """
+
+    M: float
+    C_V: float
+    C_u: float
+    sources: dict[str, str]
+    warnings: tuple[str, ...] = ()
+    unbounded: bool = False
+
+    @property
+    def needs_no_M(self) -> bool:
+        """Whether the bound without `M` has to carry the lower side: no `M` is large enough, or nobody gave one."""
+        return self.unbounded or self.basis("M") == GUESSED
+
+    def basis(self, name: str) -> str:
+        """Where the constant ``name`` comes from, as what rests on it must say (see `ocp_torch.problems.needs`)."""
+        if self.sources[name] != ESTIMATED:
+            return GIVEN
+        return GUESSED if name == "M" else SEARCHED
+
+    def __post_init__(self) -> None:
+        for name in ("M", "C_V", "C_u"):
+            require_number(name, getattr(self, name), above=0.0)
+
+
+def resolve_bounds(
+    problem: Problem,
+    occupation_bound: float | None = None,
+    value_bound: float | None = None,
+    control_bound: float | None = None,
+) -> Bounds:
+    """Each bound from the configuration if it was set there, else from the problem, else estimated with a warning.
+
+    `OPT <= J` needs `C_V >= sup V*`, for which `sup f` will do (Proposition 1); `C_u` is that of Proposition 2 where
+    `a = 0` and an estimate by the same formula with the least-squares `alpha` (`B alpha = a`) otherwise. A limit on the
+    control is a `C_u` that is known.
+    """
+    chosen: dict[str, float] = {}
+    sources: dict[str, str] = {}
+    notes: list[str] = []
+    configured = {"M": occupation_bound, "C_V": value_bound, "C_u": control_bound}
+    known = {"M": problem.occupation_bound, "C_V": problem.value_bound, "C_u": problem.control_bound}
+    fields = {"M": "method.occupation_bound", "C_V": "method.value_bound", "C_u": "method.control_bound"}
+    for name in ("C_V", "C_u", "M"):
+        if configured[name] is not None:
+            chosen[name] = require_number(fields[name], configured[name], above=0.0)
+            sources[name] = FROM_CONFIGURATION
+        elif known[name] is not None and math.isfinite(known[name]):
+            # J bounds the cost of a controller that is not quite optimal only if C_V leaves it room above V*.
+            room = MARGIN if name == "C_V" else 1.0
+            chosen[name], sources[name] = room * float(known[name]), FROM_PROBLEM
+        else:
+            if name == "C_u" and problem.control_limit is not None:
+                chosen[name], sources[name] = problem.control_limit, FROM_PROBLEM
+                continue
+            chosen[name], why = _ESTIMATES[name](problem)
+            sources[name] = ESTIMATED
+            notes.append(f"{name} is not known: {chosen[name]:.4g} is {why}; {fields[name]} sets it.")
+    if problem.control_limit is not None:
+        chosen["C_u"] = min(chosen["C_u"], problem.control_limit)
+    if sources["M"] == FROM_CONFIGURATION and problem.occupation_bound is not None:
+        if chosen["M"] < problem.occupation_bound:
+            true = f"{problem.occupation_bound:.4g}" if math.isfinite(problem.occupation_bound) else "infinite"
+            notes.append(
+                f"method.occupation_bound = {chosen['M']:.4g} is below this problem's sup mu*, which is {true}."
+            )
+    return Bounds(**chosen, sources=sources, warnings=tuple(notes), unbounded=is_unbounded(problem, occupation_bound))
+
+
+def is_unbounded(problem: Problem, occupation_bound: float | None = None) -> bool:
+    """Whether no `M` is known to be large enough: `mu*` has no bound, or neither problem nor user (``occupation_bound``)
+    gives one. A data set has no bound without `M` to aim at instead."""
+    known = problem.occupation_bound
+    if known is None:
+        return occupation_bound is None and problem.evaluable
+    return math.isinf(known)
+
+
+def state_cost_supremum(problem: Problem) -> float:
+    """`sup f`: the problem's own bound, unless more is met; or a sampled and climbed estimate with head-room."""
+    given = problem.state_cost_bound
+    if given is not None and not (problem.evaluable and problem.scan_factor):
+        return given
+    (x,) = problem.survey(SURVEYED, 1, "x")
+    if problem.evaluable:
+        x = torch.cat([x, odd_states(problem, SCANNED * problem.scan_factor, 0)])
+    found = supremum(problem.state_cost, x, differentiable=False)
+    if not math.isfinite(found.value):
+        raise ProblemError(f"state_cost is {found.value} at {place(found.x)}; it must be finite on the whole torus.")
+    return given if given is not None and found.value <= given else MARGIN * found.value
+
+
+def _estimate_value_bound(problem: Problem) -> tuple[float, str]:
+    return state_cost_supremum(problem), "the largest state cost met at sampled states, which bounds V*"
+
+
+def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
+    q, conjugate = problem.exponent, problem.control_cost.conjugate_exponent
+    total = 2.0 * conjugate * state_cost_supremum(problem)
+    if problem.driftless:
+        return total ** (1.0 / q), "Proposition 2 of the paper with a sampled sup f"
+    B, a = problem.survey(SURVEYED // 4, 1, "B", "a")
+    alpha = torch.linalg.pinv(B) @ a.unsqueeze(-1)
+    largest = float(alpha.squeeze(-1).norm(dim=-1).max())
+    return (total + 2.0**q * (conjugate - 1.0) * largest) ** (1.0 / q), "Proposition 2 with a least-squares alpha"
+
+
+def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
+    (mu0,) = problem.survey(SURVEYED, 1, "mu0")
+    guess = OCCUPATION_WEIGHT if is_unbounded(problem) else OCCUPATION_GUESS
+    if problem.evaluable and starts_narrowly(problem):
+        mu0 = problem.initial_density(drawn_starts(problem, SURVEYED // 32, 1))
+    return guess * float(mu0.max()), f"a guess to train with, {guess:g} times sup mu0"
+
+
+_ESTIMATES = {"M": _estimate_occupation_bound, "C_V": _estimate_value_bound, "C_u": _estimate_control_bound}

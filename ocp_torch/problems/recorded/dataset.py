@@ -1,0 +1,201 @@
+"""A problem known only through recorded samples: no simulator, no formula, nothing to evaluate anywhere else."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ocp_torch.errors import InputError, require_flag, require_integer, require_number
+from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.problems.problem import MARGIN, Problem
+from ocp_torch.problems.recorded import recording
+from ocp_torch.problems.samples import Samples
+
+# Branch of the seed tree for the split; the part of what is not held out that looks during training are made on.
+SPLIT_STREAM, LOOKS_PART = 6, 0.1
+# Fewest samples of a part that anything is estimated from.
+FEWEST_PART = 32
+CONSTANT = 1e-9
+
+
+class Dataset(Problem):
+    """The samples of ``path`` (a file of `recording`), split at random by ``seed``: ``held_out`` of them, a part
+    in (0, 1), for the certificate alone, a tenth of the rest for looks on the way, and the others to train on.
+
+    ``discount``, ``exponent`` and ``control_limit`` where not given are those of the file. ``wrap`` takes states modulo 1.
+    Where `B` is the same at all samples it is known everywhere, and the controller from `V` with it; otherwise only
+    `w / mu` can be handed out. ``dim``, ``control_dim`` and ``constant_matrix`` stand for the file until its samples are
+    asked for: a saved controller needs no data. Raises `InputError` for whatever is wrong with the file.
+    """
+
+    evaluable = False
+
+    def __init__(
+        self,
+        path: str,
+        discount: float | None = None,
+        exponent: float | None = None,
+        control_limit: float | None = None,
+        held_out: float = 0.2,
+        seed: int = 0,
+        wrap: bool = False,
+        dim: int | None = None,
+        control_dim: int | None = None,
+        constant_matrix: list | None = None,
+    ) -> None:
+        if not isinstance(path, str | Path):
+            raise InputError(f"problem.path is {path!r}, but must name an .npz or .safetensors file.")
+        self.path = str(Path(path).absolute())
+        self.wrap, self.seed = require_flag("problem.wrap", wrap), require_integer("problem.seed", seed, 0)
+        self.held_out_part = require_number("problem.held_out", held_out, at_least=0.01, at_most=0.99)
+        self._recording: recording.Recording | None = None
+        self._parts: dict[str, Samples] = {}
+        if dim is None:
+            self._recording = recording.read(self.path, self.wrap)
+            samples, numbers = self._recording.samples, self._recording.numbers
+            dim, control_dim = samples.B.shape[1:]
+            discount = numbers.get("discount") if discount is None else discount
+            exponent = numbers.get("exponent", 2.0) if exponent is None else exponent
+            control_limit = numbers.get("control_limit") if control_limit is None else control_limit
+            first = samples.B[:1]
+            same = float((samples.B - first).abs().max()) <= CONSTANT * (1.0 + float(first.abs().max()))
+            constant_matrix = first[0].tolist() if same else None
+        if discount is None:
+            raise InputError("problem.discount is missing: the file does not hold it; give problem.discount=...")
+        super().__init__(
+            dim=dim, control_dim=control_dim, discount=discount, exponent=exponent, control_limit=control_limit
+        )
+        self._B = None if constant_matrix is None else torch.tensor(constant_matrix, dtype=torch.float64)
+        if self._B is not None and self._B.shape != (self.dim, self.control_dim):
+            raise InputError(f"problem.constant_matrix has shape {tuple(self._B.shape)}, but must be (d, m).")
+        if self._recording is not None:
+            # The largest cost there is among the samples, with head-room: an estimate, and called one in `bounds`.
+            self.state_cost_bound = MARGIN * float(self._recording.samples.f.max())
+            self._split()
+
+    incidental = ("path",)
+
+    @property
+    def parameters(self) -> dict:
+        return {
+            **{name: getattr(self, name) for name in ("path", "discount", "exponent", "control_limit", "seed", "wrap")},
+            "held_out": self.held_out_part,
+            "dim": self.dim,
+            "control_dim": self.control_dim,
+            "constant_matrix": None if self._B is None else self._B.tolist(),
+        }
+
+    @property
+    def recording(self) -> recording.Recording:
+        """What the file holds, read when it is first asked for."""
+        if self._recording is None:
+            found = recording.read(self.path, self.wrap)
+            if found.samples.B.shape[1:] != (self.dim, self.control_dim):
+                raise InputError(
+                    f"{self.path} is of d, m = {tuple(found.samples.B.shape[1:])}, not {(self.dim, self.control_dim)}."
+                )
+            self._recording = found
+            self.state_cost_bound = MARGIN * float(found.samples.f.max())
+            self._split()
+        return self._recording
+
+    def _split(self) -> None:
+        samples = self._recording.samples
+        zero, constant = torch.zeros_like(samples.f), self._B is not None
+        if samples.div_a is None and not samples.a.any():
+            samples = Samples(**{**vars(samples), "div_a": zero})
+        if samples.div_B is None and constant:
+            samples = Samples(**{**vars(samples), "div_B": zero.unsqueeze(-1).expand(-1, self.control_dim)})
+        count = len(samples)
+        generator = torch.Generator().manual_seed(derive_seed(self.seed, SPLIT_STREAM))
+        order = torch.randperm(count, generator=generator)
+        held = round(self.held_out_part * count)
+        looks = max(FEWEST_PART, round(LOOKS_PART * (count - held)))
+        if held < FEWEST_PART or count - held - looks < FEWEST_PART:
+            raise InputError(
+                f"problem.held_out = {self.held_out_part:g} of {count} samples leaves too few on one side; each part needs "
+                f"at least {FEWEST_PART}."
+            )
+        cuts = {"held_out": order[:held], "looks": order[held : held + looks], "training": order[held + looks :]}
+        self._parts = {name: samples.take(rows) for name, rows in cuts.items()}
+
+    def _part(self, name: str) -> Samples:
+        _ = self.recording
+        return self._parts[name]
+
+    @property
+    def training(self) -> Samples:
+        """What may be learned from."""
+        return self._part("training")
+
+    @property
+    def held_out(self) -> Samples:
+        """What nothing was learned from or chosen by."""
+        return self._part("held_out")
+
+    @property
+    def rehearsal(self) -> Dataset:
+        """The same problem with other held-out samples, for looks by which choices are made."""
+        other = copy.copy(self)
+        other._recording, other._parts = self.recording, {**self._parts, "held_out": self._part("looks")}
+        return other
+
+    def samples(self, places: Tensor, divergences: bool = True) -> Samples:
+        """The training samples of the rows ``places``; a recording gives its divergences for nothing."""
+        return self.training.take(places.to("cpu"))
+
+    def survey(self, count: int, branch: int, *columns: str) -> tuple[Tensor, ...]:
+        return tuple(getattr(self.training, name)[:count] for name in columns)
+
+    def independent_samples(self, count: int) -> Samples:
+        return self.training.take(slice(count))
+
+    @property
+    def rows(self) -> int:
+        """How many samples there are to train on."""
+        return len(self.training)
+
+    @property
+    def driftless(self) -> bool:
+        return not bool(self.recording.samples.a.any())
+
+    @property
+    def gives_divergences(self) -> bool:
+        return self.training.div_a is not None and self.training.div_B is not None
+
+    @property
+    def knows_control_matrix(self) -> bool:
+        return self._B is not None
+
+    def control_matrix(self, x: Tensor) -> Tensor:
+        if self._B is None:
+            raise InputError(
+                "B varies over the recorded samples, so the controller from V is not known between them; "
+                "train with method=pd, which hands out w / mu."
+            )
+        return self._like(x, "B", self._B).expand(len(x), self.dim, self.control_dim)
+
+    def control_divergence(self, x: Tensor) -> Tensor:
+        self.control_matrix(x[:1])
+        return x.new_zeros(len(x), self.control_dim)
+
+    def state_cost(self, x: Tensor) -> Tensor:
+        raise _unknown("state cost")
+
+    def drift(self, x: Tensor) -> Tensor:
+        raise _unknown("drift")
+
+    def drift_divergence(self, x: Tensor) -> Tensor:
+        raise _unknown("drift")
+
+    def initial_density(self, x: Tensor) -> Tensor:
+        raise _unknown("initial density")
+
+
+def _unknown(what: str) -> InputError:
+    return InputError(
+        f"the {what} of a data set is known at its recorded states only; nothing can be simulated with it."
+    )

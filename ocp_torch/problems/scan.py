@@ -1,0 +1,88 @@
+"""Where a problem's data are odd: states that a few thousand would miss, and at which suprema are then looked for too.
+
+A network varies slowly; what is narrow in a slack comes from `f`, `a` or `B`. They are far cheaper to evaluate than `V` and
+its gradient, so that millions of states can be scanned: a set that takes the part `3 / N` of the torus is met by `N` states
+with 95 % probability. Kept are the states where a column of the data is smallest or largest, those that are reached from
+there downhill and uphill, and the states where a column differs most from its value nearby.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.supremum import climb
+from ocp_torch.problems.problem import Problem
+
+# Branch of the seed tree.
+STREAM = 10
+# States scanned at once, states kept for each column and kind of oddity, and how far off a neighbour is.
+CHUNK, KEPT, NEARBY = 2**16, 16, 0.02
+# Steps downhill and uphill, along gradients where there are some and then in random directions.
+STEPS = 60
+
+
+def odd_states(problem: Problem, count: int, seed: int) -> Tensor:
+    """States ``(K, d)`` in float64 at which the data of ``problem`` are odd, found among ``count`` uniform ones; found once
+    for a problem, so that looks on the way cost no more."""
+    kept = vars(problem).setdefault("_odd_states", {})
+    if (count, seed) not in kept:
+        kept[count, seed] = _odd_states(problem, count, seed)
+    return kept[count, seed]
+
+
+@torch.no_grad()
+def _odd_states(problem: Problem, count: int, seed: int) -> Tensor:
+    pairs = count // 2
+    generator = torch.Generator().manual_seed(derive_seed(seed, STREAM))
+    draw = lambda size: torch.rand(size, problem.dim, generator=generator, dtype=torch.float64)
+    found: dict[str, tuple[Tensor, Tensor]] = {}
+    for start in range(0, pairs, CHUNK):
+        x = draw(min(CHUNK, pairs - start))
+        away = torch.nn.functional.normalize(draw(len(x)) - 0.5)
+        near = (x + NEARBY * away).remainder(1.0)
+        here, there = _columns(problem, x), _columns(problem, near)
+        alone, together = torch.cat([x, near]), torch.cat([x, near], dim=1)
+        values = torch.cat([here, there])
+        found["low"] = _highest(found.get("low"), -values, alone)
+        found["high"] = _highest(found.get("high"), values, alone)
+        found["step"] = _highest(found.get("step"), (here - there).abs(), together)
+    reached = [
+        _extremes(problem, found[name][1], sign) for name, sign in (("low", -1.0), ("high", 1.0)) if name in found
+    ]
+    kept = [states.reshape(-1, problem.dim) for _, states in found.values()]
+    return torch.cat([draw(0), *kept, *reached]).unique(dim=0)
+
+
+def _extremes(problem: Problem, states: Tensor, sign: float) -> Tensor:
+    """Where the columns are largest, or smallest for a ``sign`` of -1, that can be reached from ``states`` ``(K, C, d)``."""
+    column = torch.arange(states.shape[1]).repeat(len(states)).unsqueeze(-1)
+    own = lambda x: sign * _columns(problem, x).gather(1, column).squeeze(-1)
+    x = states.flatten(0, 1)
+    with torch.enable_grad():
+        smooth = own(x.detach().requires_grad_(True)).requires_grad
+    for differentiable in (True, False)[not smooth :]:
+        x, _ = climb(own, x, own(x), STEPS, differentiable=differentiable)
+    return x.remainder(1.0)
+
+
+def _columns(problem: Problem, x: Tensor) -> Tensor:
+    """`f`, `a` and `B` as columns ``(N, 1 + d + d m)``; without those that are the same everywhere by definition."""
+    columns = [problem.state_cost(x).unsqueeze(-1)]
+    if not problem.driftless:
+        columns.append(problem.drift(x))
+    if type(problem).control_matrix is not Problem.control_matrix:
+        columns.append(problem.control_matrix(x).flatten(1))
+    return torch.cat(columns, dim=1)
+
+
+def _highest(kept: tuple[Tensor, Tensor] | None, score: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    """The `KEPT` highest scores of each column so far ``(K, C)``, and the rows of ``x`` that they are of."""
+    top, rows = score.topk(min(KEPT, len(score)), dim=0)
+    states = x[rows]
+    if kept is not None:
+        top, states = torch.cat([kept[0], top]), torch.cat([kept[1], states])
+        top, rows = top.topk(min(KEPT, len(top)), dim=0)
+        states = states.gather(0, rows.unsqueeze(-1).expand(-1, -1, states.shape[-1]))
+    return top, states

@@ -1,0 +1,173 @@
+"""A stranger's NumPy function, asked with care: what it gives is checked, and what goes wrong is named with the state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ocp_torch.errors import InputError, ProblemError, require_integer
+from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.problems.simulator.target import asked, resolved
+from ocp_torch.problems.simulator.workers import Workers
+
+__all__ = ["Oracle", "asked", "resolved"]
+
+# Two calls may differ by so much, relative to the size of the answer, and still be a function of the state.
+SAME = 1e-6
+# Single precision is forgiven that much more.
+SAME_IN_FLOAT32 = 1e3
+# The seam is looked at from so far on both sides; what changes by more than that part of the answer's size jumps there.
+SEAM_STEP, SEAM_JUMP, SEAM_PROBES, MOST_SEAMS = 1e-7, 1e-3, 4, 32
+# That size is the largest answer at so many states of the whole torus: at the seam a function that is odd is nearly 0.
+SIZED = 32
+NAMES = ("f", "a", "B", "mu0")
+
+
+class Oracle:
+    """``target``, by name or the function itself, as a function of states ``(N, dim)`` that gives `f`, `a`, `B` and maybe
+    `mu0`: made only if it keeps to that at a few states and across the seam, and asked with ``workers`` processes.
+
+    ``driftless``: `None` stands for `a`; ``gives_mu0``: there is a fourth part; ``in_float32``: `f` is in single precision.
+    Raises `InputError`, when made and when asked, with the state, where the function fails, gives another shape or a number
+    that is not finite; when made, also where it is no function of the state alone or jumps from 1 to 0.
+    """
+
+    def __init__(self, target: str | Callable, dim: int, control_dim: int, workers: int = 1) -> None:
+        workers = require_integer("problem.workers", workers, 1, maximum=1024)
+        if workers > 1 and not isinstance(target, str):
+            raise InputError("problem.workers needs a target by name, module:function, which each process can import.")
+        self._function = resolved(target) if isinstance(target, str) else target
+        if not callable(self._function):
+            raise InputError(f"problem.target is {target!r}, but must be module:function or a function.")
+        self._dim, self._control_dim = dim, control_dim
+        self._pool: Workers | None = None
+        self._kept: tuple[Tensor, dict] | None = None
+        self.one_by_one = self.driftless = self.gives_mu0 = self.in_float32 = False
+        self._understand()
+        self._look_at_the_seam()
+        if workers > 1:
+            self._pool = Workers(target, workers)
+
+    def answers(self, at: Tensor) -> dict:
+        """All parts at float64 states ``(N, dim)`` of the unit cell, by name; those of the last batch are kept, for they are
+        asked for in turn, in a dict that takes what is worked out from them as well."""
+        if self._kept is None or self._kept[0].shape != at.shape or not torch.equal(self._kept[0], at):
+            self._kept = at, self.checked(at)
+        return self._kept[1]
+
+    def checked(self, at: Tensor) -> dict[str, Tensor]:
+        """As `answers`, but asked anew and not kept."""
+        x = at.numpy()
+        try:
+            answer = self._pool.map(x, self.one_by_one) if self._pool else asked(self._function, x, self.one_by_one)
+        except InputError:
+            raise
+        except Exception as error:  # whatever a stranger's code may raise
+            raise ProblemError(self._failure(x, error)) from None
+        found = self._shaped(answer, x)
+        for name, values in found.items():
+            bad = ~torch.isfinite(values).reshape(len(x), -1).all(dim=-1)
+            if bool(bad.any()):
+                at_row = int(bad.nonzero()[0])
+                raise ProblemError(f"the oracle's {name} is not finite at x = {x[at_row].tolist()}.")
+        return found
+
+    def _failure(self, x: np.ndarray, error: Exception) -> str:
+        """What it raised, and the state it raises it at, found by halving the batch."""
+        while len(x) > 1:
+            half = x[: len(x) // 2]
+            try:
+                asked(self._function, half, self.one_by_one)
+            except Exception as other:  # whatever a stranger's code may raise
+                x, error = half, other
+                continue
+            x = x[len(x) // 2 :]
+        reason = next(iter(str(error).splitlines()), "").rstrip(".") or "no message"
+        return f"the oracle raised {type(error).__name__} at x = {x[0].tolist()}: {reason}."
+
+    def _shaped(self, answer: object, x: np.ndarray) -> dict[str, Tensor]:
+        """The parts of ``answer`` by name, as float64 tensors; `InputError` where one is missing or misshapen."""
+        count, d, m = len(x), self._dim, self._control_dim
+        if not isinstance(answer, tuple | list) or len(answer) not in (3, 4):
+            raise InputError(
+                f"the oracle gave a {type(answer).__name__}, but must give f, a, B (and, if it likes, mu0)."
+            )
+        parts = dict(zip(NAMES, answer, strict=False))
+        forms = {"f": (count,), "a": (count, d), "B": (count, d, m), "mu0": (count,)}
+        found = {}
+        for name, part in parts.items():
+            if name == "a" and part is None:
+                part = np.zeros((count, d))
+            try:
+                array = np.asarray(part)
+                array = array.astype(np.float64) if array.dtype.kind in "fiu" else None
+            except (TypeError, ValueError):
+                array = None
+            if array is None:
+                raise InputError(f"the oracle's {name} is no array of real numbers at x = {x[0].tolist()}.")
+            if name == "B" and m == 1 and array.shape == (count, d):
+                array = array[:, :, None]
+            if array.shape != forms[name]:
+                raise InputError(
+                    f"the oracle's {name} has shape {array.shape} for states of shape {x.shape} (x = {x[0].tolist()} the "
+                    f"first), but must have {forms[name]}."
+                )
+            found[name] = torch.from_numpy(np.ascontiguousarray(array))
+        return found
+
+    def _understand(self) -> None:
+        """Whether it takes batches or single states, and whether its answers depend on the state alone."""
+        x = scrambled_sobol(self._dim + 3, self._dim, 0, torch.float64)
+        self.one_by_one = self._form(x.numpy())
+        found = self.checked(x)
+        raw = asked(self._function, x[:1].numpy(), self.one_by_one)
+        self.driftless, self.gives_mu0 = raw[1] is None, len(raw) == 4
+        self.in_float32 = np.asarray(raw[0]).dtype == np.float32
+        again, alone = self.checked(x), self.checked(x[2:3])
+        same = SAME * (SAME_IN_FLOAT32 if self.in_float32 else 1.0)
+        for name, values in found.items():
+            size = same * (float(values.abs().max().nan_to_num()) + 1e-6)
+            if float((again[name] - values).abs().max()) > size:
+                raise InputError(
+                    f"the oracle's {name} differs between two calls at x = {x[0].tolist()}; it must be a function of x."
+                )
+            if float((alone[name][0] - values[2]).abs().max()) > size:
+                raise InputError(
+                    f"the oracle's {name} at x = {x[2].tolist()} depends on the other states of the batch."
+                )
+
+    def _form(self, x: np.ndarray) -> bool:
+        """Whether it takes states one by one: what gives an answer of the right shape at any of the states ``x``."""
+        complaints = []
+        for one_by_one in (False, True):
+            # As many copies of a state as no coordinate has: a batch that cannot be taken for anything else.
+            for batch in (x, *(np.repeat(state[None], len(x), axis=0) for state in x)):
+                try:
+                    self._shaped(asked(self._function, batch, one_by_one), batch)
+                    return one_by_one
+                except Exception as error:  # whatever a stranger's code may raise
+                    complaints.append(error)
+        # A function of batches is not to be told that it cannot take single states, nor the other way round.
+        raise next((e for e in complaints if isinstance(e, InputError)), None) or InputError(
+            self._failure(x, complaints[0])
+        ) from None
+
+    def _look_at_the_seam(self) -> None:
+        everywhere = self.checked(scrambled_sobol(SIZED, self._dim, 0, torch.float64))
+        for i in range(min(self._dim, MOST_SEAMS)):
+            after = scrambled_sobol(SEAM_PROBES, self._dim, 1 + i, torch.float64)
+            before = after.clone()
+            after[:, i], before[:, i] = SEAM_STEP, 1.0 - SEAM_STEP
+            here, there = self.checked(after), self.checked(before)
+            for name in here:
+                change = (here[name] - there[name]).reshape(SEAM_PROBES, -1).abs().amax(dim=-1)
+                size = max(float(values[name].abs().max()) for values in (here, there, everywhere))
+                worst = int(change.argmax())
+                if float(change[worst]) > SEAM_JUMP * size:
+                    raise InputError(
+                        f"the oracle's {name} jumps by {float(change[worst]):.3g} where coordinate {i} passes from 1 to 0, "
+                        f"at x = {after[worst].tolist()}, but it must have period 1 in each coordinate."
+                    )

@@ -1,0 +1,57 @@
+"""Somebody's function: found by its name, and asked for a batch of states at once or one by one."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from ocp_torch.errors import InputError, nearest
+from ocp_torch.files.reading import kind, require_file
+
+
+def resolved(target: str) -> Callable:
+    """The function that module:function or FILE.py:function names."""
+    source, _, name = target.rpartition(":")
+    if not source or not name:
+        raise InputError(f"problem.target is {target!r}, but must be module:function or FILE.py:function.")
+    try:
+        if source.endswith(".py"):
+            if kind(source) is None:
+                raise InputError(f"problem.target names {source}, which does not exist.")
+            require_file(source)
+            spec = importlib.util.spec_from_file_location(Path(source).stem, source)
+            module = importlib.util.module_from_spec(spec)
+            sys.modules.setdefault(Path(source).stem, module)
+            spec.loader.exec_module(module)
+        else:
+            module = importlib.import_module(source)
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:  # whatever a stranger's module may raise
+        raise InputError(f"problem.target = {target} cannot be imported: {type(error).__name__}: {error}.") from None
+    found = getattr(module, name, None)
+    if not callable(found):
+        known = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
+        raise InputError(f"problem.target = {target}: the module has no function {name!r}{nearest(name, known)}.")
+    return found
+
+
+def asked(function: Callable, x: np.ndarray, one_by_one: bool):
+    """``function`` at ``x`` ``(N, d)``, at all of them at once or one by one."""
+    try:
+        if not one_by_one:
+            return function(x.copy())
+        rows = [function(state.copy()) for state in x]
+    except SystemExit as end:  # it would end the run without a word
+        raise RuntimeError(f"it asks Python to exit (status {end.code})") from None
+    if not all(isinstance(row, tuple | list) for row in rows):
+        return rows[0]
+    return tuple(
+        None if any(p is None for p in parts) else np.stack([np.asarray(p) for p in parts])
+        for parts in zip(*rows, strict=True)
+    )

@@ -1,0 +1,78 @@
+"""Where trajectories start and bounds are evaluated: uniform states, and more of them where `mu0` or `f` is large.
+
+Every point carries a weight, so that means estimate the same integrals whatever the points; where `mu0` is narrow hardly any
+uniform state carries its mass, and none of a few.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from ocp_torch.maths.mixtures import SCANNED, Mixture, fitted_mixture
+from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.simulator.simulator import Callable as BlackBox
+
+# Parts that stay uniform: of starts, for mass that the search missed; and of the states of bounds, most of whose integrands
+# are large elsewhere too.
+UNIFORM_STARTS, UNIFORM_STATES = 0.125, 0.5
+# Part of the starts that is near spikes of `f`, which others meet by chance.
+SPIKE_STARTS = 0.125
+# A state cost whose uniform states are worth that part of their number leaves them alone.
+BROAD_COST = 0.05
+# Candidates for each start that is to carry as much mass as all others.
+CANDIDATES = 16
+# States at which a simulator is asked, each of which may cost milliseconds, where a formula is looked at `SCANNED`.
+ASKED = 2**12
+
+
+def start_law(problem: Problem) -> Mixture:
+    """The density starts are drawn from: near `mu0` and spikes of `f`, and uniform where both are broad."""
+    density, cost = _fits(problem)
+    if density.is_uniform:
+        return cost.scaled(SPIKE_STARTS)
+    spikes = [] if cost.is_uniform else [cost.scaled(SPIKE_STARTS)]
+    return Mixture.join([density.scaled(1.0 - UNIFORM_STARTS - SPIKE_STARTS * len(spikes)), *spikes])
+
+
+def evaluation_law(problem: Problem) -> Mixture:
+    """The density states are drawn from at which bounds are evaluated; uniform where neither `mu0` nor `f` is narrow."""
+    laws = [law for law in _fits(problem) if not law.is_uniform]
+    part = (1.0 - UNIFORM_STATES) / max(1, len(laws))
+    return Mixture.uniform(problem.dim) if not laws else Mixture.join([law.scaled(part) for law in laws])
+
+
+def starts_narrowly(problem: Problem) -> bool:
+    """Whether hardly any uniform state carries mass of `mu0`."""
+    return not _fits(problem)[0].is_uniform
+
+
+@torch.no_grad()
+def initial_points(problem: Problem, count: int, replicate: int, seed: int, extra: int = 0) -> tuple[Tensor, Tensor]:
+    """Starts ``(count, d + extra)``, the ``extra`` coordinates uniform, and weights ``(count,)``: `mean(weight g(x))`
+    estimates `E[g mu0]`, and the mean weight is the mass of `mu0`. Replicates are independent randomised point sets."""
+    points, weight = start_law(problem).draw(count, replicate, seed, extra)
+    return points, weight * problem.initial_density(points[:, : problem.dim])
+
+
+def drawn_starts(problem: Problem, count: int, seed: int) -> Tensor:
+    """``count`` starts ``(count, d)`` drawn from `mu0`, which all count the same: weighted ones, drawn again by weight."""
+    x, weight = initial_points(problem, CANDIDATES * count, 0, seed)
+    if not float(weight.sum()) > 0.0:
+        return x[:count]
+    generator = torch.Generator().manual_seed(derive_seed(seed, count))
+    return x[torch.multinomial(weight, count, replacement=True, generator=generator)]
+
+
+def _fits(problem: Problem) -> tuple[Mixture, Mixture]:
+    """The densities fitted to `mu0` and to `f`; found once for a problem."""
+    kept = vars(problem)
+    if "_fits" not in kept:
+        everywhere = getattr(problem.initial_density, "__func__", None) is Problem.initial_density
+        fit = partial(fitted_mixture, dim=problem.dim, scanned=ASKED if isinstance(problem, BlackBox) else SCANNED)
+        density = Mixture.uniform(problem.dim) if everywhere else fit(problem.initial_density)
+        kept["_fits"] = density, fit(problem.state_cost, broad=BROAD_COST)
+    return kept["_fits"]

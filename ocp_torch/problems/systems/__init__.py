@@ -1,0 +1,1 @@
+"""Systems people have: arms, vehicles, oscillators, a pendulum."""

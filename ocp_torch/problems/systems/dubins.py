@@ -1,0 +1,64 @@
+r"""Dubins' vehicle in a periodic plane: constant speed, only the turn rate is controlled; stay near a target."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ocp_torch.errors import require_number
+from ocp_torch.problems.systems.angles import TURN
+from ocp_torch.problems.systems.planar import PlanarVehicle
+
+TARGET = (2.0, 2.0)
+OBSTACLES = ((1.0, 2.6, 0.3),)
+
+
+class Dubins(PlanarVehicle):
+    r"""`size dx_1/dt = speed cos(2 pi x_3)`, `size dx_2/dt = speed sin(2 pi x_3)`, `dx_3/dt = turn_rate u`: `d = 3`, `m = 1`.
+
+    Dubins (1957), with a price on turning in place of a limit. `u = 1` is ``turn_rate`` turns per second. The vehicle
+    cannot stop: at best it circles near the target. The cost is that of `PlanarVehicle`.
+
+    The drift is not in the range of `B`, so the paper's assumption A2 fails. What then still holds: `f`, `a`, `B` are
+    smooth, so `V*` is bounded by `sup f`, continuous, and the viscosity solution; a smooth `V` with `Q <= 0` is at most
+    `V*` by integration along any trajectory, so the shifted bound, and `F_M` with an `M >= sup mu*`, are lower bounds as
+    before; simulated performance and the Lagrangian bound speak of the learned, smooth controller and need no optimum.
+    What is lost is the a-priori bound on `u*` (Proposition 2), for which a least-squares `alpha` stands, and knowledge
+    of `mu*`. It is declared unbounded where the vehicle can turn faster than the discount forgets: the flow then gathers on
+    a circle about the target (an `inf` only keeps `F_M` out of the certificate).
+    """
+
+    def __init__(
+        self,
+        size: float = 4.0,
+        target: list[float] = TARGET,
+        obstacles: list[list[float]] = OBSTACLES,
+        clearance: float = 0.3,
+        target_weight: float = 1.0,
+        obstacle_weight: float = 2.0,
+        speed: float = 1.0,
+        turn_rate: float = 0.25,
+        discount: float = 0.5,
+        exponent: float = 2.0,
+        control_limit: float | None = None,
+    ) -> None:
+        weights = target_weight, obstacle_weight
+        super().__init__(1, size, target, obstacles, clearance, *weights, discount, exponent, control_limit)
+        self.speed = require_number("problem.speed", speed, above=0.0)
+        self.turn_rate = require_number("problem.turn_rate", turn_rate, above=0.0)
+        self.occupation_bound = math.inf if TURN * self.turn_rate > self.discount else None
+
+    def drift(self, x: Tensor) -> Tensor:
+        ahead = self.speed / self.size * self.heading(x)
+        return torch.cat([ahead, torch.zeros_like(ahead[:, :1])], dim=-1)
+
+    def drift_divergence(self, x: Tensor) -> Tensor:
+        return torch.zeros_like(x[:, 0])
+
+    def control_matrix(self, x: Tensor) -> Tensor:
+        return x.new_tensor([0.0, 0.0, self.turn_rate]).unsqueeze(-1).expand(len(x), 3, 1)
+
+    def control_divergence(self, x: Tensor) -> Tensor:
+        return x.new_zeros(len(x), 1)

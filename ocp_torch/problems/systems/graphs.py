@@ -1,0 +1,96 @@
+"""Who acts on whom: adjacency matrices by name, by seed, from a list of rows or from a file."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ocp_torch.errors import InputError, nearest
+from ocp_torch.files.arrays import read_npy
+from ocp_torch.files.reading import read_text
+from ocp_torch.problems.arguments import require_numbers
+
+GRAPHS = ("complete", "ring", "random")
+SUFFIXES = (".npy", ".txt")
+# Characters of a number in a text file, on average, at most.
+LONGEST_NUMBER = 64
+# Bytes of a matrix that is read even where it is larger than it should be, so that its shape can be told.
+LEAST_ROOM = 2**20
+
+
+def adjacency(name: str, value: object, count: int, probability: float, seed: int) -> Tensor:
+    """The weights `A_ij >= 0` of the action of `j` on `i`, ``(count, count)`` float64 with zero diagonal.
+
+    ``value`` is complete, ring, random (a random tree, and each other edge with ``probability``, drawn by ``seed``: always
+    connected), a `.npy` or `.txt` file, or a list of rows. Raises `InputError` for anything else, or one of another size.
+    """
+    if not isinstance(value, str):
+        return _checked(name, _rows(name, value, count), count)
+    if Path(value).suffix in SUFFIXES:
+        return _checked(name, _read(name, Path(value), count), count)
+    if value not in GRAPHS:
+        raise InputError(
+            f"{name} is {value!r}, but must be {', '.join(GRAPHS)}, a .npy or .txt file, or a list of rows"
+            f"{nearest(value, GRAPHS)}."
+        )
+    return {"complete": _complete, "ring": _ring, "random": _random}[value](count, probability, seed)
+
+
+def _complete(count: int, probability: float, seed: int) -> Tensor:
+    return 1.0 - torch.eye(count, dtype=torch.float64)
+
+
+def _ring(count: int, probability: float, seed: int) -> Tensor:
+    A = torch.zeros(count, count, dtype=torch.float64)
+    for i in range(count):
+        j = (i + 1) % count
+        if i != j:
+            A[i, j] = A[j, i] = 1.0
+    return A
+
+
+def _random(count: int, probability: float, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.rand(count, count, generator=generator, dtype=torch.float64).triu(1) + torch.ones(count, count).tril()
+    A = (drawn < probability).double()
+    order = torch.randperm(count, generator=generator).tolist()
+    for k in range(1, count):
+        i, j = order[k], order[int(torch.randint(k, (), generator=generator))]
+        A[i, j] = A[j, i] = 1.0
+    return ((A + A.T) > 0).double()
+
+
+def _rows(name: str, value: object, count: int) -> np.ndarray:
+    if not isinstance(value, Sequence) or len(value) != count:
+        raise InputError(f"{name} is {value!r}, but must be a list of {count} rows.")
+    return np.array([require_numbers(f"{name}[{i}]", row, count) for i, row in enumerate(value)])
+
+
+def _read(name: str, path: Path, count: int) -> np.ndarray:
+    try:
+        if path.suffix == ".npy":
+            return read_npy(path, max(8 * count**2, LEAST_ROOM))
+        text = read_text(path, LONGEST_NUMBER * count**2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # that there is nothing in it
+            return np.loadtxt(text.splitlines(), ndmin=2)
+    except InputError as error:
+        raise InputError(f"{name} cannot be read: {error}") from None
+    except (ValueError, EOFError, UserWarning) as error:
+        raise InputError(f"{name} = {path} is not a matrix of numbers ({error}).") from None
+
+
+def _checked(name: str, matrix: np.ndarray, count: int) -> Tensor:
+    if matrix.shape != (count, count) or matrix.dtype.kind not in "buif":
+        raise InputError(f"{name} has shape {matrix.shape}, but must be a {count} by {count} matrix of numbers.")
+    A = torch.from_numpy(np.array(matrix, dtype=np.float64))
+    if not bool(torch.isfinite(A).all()) or bool((A < 0.0).any()):
+        raise InputError(f"{name} holds a weight that is negative or not finite; every weight must be at least 0.")
+    if bool(A.diagonal().any()):
+        raise InputError(f"{name} has a weight on its diagonal, but an oscillator does not act on itself.")
+    return A

@@ -1,0 +1,58 @@
+r"""A unicycle in a periodic plane: speed and turn rate are the controls, a target and round obstacles the cost."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ocp_torch.errors import require_number
+from ocp_torch.problems.systems.planar import PlanarVehicle
+
+TARGET = (2.0, 2.0)
+OBSTACLES = ((1.0, 2.6, 0.3), (2.9, 1.1, 0.3))
+
+
+class Unicycle(PlanarVehicle):
+    r"""`size dx_1/dt = speed cos(2 pi x_3) u_1`, `size dx_2/dt = speed sin(2 pi x_3) u_1`, `dx_3/dt = turn_rate u_2`.
+
+    The kinematic model of a wheeled robot that cannot slide sideways (LaValle, *Planning Algorithms*, section 13.1.2):
+    `d = 3`, `m = 2`, no drift. `u_1 = 1` is ``speed`` metres per second ahead, `u_2 = 1` is ``turn_rate`` turns per second.
+    The cost is that of `PlanarVehicle`. Where the flow contracts onto the target line by line faster than the discount
+    forgets, which for `q = 2` is `2 target_weight speed^2 >= 2 discount^2`, `mu*` is declared unbounded.
+    """
+
+    def __init__(
+        self,
+        size: float = 4.0,
+        target: list[float] = TARGET,
+        obstacles: list[list[float]] = OBSTACLES,
+        clearance: float = 0.3,
+        target_weight: float = 1.0,
+        obstacle_weight: float = 4.0,
+        speed: float = 1.0,
+        turn_rate: float = 0.25,
+        discount: float = 1.0,
+        exponent: float = 2.0,
+        control_limit: float | None = None,
+    ) -> None:
+        weights = target_weight, obstacle_weight
+        super().__init__(2, size, target, obstacles, clearance, *weights, discount, exponent, control_limit)
+        self.speed = require_number("problem.speed", speed, above=0.0)
+        self.turn_rate = require_number("problem.turn_rate", turn_rate, above=0.0)
+        # With V = p r^2 / 2 along the heading: p + (speed p)^2 / rho^2 = 2 target_weight, contraction speed^2 p / rho. The
+        # control vanishes at the target, so that no limit changes any of it there.
+        fast = self.target_weight * self.speed**2 >= self.discount**2
+        self.occupation_bound = math.inf if fast and self.exponent == 2.0 else None
+
+    def control_matrix(self, x: Tensor) -> Tensor:
+        ahead = self.speed / self.size * self.heading(x)
+        drive = torch.cat([ahead, torch.zeros_like(ahead[:, :1])], dim=-1)
+        turn = torch.zeros_like(drive)
+        turn[:, 2] = self.turn_rate
+        return torch.stack([drive, turn], dim=-1)
+
+    def control_divergence(self, x: Tensor) -> Tensor:
+        """Zero: the direction ahead does not depend on the position, nor the turn on the heading."""
+        return x.new_zeros(len(x), 2)

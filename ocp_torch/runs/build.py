@@ -1,0 +1,166 @@
+"""From a resolved configuration, as plain nested data, to a trainer ready to run. No Hydra in here."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+from collections.abc import Callable
+
+from torch import nn
+
+from ocp_torch.certificate import CertificateSettings, StageSettings
+from ocp_torch.control.controller import problem_name
+from ocp_torch.errors import (
+    InputError,
+    call,
+    nearest,
+    require_choice,
+    require_integer,
+    require_number,
+    require_section,
+)
+from ocp_torch.fields import MODELS, VALUE, Fields
+from ocp_torch.fields.fields import cost_unit
+from ocp_torch.fields.waves import STATES
+from ocp_torch.files.memory import require_memory
+from ocp_torch.maths.sampling import SAMPLERS, RowSampler, derive_seed
+from ocp_torch.objectives import METHODS, Objective
+from ocp_torch.problems import Problem
+from ocp_torch.problems.blame import in_their_words, origin, words
+from ocp_torch.problems.check import check_once
+from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.problem import MOST_COORDINATES
+from ocp_torch.runs.process import prepare
+from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
+from ocp_torch.training.batches import Batches
+from ocp_torch.training.budgets import fill
+from ocp_torch.training.settings import TrainerSettings
+from ocp_torch.training.trainer import Trainer
+
+# Branch of the seed tree for network weights, beside those of the samplers.
+WEIGHTS_STREAM = 2
+# Numbers that a step keeps per unit of a network and state: 6 to 10 were measured, in one and in four dimensions.
+VALUES_PER_UNIT = 5
+# Of all methods; a learning rate may be set for each that the chosen one has.
+PLAYERS = ("value", "density")
+BOUND_FIELDS = ("occupation_bound", "value_bound", "control_bound")
+
+
+def problem_class(target: object) -> type[Problem]:
+    """The `Problem` subclass that ``target``, as in my_module.MyProblem, names."""
+    if not isinstance(target, str) or not re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+", target):
+        raise InputError(f"problem._target_ is {target!r}, but must be a class, as in my_module.MyProblem.")
+    module_name, _, class_name = target.rpartition(".")
+    try:
+        module = importlib.import_module(module_name)
+    except (Exception, SystemExit) as error:  # whatever a stranger's module may raise
+        missing = isinstance(error, ImportError) and module_name.startswith(str(error.name))
+        where = "" if missing else origin(error)
+        raise InputError(f"problem._target_ = {target} cannot be imported: {words(error)}{where}.") from None
+    known = [n for n, c in vars(module).items() if inspect.isclass(c) and issubclass(c, Problem) and c is not Problem]
+    if class_name not in known:
+        hint = nearest(class_name, known)
+        raise InputError(f"problem._target_ = {target} is not a Problem subclass in that module{hint}.")
+    return getattr(module, class_name)
+
+
+def build_problem(section: object) -> Problem:
+    """The problem ``_target_`` names, made with the other fields as arguments and checked; any `Problem` subclass will do."""
+    options = require_section("problem", section)
+    cls = problem_class(options.pop("_target_", None))
+    dim = options.get("dim")
+    if isinstance(dim, int) and 1 <= dim <= MOST_COORDINATES:  # a problem that large may take long to be made
+        _require_room(dim, options.get("control_dim"))
+    problem = in_their_words(lambda: call(cls, "problem", options), cls.__name__, cls)
+    _require_room(problem.dim, problem.control_dim)
+    check_once(problem)
+    return problem
+
+
+def _require_room(dim: int, control_dim: object) -> None:
+    """Raise `InputError` where `B` at the states at which the embedding looks for waves would not fit into the memory."""
+    given = isinstance(control_dim, int) and 1 <= control_dim <= MOST_COORDINATES
+    entries = dim * (control_dim if given else dim)
+    require_memory("the number of entries of B, problem.dim times control_dim,", entries, 8.0 * STATES)
+
+
+def build_trainer(config: dict) -> Trainer:
+    """Everything a run needs, in the order in which data flows. Raises `InputError` for any wrong field."""
+    seed = require_integer("seed", config["seed"], 0)
+    problem = build_problem(config["problem"])
+    config = fill(config, problem)
+    settings = call(TrainerSettings, "trainer", require_section("trainer", config["trainer"]))
+    prepare(settings.threads)
+    method = require_section("method", config["method"])
+    name = require_choice("method.name", method.pop("name", None), METHODS)
+    bounds = resolve_bounds(problem, **{field: method.pop(field, None) for field in BOUND_FIELDS})
+    objective = call(METHODS[name], "method", method, problem=problem, bounds=bounds)
+    if settings.target_gap is not None and VALUE not in objective.fields:
+        raise InputError(
+            f"trainer.target_gap is {settings.target_gap:g}, but {name} gives no lower bound to measure a gap by; "
+            "use dual or pd."
+        )
+    network = build_network(config["model"])
+    fields = Fields.build(problem, objective.fields, network, derive_seed(seed, WEIGHTS_STREAM))
+    fields = fields.to(dtype=settings.torch_dtype, device=settings.torch_device)
+    require_memory("trainer.batch", settings.batch, _bytes_per_state(problem, fields, settings))
+    stepper = _build_stepper(config, fields, objective, settings.steps, cost_unit(problem))
+    average = call(averaged, "averaging", require_section("averaging", config["averaging"]), fields=fields)
+    sampler_section = require_section("sampler", config["sampler"])
+    sampler_name = require_choice("sampler.name", sampler_section.pop("name", None), SAMPLERS)
+    visited = sampler_section.pop("visited", None)
+    given = {"dim": problem.dim, "seed": seed, "dtype": settings.torch_dtype}
+    if problem.evaluable:
+        sampler = call(SAMPLERS[sampler_name], "sampler", sampler_section, **given)
+    elif settings.target_gap is not None:
+        raise InputError("trainer.target_gap is set, but a data set has no simulation to see a gap by.")
+    else:  # a data set has its own samples
+        sampler = RowSampler(problem.rows, seed, problem.recording.digest)
+    batches = Batches(problem, fields, objective, sampler, settings.batch, seed, visited)
+    names = (problem_name(problem), name)
+    return Trainer(
+        problem, fields, objective, bounds, stepper, average, batches, settings, network, seed, names, config
+    )
+
+
+def _bytes_per_state(problem: Problem, fields: Fields, settings: TrainerSettings) -> float:
+    """What a step keeps of each state of a batch, at least: its samples, and the values of all units with derivatives."""
+    units = sum(p.shape[0] for p in fields.parameters() if p.dim() == 2)
+    samples = 2 * problem.dim + 2  # x, f, a and mu0; a constant B takes no room
+    return settings.torch_dtype.itemsize * (samples + VALUES_PER_UNIT * units)
+
+
+def build_network(model: object) -> Callable[..., nn.Module]:
+    """A maker of networks of the configured ``model``, given the form a field wants."""
+    options = require_section("model", model)
+    network = MODELS[require_choice("model.name", options.pop("name", None), MODELS)]
+    return lambda **form: call(network, "model", options, **form)
+
+
+def build_certificate_settings(config: dict) -> CertificateSettings:
+    """How much the final certificate may cost."""
+    section = require_section("certificate", config["certificate"])
+    stage_section = require_section("certificate.stage", section.pop("stage", {}))
+    stage = call(StageSettings, "certificate.stage", stage_section)
+    return call(CertificateSettings, "certificate", section, stage=stage)
+
+
+def _build_stepper(config: dict, fields: Fields, objective: Objective, steps: int, unit: float) -> Stepper:
+    options = require_section("optimizer", config["optimizer"])
+    player_lr = require_section("optimizer.player_lr", options.pop("player_lr", {}))
+    for player, rate in player_lr.items():
+        require_choice("optimizer.player_lr", player, PLAYERS)
+        if rate is not None:
+            require_choice("optimizer.player_lr", player, objective.players)
+    lr = options.pop("lr", None)
+    rates = {player: lr if player_lr.get(player) is None else player_lr[player] for player in objective.players}
+    makers = {player: call(optimizer_maker, "optimizer", options, lr=rate) for player, rate in rates.items()}
+    schedule = call(schedule_maker, "schedule", require_section("schedule", config["schedule"]), steps=steps)
+    section = require_section("stepper", config["stepper"])
+    stepper = STEPPERS[require_choice("stepper.name", section.pop("name", None), STEPPERS)]
+    for field in ("radius", "clip"):
+        if section.get(field) is not None:
+            require_number(f"stepper.{field}", section[field], above=0.0)
+    given = dict(fields=fields, objective=objective, optimizers=makers, schedule=schedule, unit=unit)
+    return call(stepper, "stepper", section, **given)

@@ -1,0 +1,82 @@
+"""Certify a saved controller again, on the same or on fresh evaluation states."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields, table
+from ocp_torch.certificate.certify import in_float64
+from ocp_torch.control.controller import Controller, load_controller
+from ocp_torch.control.policies import ControlLaw, control_laws
+from ocp_torch.errors import InputError, require_integer, require_section
+from ocp_torch.files.limits import require_modest_run
+from ocp_torch.files.reading import FOLDER, kind
+from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem
+from ocp_torch.runs.metrics import write_metrics
+from ocp_torch.runs.pictures import animate, require_gif
+from ocp_torch.runs.process import prepare
+from ocp_torch.training.health import hopeless
+from ocp_torch.training.settings import MOST_THREADS
+
+log = logging.getLogger(__name__)
+
+
+def load_run(config: dict) -> Controller:
+    """The controller of ``config["run"]``, a run's folder or a file; a user's own problem comes from ``config["problem"]``,
+    that is from the command line, never from the file."""
+    path = Path(str(config["run"]))
+    found = kind(path)
+    if found is None:
+        raise InputError(
+            f"run is {str(path)!r}, which does not exist; give a run's folder or its controller.safetensors."
+        )
+    if found == FOLDER:
+        path = path / "controller.safetensors"
+    problem = build_problem(config["problem"]) if config["problem"] else None
+    return load_controller(path, problem=problem)
+
+
+def settings_for(controller: Controller, config: dict) -> CertificateSettings:
+    """The settings of the controller's own run, with what ``config`` sets in their place. Raises `InputError` where the run's
+    own would take more than a file may ask for."""
+    own, asked = controller.config["certificate"], require_section("certificate", config["certificate"])
+    changed = {k: v for k, v in asked.items() if v is not None and k != "stage"}
+    section = require_section("certificate.stage", {} if asked.get("stage") is None else asked["stage"])
+    stage = {k: v for k, v in section.items() if v is not None}
+    named = {f"certificate.{k}" for k in changed} | {f"certificate.stage.{k}" for k in stage}
+    require_modest_run(config["run"], controller.config, named)
+    return build_certificate_settings(
+        {"certificate": {**own, **changed, "stage": {**(own.get("stage") or {}), **stage}}}
+    )
+
+
+def certify_saved(controller: Controller, settings: CertificateSettings, seed: int | None = None) -> Certificate:
+    """Print and return the certificate of ``controller``; with its own ``seed`` the numbers are those of its run."""
+    threads = controller.config.get("trainer", {}).get("threads", 1)
+    prepare(require_integer("trainer.threads", threads, 1, maximum=MOST_THREADS))
+    run = Run.read(controller.certificate)
+    if seed is not None:
+        run = Run(**{**vars(run), "seed": require_integer("seed", seed, 0)})
+    trained = Trained(controller.fields, controller.occupation, build_network(controller.model))
+    certificate = certify_fields(controller.problem, trained, controller.bounds, settings, run)
+    found = hopeless(controller.problem, controller.bounds, certificate, run.seed)
+    fresh = [note for note in found if note not in certificate.warnings]
+    certificate = replace(certificate, warnings=[*certificate.warnings, *fresh])
+    log.info("\n%s", table(certificate.to_dict(), certificate.searches))
+    if settings.trajectories:
+        write_metrics(controller.problem, law_of(controller), run.seed, None)
+    return certificate
+
+
+def law_of(controller: Controller) -> ControlLaw:
+    """The law that ``controller`` follows, in float64."""
+    laws = control_laws(controller.occupation, controller.problem, in_float64(controller.fields), controller.bounds)
+    return laws[controller.kind]
+
+
+def animated(controller: Controller, file: object, seed: int | None = None) -> None:
+    """Write the motion under ``controller`` as the GIF ``file``. Raises `InputError` for anything else."""
+    animate(controller.problem, law_of(controller), require_gif(controller.problem, file), seed or 0)
+    log.info("animated in %s", file)

@@ -1,0 +1,170 @@
+"""Certify a controller somebody brings: load it, train a `V` to judge it by, and put both into a certificate."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from ocp_torch.certificate import Certificate, CertificateSettings, Run, certify_policy, in_float64, table
+from ocp_torch.certificate.checks.possible import require_possible
+from ocp_torch.certificate.external.black_box import BlackBox, require_limit
+from ocp_torch.control.controller import Controller, problem_name
+from ocp_torch.control.policies import ControlLaw, control_laws
+from ocp_torch.errors import InputError, require_flag, require_integer
+from ocp_torch.fields import Fields
+from ocp_torch.fields.fields import VALUE, cost_unit
+from ocp_torch.maths.calculus import Field
+from ocp_torch.maths.sampling import SAMPLERS, derive_seed, scrambled_sobol
+from ocp_torch.maths.supremum import batched
+from ocp_torch.objectives import Dual
+from ocp_torch.problems import Problem
+from ocp_torch.problems.constants import Bounds, resolve_bounds
+from ocp_torch.runs import figures
+from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem
+from ocp_torch.runs.loading import load_law, load_saved
+from ocp_torch.runs.process import prepare
+from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
+from ocp_torch.training.batches import Batches
+from ocp_torch.training.budgets import fill
+
+log = logging.getLogger(__name__)
+
+# Branch of the seed tree for the V trained here, beside those of runs, evaluation and the stage.
+JUDGE_STREAM = 4
+# States at which a controller trained under another limit is held against the problem's.
+LIMIT_PROBES = 2**14
+MODEL = {"name": "mlp", "modes": None, "waves": None, "width": None, "depth": 3, "activation": None, "gated": None}
+
+
+def certify(
+    problem: Problem,
+    controller: Callable | Controller,
+    value: Field | Controller | None = None,
+    settings: CertificateSettings | None = None,
+    seed: int = 0,
+    train_steps: int | None = None,
+) -> Certificate:
+    """What ``controller`` costs on ``problem``, and how far from optimal it can be.
+
+    ``controller`` maps states ``(N, d)`` in the unit cell to controls ``(N, m)``: any function of tensors or arrays, or a
+    `Controller` of ours. ``value`` is a `V` to judge it by, ``(N, d) -> (N,)`` and smooth, or a `Controller` that holds
+    one; where it is `None` one is trained by the dual, for ``train_steps`` (default: by dimension; 0 for none, and then
+    there is no lower bound). Raises `InputError` where the controller or the value fails.
+    """
+    require_integer("seed", seed, 0)
+    if not problem.evaluable:
+        raise InputError(
+            "problem is a data set, on which no given controller can be certified: nothing can be simulated."
+        )
+    defaults = fill({"model": dict(MODEL), "trainer": {}, "optimizer": {}, "certificate": {}}, problem)
+    settings = settings or build_certificate_settings(defaults)
+    bounds = resolve_bounds(problem)
+    network = build_network(defaults["model"])
+    law = law_of(controller, problem)
+    steps = defaults["trainer"]["steps"] if train_steps is None else require_integer("train_steps", train_steps, 0)
+    run = Run(problem_name(problem), "given", seed)
+    if value is None and steps:
+        batch, lr, sampler = defaults["trainer"]["batch"], defaults["optimizer"]["lr"], defaults["sampler"]["name"]
+        value = in_float64(train_value(problem, bounds, network, steps, batch, lr, sampler, seed)).value
+        run = Run(problem_name(problem), "given", seed, steps, steps * batch)
+    elif value is not None:
+        value = value_of(value, problem)
+    return certify_policy(problem, law, value, network, bounds, settings, run)
+
+
+def train_value(
+    problem: Problem,
+    bounds: Bounds,
+    network: Callable[..., nn.Module],
+    steps: int,
+    batch: int,
+    lr: float,
+    sampler: str,
+    seed: int,
+) -> Fields:
+    """A `V` by the dual, with the defaults of a run."""
+    fields = Fields.build(problem, (VALUE,), network, derive_seed(seed, JUDGE_STREAM, 0))
+    objective = Dual(problem, bounds)
+    states = SAMPLERS[sampler](problem.dim, derive_seed(seed, JUDGE_STREAM, 1), torch.float32)
+    batches = Batches(problem, fields, objective, states, batch, derive_seed(seed, JUDGE_STREAM, 2))
+    makers = {player: optimizer_maker("soap", lr, betas=(0.95, 0.95)) for player in objective.players}
+    stepper = Simultaneous(fields, objective, makers, schedule_maker("cosine", steps), unit=cost_unit(problem))
+    average = averaged(fields, decay=0.98)
+    for step in range(steps):
+        objective.progress = step / steps
+        stepper.step(batches.draw, lambda: average.update_parameters(fields))
+    return average.module
+
+
+def law_of(controller: Callable | Controller, problem: Problem) -> ControlLaw:
+    """A law in float64: the networks of a `Controller` of ours, or a `BlackBox` around anything else."""
+    if not isinstance(controller, Controller):
+        return BlackBox(controller, problem)
+    if (controller.problem.dim, controller.problem.control_dim) != (problem.dim, problem.control_dim):
+        raise InputError(
+            f"the controller is for d = {controller.problem.dim} and m = {controller.problem.control_dim}, "
+            f"but the problem has d = {problem.dim} and m = {problem.control_dim}."
+        )
+    fields = in_float64(controller.fields)
+    law = control_laws(controller.occupation, controller.problem, fields, controller.bounds)[controller.kind]
+    if controller.problem.control_limit != problem.control_limit:  # its own limit it obeys by itself
+        x = scrambled_sobol(LIMIT_PROBES, problem.dim, 0, torch.float64)
+        with torch.no_grad():
+            require_limit(batched(law, x), x, problem.control_limit)
+    return law
+
+
+def value_of(value: Field | Controller, problem: Problem) -> Field:
+    """`V` in float64, tried on a few states."""
+    if isinstance(value, Controller):
+        if value.fields.value is None:
+            raise InputError("value is a controller without V; give one trained by dual or pd.")
+        value = in_float64(value.fields).value
+    elif isinstance(value, nn.Module):
+        value = in_float64(value)
+    x = torch.full((2, problem.dim), 0.25, dtype=torch.float64)
+    try:
+        out = value(x)
+    except Exception as error:  # whatever a stranger's code may raise
+        raise InputError(f"value raised {type(error).__name__}: {error}.") from None
+    if not isinstance(out, Tensor) or out.shape != (2,) or not bool(torch.isfinite(out).all()):
+        shape = tuple(getattr(out, "shape", ()))
+        raise InputError(f"value gave {shape} for states (2, {problem.dim}), but must give finite numbers (N,).")
+    return value
+
+
+def read(config: dict) -> dict:
+    """The arguments of `certify` that the plain ``config`` of the command line names; only it may name code to run."""
+    problem = build_problem(config["problem"])
+    filled = fill({"model": dict(MODEL), "trainer": {}, "optimizer": {}, "certificate": config["certificate"]}, problem)
+    train = require_flag("train", config["train"])
+    if config["steps"] is not None:
+        require_integer("steps", config["steps"], 1)
+    settings = build_certificate_settings(filled)
+    require_possible(problem, settings, trains_value=False)  # a given controller's bounds are not proved
+    controller = load_law(config["controller"], problem)
+    law_of(controller, problem)
+    value = None if config["value"] is None else load_saved(Path(str(config["value"])), problem)
+    return {
+        "problem": problem,
+        "controller": controller,
+        "value": value,
+        "settings": settings,
+        "seed": require_integer("seed", config["seed"], 0),
+        "train_steps": config["steps"] if train else 0,
+    }
+
+
+def certify_configured(config: dict, folder: Path) -> Certificate:
+    """Certify what ``config`` names; print the table and leave `certificate.json` and its figure in ``folder``."""
+    prepare(1)
+    certificate = certify(**read(config))
+    certificate.save(folder / "certificate.json")
+    figures.save({"certificate": figures.interval(certificate.to_dict())}, folder / "figures")
+    log.info("\n%s", table(certificate.to_dict(), certificate.searches))
+    log.info("in %s", folder)
+    return certificate

@@ -1,0 +1,186 @@
+"""Figures of `V`, `u`, `mu` and the HJB slack: curves in one dimension, maps over two coordinates beyond."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from ocp_torch.certificate.certificate import LONGEST_NAME
+from ocp_torch.certificate.certify import in_float64
+from ocp_torch.certificate.lower.shifted import slack_function
+from ocp_torch.certificate.simulated.simulation import rate_at
+from ocp_torch.control.policies import NETWORK, control_laws, occupation_density
+from ocp_torch.errors import visible
+from ocp_torch.fields import Fields
+from ocp_torch.files.storage import write_atomically
+from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.supremum import batched
+from ocp_torch.problems import Problem
+from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.starts import initial_points
+
+LINE_POINTS, MAP_POINTS = 400, 80
+# Of the simulated occupation density: bins a coordinate by dimension, starts, steps of a trajectory, branch of the seeds.
+BINS, STARTS, FIGURE_STEPS, FIGURE_STREAM = {1: 50, 2: 20}, 2048, 16, 5
+TITLES = {
+    "value": "V",
+    "control_value": "u from V",
+    "control_density": "u = w / mu",
+    "occupation": "mu",
+    "slack": "HJB slack Q",
+}
+
+
+def quantities(problem: Problem, fields: Fields, bounds: Bounds, occupation: str | None) -> dict[str, tuple]:
+    """Name -> (learned function, exact function or None), for what the fields give."""
+    fields = in_float64(fields)
+    laws = control_laws(occupation, problem, fields, bounds)
+    drawn: dict[str, tuple] = {}
+    if fields.value is not None:
+        drawn["value"] = (fields.value, problem.exact_value)
+        if problem.evaluable:
+            drawn["slack"] = (slack_function(problem, fields.value), None)
+    for kind, law in laws.items():
+        if kind != "value" or problem.knows_control_matrix:
+            drawn[f"control_{kind}"] = (law, problem.exact_control)
+    if occupation is not None and (problem.evaluable or occupation == NETWORK):
+        drawn["occupation"] = (occupation_density(occupation, problem, fields, bounds), problem.exact_occupation)
+    if problem.dim in BINS and problem.evaluable:
+        learned, exact = drawn.get("occupation", (None, problem.exact_occupation))
+        drawn["occupation"] = (learned, exact, simulated_occupation(problem, next(iter(laws.values()))))
+    return drawn
+
+
+@torch.no_grad()
+def simulated_occupation(
+    problem: Problem, law: Callable[[Tensor], Tensor], seed: int = 0
+) -> Callable[[Tensor], Tensor]:
+    """A histogram of `mu^u`, for one or two coordinates: where the closed loop of ``law`` is at a time `T ~ Exp(rho)`.
+
+    Starts weigh `mu0`; their number and the bins are few enough for a fraction of a second.
+    """
+    bins = BINS[problem.dim]
+    points, start_mass = initial_points(problem, STARTS, 0, derive_seed(seed, FIGURE_STREAM), extra=1)
+    x0, times = points[:, :-1], -torch.log1p(-points[:, -1]) / problem.discount
+    _, end = rate_at(lambda x: (problem.velocity(x, law(x)), x[:, 0]), x0, problem.discount, times, FIGURE_STEPS)
+    cell = lambda x: ((x * bins).long().clamp(0, bins - 1) * bins ** torch.arange(problem.dim)).sum(dim=-1)
+    mass = torch.zeros(bins**problem.dim, dtype=torch.float64)
+    mass.index_add_(0, cell(end), start_mass)
+    density = mass * bins**problem.dim / STARTS
+    return lambda x: density[cell(x.remainder(1.0))]
+
+
+def draw(problem: Problem, fields: Fields, bounds: Bounds, occupation: str | None) -> dict[str, Figure]:
+    """A figure per quantity; in three and more dimensions a cut along the first two coordinates through 1/2."""
+    plot = _curve if problem.dim == 1 else _map
+    drawn = quantities(problem, fields, bounds, occupation)
+    return {name: plot(problem.dim, TITLES[name], *functions) for name, functions in drawn.items()}
+
+
+def interval(certificate: dict) -> Figure:
+    """The certificate (as a dict of its schema) on a line: bounds, `OPT` where known and performances, with their intervals.
+
+    What is much farther from the tightest of them than they are from one another is cut off, with an arrow and its value.
+    """
+    rows = [(f"{n} ≤ OPT", e, "C0") for n, e in certificate["lower"].items() if e]
+    rows += [(f"Perf, {n}", e, "C2") for n, e in certificate["perf"].items() if e]
+    rows += [(f"{n} ≤ Perf", e, "C4") for n, e in certificate.get("perf_lower", {}).items() if e]
+    rows += [(f"≤ {n}", e, "C3") for n, e in certificate["upper"].items() if e]
+    rows += [("doing nothing", e, "C7") for e in certificate["baseline"].values() if e]
+    figure = Figure(figsize=(7.0, 1.2 + 0.32 * max(len(rows), 1)), layout="constrained")
+    FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    lows, highs = ([e["value"] for e in certificate[side].values() if e] for side in ("lower", "perf"))
+    highs = highs or [e["value"] for e in certificate["upper"].values() if e]
+    ends = ([max(lows)] if lows else []) + ([min(highs)] if highs else [])
+    ends += [certificate["exact"]] if certificate["exact"] is not None else []
+    ends += [end for name, e, _ in rows if name.startswith("Perf") for end in e["interval"]]
+    left, right = min(ends, default=0.0), max(ends, default=1.0)
+    room = max(2.0 * (right - left), 1e-3 * max(abs(left), abs(right)), 1e-12)
+    left, right = left - room, right + room
+    axis.set_xlim(left, right)
+    for y, (_, e, color) in enumerate(rows):
+        outside = min(max(e["value"], left), right)
+        if outside != e["value"]:
+            marker, side = ("<", 1) if outside == left else (">", -1)
+            axis.plot(outside, y, marker, color=color, clip_on=False)
+            offset = {"xytext": (8 * side, 0), "textcoords": "offset points"}
+            at = "left" if side > 0 else "right"
+            axis.annotate(f"{e['value']:.5g}", (outside, y), va="center", ha=at, **offset)
+            continue
+        axis.errorbar(e["value"], y, xerr=0.5 * (e["interval"][1] - e["interval"][0]), fmt="o", capsize=3, color=color)
+    if certificate["exact"] is not None:
+        axis.axvline(certificate["exact"], color="k", linestyle=":", label="OPT")
+        axis.legend(loc="upper right")
+    # A name may come from a file: its signs are not a formula.
+    axis.set_yticks(range(len(rows)), [visible(name, LONGEST_NAME) for name, *_ in rows], parse_math=False)
+    axis.invert_yaxis()
+    title = f"{visible(certificate['problem'], LONGEST_NAME)}, {100 * certificate['confidence']:.4g} % intervals"
+    axis.set_title(title, parse_math=False)
+    return figure
+
+
+def save(figures: dict[str, Figure], folder: Path) -> None:
+    """Write `figures/<name>.png`."""
+    for name, figure in figures.items():
+        write_atomically(
+            folder / f"{name}.png", lambda path, figure=figure: figure.savefig(path, dpi=120, format="png")
+        )
+
+
+def _figure(columns: int):
+    figure = Figure(figsize=(5.2 * columns, 4.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(1, columns, squeeze=False)[0]
+
+
+def _components(function: Callable[[Tensor], Tensor | None], x: Tensor) -> Tensor | None:
+    """Values as columns ``(N, k)``; an infinite one becomes a gap in the plot."""
+    with torch.no_grad():
+        if function is None or function(x[:1]) is None:
+            return None
+        values = batched(function, x)
+    return values.reshape(len(x), -1).where(torch.isfinite(values.reshape(len(x), -1)), torch.nan)
+
+
+def _curve(dim: int, title: str, learned, exact, simulated=None) -> Figure:
+    x = torch.linspace(0.0, 1.0, LINE_POINTS, dtype=torch.float64).unsqueeze(-1)
+    figure, (axis,) = _figure(1)
+    forms = (("simulated", simulated, "C7"), ("learned", learned, "C0"), ("exact", exact, "k:"))
+    for label, function, form in forms:
+        values = _components(function, x)
+        if values is not None:
+            axis.plot(x, values, form, label=label)
+    if len(axis.lines) > 1:
+        axis.legend()
+    axis.set(title=title, xlabel="x")
+    return figure
+
+
+def _map(dim: int, title: str, learned, exact, simulated=None) -> Figure:
+    line = (torch.arange(MAP_POINTS, dtype=torch.float64) + 0.5) / MAP_POINTS
+    x = torch.full((MAP_POINTS**2, dim), 0.5, dtype=torch.float64)
+    x[:, :2] = torch.cartesian_prod(line, line)
+    panels = {"": _components(learned, x), ", exact": _components(exact, x), ", simulated": _components(simulated, x)}
+    panels = {suffix: values for suffix, values in panels.items() if values is not None}
+    # A control of several components is drawn as its size, with arrows for its first two.
+    sizes = {suffix: v.norm(dim=-1) if v.shape[1] > 1 else v[:, 0] for suffix, v in panels.items()}
+    low = min(float(s.nan_to_num(nan=torch.inf).min()) for s in sizes.values())
+    high = max(float(s.nan_to_num(nan=-torch.inf).max()) for s in sizes.values())
+    figure, axes = _figure(len(panels))
+    for axis, (suffix, values) in zip(axes, panels.items(), strict=True):
+        grid = sizes[suffix].reshape(MAP_POINTS, MAP_POINTS).T
+        image = axis.imshow(grid, origin="lower", extent=(0, 1, 0, 1), vmin=low, vmax=high)
+        if values.shape[1] > 1:
+            stride = MAP_POINTS // 16
+            arrows = values[:, :2].reshape(MAP_POINTS, MAP_POINTS, 2)[::stride, ::stride]
+            axis.quiver(line[::stride], line[::stride], arrows[..., 0].T, arrows[..., 1].T, color="w")
+        name = f"|{title}|" if values.shape[1] > 1 else title
+        axis.set(title=name + suffix, xlabel="$x_1$", ylabel="$x_2$")
+        figure.colorbar(image, ax=axis)
+    return figure

@@ -1,0 +1,103 @@
+"""Controllers by what the command line names: a function in a file, a run of ours, ONNX, TorchScript."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import torch
+
+from ocp_torch.control.controller import Controller, load_controller, problem_name
+from ocp_torch.errors import InputError, nearest
+from ocp_torch.files.reading import FOLDER, kind, require_file
+from ocp_torch.problems import PROBLEMS, Problem
+
+log = logging.getLogger(__name__)
+
+
+def load_law(source: str, problem: Problem) -> Callable | Controller:
+    """The controller the command line names: FILE.py:function, a run's folder or a file of ours, .onnx, or TorchScript.
+
+    A .py file is code, and so is TorchScript: it can write files by itself. Only what is trusted is named here; an .onnx
+    file, like one of ours, can do nothing but compute.
+    """
+    path, _, name = str(source).rpartition(":")
+    if path.endswith(".py"):
+        return _function(Path(path), name)
+    path = Path(str(source))
+    if path.suffix == ".py":
+        raise InputError(f"controller is {source!r}, but must name its function, as in {source}:function.")
+    found = kind(path)
+    if found is None:
+        raise InputError(
+            f"controller is {str(source)!r}, which does not exist; give FILE.py:function, a run's folder, a "
+            "controller.safetensors, an .onnx or, if you trust it with your files, a TorchScript file."
+        )
+    if found == FOLDER or path.suffix == ".safetensors":
+        return load_saved(path, problem)
+    require_file(path)
+    return _onnx(path) if path.suffix == ".onnx" else _torchscript(path)
+
+
+def load_saved(path: Path, problem: Problem) -> Controller:
+    """A controller of ours, by its file or its run's folder; of the same problem, and for one of the package's, which the
+    file makes again, whatever its parameters were."""
+    file = path / "controller.safetensors" if kind(path) == FOLDER else path
+    if problem_name(problem) not in PROBLEMS:
+        return load_controller(file, problem=problem)
+    found = load_controller(file)
+    if type(found.problem) is not type(problem):
+        raise InputError(f"{file} belongs to {problem_name(found.problem)!r}, not to {problem_name(problem)!r}.")
+    return found
+
+
+def _function(path: Path, name: str) -> Callable:
+    if kind(path) is None:
+        raise InputError(f"controller names {path}, which does not exist.")
+    require_file(path)
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:  # whatever a stranger's code may raise
+        raise InputError(f"{path} cannot be run: {type(error).__name__}: {error}.") from None
+    found = getattr(module, name, None)
+    if not callable(found):
+        known = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
+        raise InputError(f"{path} has no function {name!r}{nearest(name, known)}.")
+    return found
+
+
+def _onnx(path: Path) -> Callable:
+    try:
+        import onnxruntime
+    except ImportError:
+        raise InputError(f"{path} needs onnxruntime: pip install onnxruntime.") from None
+    try:
+        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        (entry,) = session.get_inputs()
+    except Exception as error:  # the runtime has no one type for a bad file
+        raise InputError(f"{path} is not a model with one input that onnxruntime can run: {error}.") from None
+    dtype = torch.float64 if "double" in entry.type else torch.float32
+    return lambda x: torch.from_numpy(session.run(None, {entry.name: x.to(dtype).numpy()})[0])
+
+
+def _torchscript(path: Path) -> Callable:
+    """A program of its own, which may write wherever the user may."""
+    warn_of_code(path)
+    try:
+        return torch.jit.load(str(path), map_location="cpu").eval()
+    except Exception as error:  # the loader has no one type for a bad file
+        reason = next(iter(str(error).splitlines()), "").split(". ")[0]
+        raise InputError(f"{path} is not a TorchScript file ({reason}).") from None
+
+
+@cache
+def warn_of_code(path: Path) -> None:
+    """Say once what TorchScript can do."""
+    log.warning(
+        "warning: %s is TorchScript, code that can write your files; load it if you trust it, or take ONNX.", path
+    )

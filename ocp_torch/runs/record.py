@@ -1,0 +1,83 @@
+"""Record a problem: draw states, evaluate, write the file that `problem=dataset` trains on."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ocp_torch.errors import InputError, require_flag, require_integer, require_number
+from ocp_torch.files.memory import require_memory
+from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.problems import Problem
+from ocp_torch.problems.recorded import recording
+from ocp_torch.problems.samples import Samples
+from ocp_torch.runs.build import build_problem
+
+log = logging.getLogger(__name__)
+
+# Branch of the seed tree for recorded states; states evaluated at once.
+RECORD_STREAM, CHUNK = 8, 4096
+
+
+@dataclass(frozen=True)
+class Recorder:
+    """What was asked for, checked: ``count`` independent samples of ``problem`` into ``out``.
+
+    States are uniform, or, with ``contrast`` `k` in (0, 1), of density `prod_i (1 + k cos(2 pi x_i))`, which is recorded.
+    """
+
+    problem: Problem
+    count: int
+    out: Path
+    seed: int
+    divergences: bool
+    contrast: float
+
+    def run(self) -> Path:
+        """Draw, evaluate, write; the file."""
+        x = self._states()
+        parts = [Samples.of(self.problem, part, divergences=self.divergences) for part in x.split(CHUNK)]
+        problem = self.problem
+        numbers = {name: getattr(problem, name) for name in ("discount", "exponent", "control_limit")}
+        density = None if self.contrast == 0.0 else self._density(x)
+        recording.write(self.out, Samples.concatenate(parts), numbers, density)
+        log.info("%s samples of d = %d, m = %d in %s", f"{self.count:,}", problem.dim, problem.control_dim, self.out)
+        return self.out
+
+    def _density(self, x: Tensor) -> Tensor:
+        return (1.0 + self.contrast * (2.0 * torch.pi * x).cos()).prod(dim=-1)
+
+    def _states(self) -> Tensor:
+        """Independent states: uniform, or by rejection, coordinate by coordinate."""
+        generator = torch.Generator().manual_seed(derive_seed(self.seed, RECORD_STREAM))
+        draw = lambda *shape: torch.rand(*shape, dtype=torch.float64, generator=generator)
+        x = draw(self.count, self.problem.dim)
+        wrong = torch.full(x.shape, self.contrast > 0.0)
+        while wrong.any():
+            fresh = draw(int(wrong.sum()))
+            kept = draw(len(fresh)) * (1.0 + self.contrast) <= 1.0 + self.contrast * (2.0 * torch.pi * fresh).cos()
+            at = wrong.nonzero()[kept]
+            x[at[:, 0], at[:, 1]] = fresh[kept]
+            wrong[at[:, 0], at[:, 1]] = False
+        return x
+
+
+def prepare(config: dict) -> Recorder:
+    """Check every field. Raises `InputError` for a wrong one."""
+    problem = build_problem(config["problem"])
+    if not problem.evaluable:
+        raise InputError("problem is a data set already; there is nothing to record from it.")
+    out = Path(str(config["out"]))
+    if out.suffix not in recording.SUFFIXES:
+        raise InputError(f"out is {str(out)!r}, but must end in {' or '.join(recording.SUFFIXES)}.")
+    divergences = require_flag("divergences", config["divergences"]) and problem.gives_divergences
+    count = require_integer("samples", config["samples"], recording.FEWEST, maximum=10**8)
+    d, m = problem.dim, problem.control_dim
+    require_memory("samples", count, 8 * (2 * d + d * m + m + 3))  # x, f, a, B, mu0 and divergences in float64
+    seed = require_integer("seed", config["seed"], 0)
+    contrast = require_number("contrast", config["contrast"], at_least=0.0, at_most=0.95)
+    return Recorder(problem, count, out, seed, divergences, contrast)

@@ -1,0 +1,155 @@
+"""Curves of several seeds as a table and as plots."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ocp_torch.studies.benchmark.curve import Curve, Point, median_and_spread
+
+# The certified gaps of all are held against that of the paper's primal-dual.
+BASELINE = "kernel pd"
+# "Reaches 1 %" in the table: the performance stays within so much of the optimum.
+TOLERANCE = 0.01
+
+
+def reference(curves: list[Curve], exact: float | None) -> tuple[float, str]:
+    """What sub-optimality is relative to: `OPT`, or where it is unknown the best lower bound any run certified."""
+    if exact is not None:
+        return exact, "OPT"
+    bounds = [p.numbers[n] for c in curves for p in c.points for n in ("F_M", "shifted") if n in p.numbers]
+    return max(bounds, default=math.nan), "the best lower bound found"
+
+
+def by_contender(curves: list[Curve]) -> dict[str, list[Curve]]:
+    names = dict.fromkeys(c.contender for c in curves)
+    return {name: [c for c in curves if c.contender == name] for name in names}
+
+
+def table(curves: list[Curve], exact: float | None) -> str:
+    """A Markdown table: at each contender's end, median over seeds and, where there are several, smallest to largest."""
+    optimum, what = reference(curves, exact)
+    off = lambda number: 100.0 * (number / optimum - 1.0)
+    lines = [
+        f"Per cent are relative to {what} = {optimum:.8g}; the gap is that of the full certificate at the end, relative "
+        f"to the lower bound, and `times smaller` holds its median against that of {BASELINE}; where a certificate uses no "
+        "upper bound (a controller that jumps), (min(J, G) - F_M) / F_M stands in for it, marked *; seconds are CPU "
+        "seconds of training, those of the certificate after the sign +.",
+        "",
+        "| contender | samples | seconds | F_M | J | G | Perf | gap, certified | times smaller "
+        "| 1 % on Perf after samples | seconds |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    widest = gaps(by_contender(curves).get(BASELINE, []))
+    for name, own in by_contender(curves).items():
+        ends = [c.points[-1] for c in own]
+        number = lambda key, ends=ends: spread([off(p.numbers[key]) for p in ends if key in p.numbers], "+.3g", " %")
+        certified = gaps(own)
+        ratio = median_and_spread(widest)[0] / median_and_spread(certified)[0] if widest and certified else math.nan
+        hits = [c.first_within(TOLERANCE, optimum) for c in own]
+        reached = [hit for hit in hits if hit is not None]
+        few = "" if len(reached) == len(own) else f" ({len(reached)} of {len(own)} seeds)"
+        seconds = spread([p.seconds for p in ends], ".3g", "")
+        later = [c.certificate_seconds for c in own if c.certificate_seconds > 0.0]
+        cells = [
+            name,
+            spread([float(p.samples) for p in ends], ",.0f", ""),
+            seconds + (f" + {median_and_spread(later)[0]:.3g}" if later else ""),
+            number("F_M"),
+            number("J"),
+            number("G"),
+            spread([off(p.perf) for p in ends if math.isfinite(p.perf)], "+.3g", " %"),
+            spread(certified, ".3g", " %") + ("*" if certified and any(c.certified is None for c in own) else ""),
+            f"{ratio:.3g}" if math.isfinite(ratio) else "-",
+            spread([float(p.samples) for p in reached], ",.0f", "") + few if reached else "not reached",
+            spread([p.seconds for p in reached], ".3g", "") if reached else "-",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join([*lines, "", *winners(curves, optimum)])
+
+
+def winners(curves: list[Curve], optimum: float) -> list[str]:
+    """Who reaches the tolerance first with every seed, in samples and in CPU seconds, by the median over seeds."""
+    reached = {
+        name: [hit for c in own if (hit := c.first_within(TOLERANCE, optimum)) is not None]
+        for name, own in by_contender(curves).items()
+    }
+    sure = {name: hits for name, hits in reached.items() if len(hits) == len(by_contender(curves)[name])}
+    if not sure:
+        return []
+    found = []
+    for unit, measure in (("samples", lambda p: p.samples), ("seconds", lambda p: p.seconds)):
+        medians = {name: median_and_spread([measure(hit) for hit in hits])[0] for name, hits in sure.items()}
+        first = min(medians, key=medians.get)
+        found.append(f"1 % on Perf in the fewest {unit}: {first}, {medians[first]:,.6g}.")
+    return found
+
+
+def gaps(curves: list[Curve]) -> list[float]:
+    """The certified gaps, in per cent; where a certificate has none, that of the bounds themselves, if there is one."""
+    found = [c.certified if c.certified is not None else c.points[-1].gap for c in curves]
+    return [100.0 * gap for gap in found if math.isfinite(gap)]
+
+
+def spread(values: list[float], form: str, unit: str) -> str:
+    """`median [smallest, largest]`, or the one value, or a dash."""
+    if not values:
+        return "-"
+    middle, low, high = (format(v, form) for v in median_and_spread(values))
+    return f"{middle}{unit}" + (f" [{low}, {high}]" if low != high else "")
+
+
+def plot(curves: list[Curve], exact: float | None) -> Figure:
+    """Sub-optimality of the controller and the gap of the bounds, against samples and against CPU seconds."""
+    optimum, what = reference(curves, exact)
+    rows = {
+        f"Perf above {what}, %": lambda p: 100.0 * (p.perf / optimum - 1.0),
+        "(min(J, G) - F_M) / F_M, %": lambda p: 100.0 * p.gap,
+    }
+    columns = {"samples": lambda p: float(p.samples), "CPU seconds of training": lambda p: p.seconds}
+    figure = Figure(figsize=(11.0, 8.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, 2, sharey="row", sharex="col")
+    for i, (label, height) in enumerate(rows.items()):
+        for j, (unit, place) in enumerate(columns.items()):
+            for k, (name, own) in enumerate(by_contender(curves).items()):
+                draw(axes[i, j], own, place, height, f"C{k}", name)
+            axes[i, j].set(xscale="log", yscale="log", xlabel=unit if i == 1 else "", ylabel=label if j == 0 else "")
+            axes[i, j].grid(alpha=0.3)
+    axes[0, 0].legend(fontsize=8)
+    return figure
+
+
+def draw(axis, curves: list[Curve], place, height, color: str, name: str) -> None:
+    """The median over seeds at each point, and the range between seeds."""
+    count = min(len(c.points) for c in curves)
+    at = lambda measure, i: [measure(c.points[i]) for c in curves]
+    x = np.array([np.median(at(place, i)) for i in range(count)])
+    values = np.array([at(height, i) for i in range(count)])
+    values[~np.isfinite(values) | (values <= 0.0)] = np.nan
+    usable = ~np.isnan(values).any(axis=1) & (x > 0.0)
+    if not usable.any():
+        return
+    x, values = x[usable], values[usable]
+    axis.plot(x, np.median(values, axis=1), color=color, label=name, marker=".")
+    axis.fill_between(x, values.min(axis=1), values.max(axis=1), color=color, alpha=0.2)
+
+
+def save(curves: list[Curve], exact: float | None, folder: Path) -> str:
+    """Write `benchmark.md` and `curves.json`; returns the table."""
+    folder.mkdir(parents=True, exist_ok=True)
+    text = table(curves, exact)
+    (folder / "benchmark.md").write_text(text + "\n")
+    (folder / "curves.json").write_text(json.dumps([asdict(c) for c in curves], indent=1, default=float) + "\n")
+    return text
+
+
+def load(path: Path) -> list[Curve]:
+    """The curves `save` wrote."""
+    return [Curve(**{**c, "points": [Point(**p) for p in c["points"]]}) for c in json.loads(path.read_text())]

@@ -1,0 +1,122 @@
+r"""A field in the space, for `R` independent runs: by truncated features, or exactly by the kernel at all past states.
+
+Both move along `sum_a c_a d_a Phi(x)` at one state `x` (`d_0 Phi = Phi`), whose coefficients a rule gives, and tell their
+jets at one state. ``mark`` and ``restore`` go back to where a look-ahead began.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ocp_torch.fields.sobolev import SobolevFeatures, SobolevField
+from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
+from ocp_torch.studies.kernel.stream import Datum
+
+
+class FeatureExpansion:
+    """`V = theta . features`: a step costs the same at every `n`. ``radius`` is that of the ball it is projected on."""
+
+    def __init__(self, features: SobolevFeatures, runs: int, outputs: int, radius: float | None = None) -> None:
+        self.features, self.radius = features, radius
+        self.theta = np.zeros((runs, features.count, outputs))
+        self.total, self.count = np.zeros_like(self.theta), 0
+
+    def jet(self, datum: Datum) -> np.ndarray:
+        """Value and gradient at the datum's state, ``(R, 1 + d, o)``."""
+        return np.matmul(datum.jets, self.theta)
+
+    def move(self, step: np.ndarray, datum: Datum) -> None:
+        """Add the element with coefficients ``step`` ``(R, 1 + d, o)`` at the datum's state, and project."""
+        self.theta = self.theta + np.matmul(datum.jets.transpose(0, 2, 1), step)
+        if self.radius is not None:
+            norm = np.sqrt(np.square(self.theta).sum(axis=(1, 2), keepdims=True))
+            self.theta *= np.minimum(1.0, self.radius / np.maximum(norm, 1e-300))
+
+    def mark(self) -> np.ndarray:
+        return self.theta
+
+    def restore(self, mark: np.ndarray) -> None:
+        self.theta = mark
+
+    def visit(self) -> None:
+        """Count the present iterate in the average."""
+        self.total += self.theta
+        self.count += 1
+
+    def field(self, run: int, scalar: bool) -> SobolevField:
+        """The averaged iterate of one run as a network; ``(N,)`` if ``scalar``."""
+        return as_field(self.features, self.total[run] / max(self.count, 1), scalar)
+
+
+class KernelExpansion:
+    """`V = sum_k alpha_k Phi(x_k) + sum_i beta_ki d_i Phi(x_k)` (Propositions 5, 7 and 10): a step costs `O(n)`.
+
+    Holds ``capacity`` states at most. The norm is kept up to date by the reproducing property.
+    """
+
+    def __init__(
+        self, kernel: BernoulliKernel, dim: int, runs: int, outputs: int, capacity: int, radius: float | None = None
+    ) -> None:
+        self.kernel, self.radius, self.known = kernel, radius, 0
+        self.x = np.zeros((runs, capacity, dim))
+        self.coefficients = np.zeros((runs, capacity, 1 + dim, outputs))
+        self.total, self.count = np.zeros_like(self.coefficients), 0
+        self.squared_norm = np.zeros(runs)
+        self._own = kernel.jets(np.zeros(dim), np.zeros(dim))
+
+    def jet(self, datum: Datum) -> np.ndarray:
+        """Value and gradient at the datum's state, ``(R, 1 + d, o)``."""
+        return self.at(datum.x[:, None])[:, 0]
+
+    def at(self, x: np.ndarray, average: bool = False) -> np.ndarray:
+        """Jets ``(R, N, 1 + d, o)`` at states ``(R or 1, N, d)`` of the present, or of the averaged, iterate."""
+        n = self.known
+        coefficients = self.total[:, :n] / max(self.count, 1) if average else self.coefficients[:, :n]
+        blocks = self.kernel.jets(self.x[:, None, :n], x[:, :, None])  # (R, N, n, 1 + d, 1 + d)
+        runs, states, _, width, _ = blocks.shape
+        rows = blocks.reshape(runs, states, n * width, width).swapaxes(-1, -2)
+        return np.matmul(rows, coefficients.reshape(len(self.x), 1, n * width, self.coefficients.shape[-1]))
+
+    def move(self, step: np.ndarray, datum: Datum) -> None:
+        """Add the element with coefficients ``step`` ``(R, 1 + d, o)`` at the datum's state, and project."""
+        if self.radius is not None:
+            own = np.einsum("rao,ab,rbo->r", step, self._own, step)
+            self.squared_norm = self.squared_norm + 2.0 * (self.jet(datum) * step).sum(axis=(1, 2)) + own
+        self.x[:, self.known] = datum.x
+        self.coefficients[:, self.known] = step
+        self.known += 1
+        if self.radius is not None:
+            norm = np.sqrt(np.maximum(self.squared_norm, 1e-300))
+            factor = np.minimum(1.0, self.radius / norm)
+            self.coefficients[:, : self.known] *= factor[:, None, None, None]
+            self.squared_norm = self.squared_norm * factor**2
+
+    def mark(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.coefficients[:, : self.known].copy(), self.squared_norm
+
+    def restore(self, mark: tuple[np.ndarray, np.ndarray]) -> None:
+        """States met since then stay, with the coefficient 0: the average may hold them."""
+        coefficients, self.squared_norm = mark
+        kept = coefficients.shape[1]
+        self.coefficients[:, :kept] = coefficients
+        self.coefficients[:, kept : self.known] = 0.0
+
+    def visit(self) -> None:
+        """Count the present iterate in the average."""
+        self.total[:, : self.known] += self.coefficients[:, : self.known]
+        self.count += 1
+
+    def field(self, run: int, scalar: bool, features: SobolevFeatures) -> SobolevField:
+        """The averaged iterate of one run, as seen by ``features``: its Fourier coefficients are exact."""
+        jets = features.jets(torch.from_numpy(self.x[run, : self.known])).numpy()
+        theta = np.einsum("kaf,kao->fo", jets, self.total[run, : self.known] / max(self.count, 1))
+        return as_field(features, theta, scalar)
+
+
+@torch.no_grad()
+def as_field(features: SobolevFeatures, theta: np.ndarray, scalar: bool) -> SobolevField:
+    """The float64 network with coefficients ``theta`` ``(F, o)``, in units of 1."""
+    field = SobolevField.of(features, None if scalar else theta.shape[1]).double()
+    field.coefficients.copy_(torch.from_numpy(theta[:, 0] if scalar else theta.T))
+    return field.requires_grad_(False)

@@ -1,0 +1,113 @@
+"""The recipes carried out: the measured curves, the fields to draw, the exact kernel beside its truncation, and costs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from ocp_torch.fields import Fields
+from ocp_torch.fields.sobolev import SobolevFeatures
+from ocp_torch.problems import Circle
+from ocp_torch.problems.constants import Bounds, resolve_bounds
+from ocp_torch.studies.benchmark.kernels import OCCUPATION
+from ocp_torch.studies.benchmark.measure import Judge, relative
+from ocp_torch.studies.kernel import Iteration
+from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
+from ocp_torch.studies.paper.recipes import DISCOUNT, OCCUPATION_BOUND, VALUE_BOUND, Recipe
+
+Tick = Callable[[int], None]
+
+# Parts of a window whose time is taken.
+PARTS = 5
+
+
+def circle() -> tuple[Circle, Bounds]:
+    """The paper's example and its constants."""
+    problem = Circle(DISCOUNT)
+    return problem, resolve_bounds(problem, occupation_bound=OCCUPATION_BOUND, value_bound=VALUE_BOUND)
+
+
+@dataclass
+class History:
+    """One recipe's numbers, per cent of `OPT`, at ``[look][seed]``; the first seed's fields to draw; CPU seconds."""
+
+    recipe: Recipe
+    numbers: dict[int, list[dict[str, float]]] = field(default_factory=dict)
+    fields: dict[int, Fields] = field(default_factory=dict)
+    train_seconds: float = 0.0
+    measure_seconds: float = 0.0
+
+
+def carry_out(recipe: Recipe, seeds: tuple[int, ...], modes: int, tick: Tick = lambda steps: None) -> History:
+    """All ``seeds`` of one recipe at once, with truncated features. ``tick`` is told the steps made."""
+    problem, bounds = circle()
+    iteration = Iteration(problem, recipe.method, bounds, seeds, features=SobolevFeatures(1, modes=modes))
+    judge, history, sizes = Judge(problem, bounds), History(recipe), recipe.sizes
+    for look in recipe.looks:
+        started = time.process_time()
+        while iteration.n < look:
+            part = sizes[iteration.n : min(iteration.n + 1000, look)]
+            iteration.advance(part)
+            tick(len(part))
+        trained = time.process_time()
+        history.numbers[look] = []
+        for run in range(len(seeds)):
+            fields = iteration.fields(run)
+            measured = judge(fields, OCCUPATION[recipe.method])
+            history.numbers[look].append({k: relative(v, problem.exact_optimum) for k, v in measured.items()})
+            if run == 0 and look in recipe.drawn:
+                history.fields[look] = fields
+        history.train_seconds += trained - started
+        history.measure_seconds += time.process_time() - trained
+    return history
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The exact kernel beside its truncation on the same samples: how far the averaged fields are apart, and the cost."""
+
+    method: str
+    steps: int
+    modes: int
+    differences: dict[str, float]  # field -> largest difference on a grid, relative to the field's largest value
+    costs: dict[str, list[tuple[int, float]]]  # exact, truncated -> n, and CPU seconds per step there
+
+
+def compare_with_exact(
+    recipe: Recipe, steps: int, modes: int, seed: int, windows: int = 10, tick: Tick = lambda steps: None
+) -> Comparison:
+    """The first ``steps`` of a recipe in both forms, timed over consecutive ``windows``."""
+    problem, bounds = circle()
+    make = lambda **form: Iteration(problem, recipe.method, bounds, (seed,), **form)
+    exact = make(kernel=BernoulliKernel(2), capacity=2 * steps)
+    truncated = make(features=SobolevFeatures(1, modes=modes))
+    forms = {"exact": exact, "truncated": truncated}
+    costs = {name: timed(form, recipe.sizes[:steps], windows, tick) for name, form in forms.items()}
+    grid = np.linspace(0.0, 1.0, 201)[None, :, None]
+    differences = {}
+    for name, network in truncated.fields(0).networks.items():
+        there = exact.expansions[name].at(grid, average=True)[0, :, 0, 0]
+        here = network(torch.from_numpy(grid[0])).reshape(-1).numpy()
+        differences[name] = float(np.abs(there - here).max() / np.abs(there).max())
+    return Comparison(recipe.method, steps, modes, differences, costs)
+
+
+def timed(iteration: Iteration, sizes: np.ndarray, windows: int, tick: Tick) -> list[tuple[int, float]]:
+    """Make all steps; at the end of each window, `n` and the CPU seconds per step of its fastest part.
+
+    The fastest of `PARTS`, because whatever else a machine does only ever slows a part down.
+    """
+    costs = []
+    for window in np.array_split(sizes, min(windows, len(sizes))):
+        per_step = []
+        for part in np.array_split(window, min(PARTS, len(window))):
+            started = time.process_time()
+            iteration.advance(part)
+            per_step.append((time.process_time() - started) / len(part))
+            tick(len(part))
+        costs.append((iteration.n, min(per_step)))
+    return costs

@@ -1,0 +1,82 @@
+"""What a grid can solve: few dimensions, enough memory, finite and periodic data, the power cost."""
+
+from __future__ import annotations
+
+import torch
+
+from ocp_torch.errors import InputError, require_integer, require_number
+from ocp_torch.problems.problem import Problem
+from ocp_torch.studies.reference.grid import OFFSETS, Grid
+from ocp_torch.studies.reference.semi_lagrangian import PIECE, running_cost
+
+MOST_DIMENSIONS = 3
+FEWEST_NODES = 8
+# Ratio of the sides of successive grids, and the finest side by dimension.
+RATIO = {1: 2.0, 2: 2.0, 3: 1.5}
+FINEST = {1: 1024, 2: 192, 3: 40}
+# Index, weights and their copies, per entry of the interpolation matrix.
+BYTES_PER_ENTRY = 40
+TOLERANCE = 1e-6
+
+
+def grid_sides(dim: int, side: int | None, memory: float) -> tuple[int, int, int]:
+    """Nodes per coordinate of the three grids, the finest ``side`` (None: by dimension); ``memory`` in gigabytes."""
+    if dim > MOST_DIMENSIONS:
+        raise InputError(
+            f"problem.dim is {dim}, but a grid needs at most {MOST_DIMENSIONS} coordinates; beyond, certificates remain."
+        )
+    ratio = RATIO[dim]
+    finest = FINEST[dim] if side is None else require_integer("side", side, 1)
+    sides = tuple(round(finest / ratio**k) for k in (2, 1, 0))
+    if sides[0] < FEWEST_NODES:
+        least = round(FEWEST_NODES * ratio**2)
+        raise InputError(
+            f"side is {finest}, but must be at least {least}: the coarsest of the three grids has {sides[0]}."
+        )
+    require_number("memory", memory, above=0.0)
+    entries = float(finest) ** dim * OFFSETS**dim
+    most = min(memory * 1e9 / BYTES_PER_ENTRY, 2.0**31 - 1.0)
+    if entries > most:
+        fits = int((most / OFFSETS**dim) ** (1.0 / dim))
+        need = entries * BYTES_PER_ENTRY / 1e9
+        raise InputError(
+            f"side is {finest}, which in {dim} dimensions needs about {need:.3g} GB, but memory is {memory:g}; "
+            f"at most {fits} nodes per coordinate fit."
+        )
+    return sides
+
+
+def require_solvable(problem: Problem, grid: Grid) -> None:
+    """Raise `InputError` unless the problem's functions have their shapes, are finite at the nodes of ``grid`` and have
+    period 1, and its control costs `|u|^q / q`."""
+    d, m = problem.dim, problem.control_dim
+    shapes = {"state_cost": (), "drift": (d,), "control_matrix": (d, m), "initial_density": ()}
+    probe = torch.rand(256, d, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    nodes = grid.nodes()
+    for name, shape in shapes.items():
+        function = getattr(problem, name)
+        first = function(probe)
+        if tuple(first.shape) != (len(probe), *shape):
+            wanted = ", ".join(["N", *map(str, shape)])
+            raise InputError(
+                f"{name} gives shape {tuple(first.shape)} at {len(probe)} states, but must give ({wanted})."
+            )
+        size = 0.0
+        for part in (probe, *nodes.split(PIECE)):
+            values = function(part).flatten(1) if shape else function(part).unsqueeze(-1)
+            bad = ~torch.isfinite(values).all(dim=-1)
+            if bad.any():
+                at = [round(c, 6) for c in part[bad][0].tolist()]
+                raise InputError(f"{name} is {values[bad][0].tolist()} at x = {at}, but must be finite everywhere.")
+            size = max(size, float(values.abs().max()))
+        for k in range(d):
+            moved = probe.clone()
+            moved[:, k] += 1.0
+            if float((function(moved) - first).abs().max()) > TOLERANCE * max(size, 1e-12):
+                raise InputError(f"{name} does not have period 1 in x_{k + 1}, but all of a problem on the torus must.")
+    u = 3.0 * torch.randn(64, m, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    if problem.control_limit is not None:
+        u = problem.control_limit * u / (1.0 + u.norm(dim=-1, keepdim=True))
+    own, power = problem.control_cost.cost(u), running_cost(u, problem.exponent)
+    if not torch.allclose(own, power, rtol=1e-8, atol=1e-12):
+        raise InputError(f"{type(problem).__name__} has a control cost of its own, but the grid knows only |u|^q / q.")

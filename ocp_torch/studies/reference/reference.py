@@ -1,0 +1,146 @@
+"""A reference for `V*` and `OPT` in one to three dimensions, from grids alone: no network, no objective, no certificate."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ocp_torch.problems.problem import Problem
+from ocp_torch.studies.reference.between import look_between
+from ocp_torch.studies.reference.checks import grid_sides, require_solvable
+from ocp_torch.studies.reference.grid import Grid
+from ocp_torch.studies.reference.richardson import Extrapolation, extrapolate
+from ocp_torch.studies.reference.semi_lagrangian import CLIP, PIECE, GridSolution, SemiLagrangian, minimiser
+
+# The step moves a typical state by this many cells, and is at most this share of 1 / rho on the coarsest grid.
+CELLS, LONGEST = 1.0, 0.25
+# Policy iteration ends where one more policy changes V by less, relative to the oscillation of f.
+TOLERANCE, ROUGH = 1e-7, 1e-3
+SPEED_SIDE = {1: 64, 2: 32, 3: 16}
+SPEED_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What three grids say of ``problem``.
+
+    ``optimum`` is `OPT` extrapolated, ``error`` its stated error, ``order`` the order observed (see `richardson`); an error
+    that nobody knows is `None`, and ``unknown`` says why;
+    ``sides`` are nodes per coordinate and ``estimates`` the `OPT` of the three grids; ``value_change`` the largest change
+    of `V` from the second grid to the finest; ``unsettled`` is the part of ``error`` that iterations stopped early leave;
+    ``value`` ``(side,) * d`` is `V` on the finest grid.
+    """
+
+    problem: Problem
+    optimum: float
+    error: float | None
+    order: float
+    sides: tuple[int, ...]
+    estimates: tuple[float, ...]
+    value_change: float
+    unsettled: float
+    solution: GridSolution
+    unknown: str | None = None
+
+    @property
+    def value(self) -> Tensor:
+        return self.solution.value.reshape([self.sides[-1]] * self.problem.dim)
+
+    @property
+    def control(self) -> Tensor:
+        """The controls of the finest grid, each held for one step, ``(side,) * d + (m,)``."""
+        return self.solution.control.reshape(*self.value.shape, -1)
+
+    def interpolate(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """`V` ``(N,)`` and `u = grad R*(-B^T grad V / rho)` ``(N, m)`` at states ``(N, d)``, any reals.
+
+        Within two cells of a kink the control is a mean of those on its sides.
+        """
+        pieces = [_interpolated(self.problem, self.solution, part) for part in x.double().split(PIECE)]
+        return torch.cat([v for v, _ in pieces]), torch.cat([u for _, u in pieces])
+
+
+def solve_reference(problem: Problem, side: int | None = None, memory: float = 4.0) -> Reference:
+    """Solve ``problem`` on three grids, the finest with ``side`` nodes per coordinate (None: 1024, 192, 40 by dimension).
+
+    ``memory`` in gigabytes is what the finest may take. Raises `InputError` for more than three dimensions, a grid that
+    does not fit, functions that are not finite or not periodic, and a control cost other than `|u|^q / q`.
+    """
+    sides = grid_sides(problem.dim, side, memory)
+    with torch.no_grad():
+        require_solvable(problem, Grid(problem.dim, sides[0]))
+        start, pace = _speed(problem, sides[0])
+        rise = float(start.value.max() - start.value.min())
+        solutions = []
+        for n in sides:
+            grid = Grid(problem.dim, n)
+            value, control = _carried(start, grid)
+            # The monotone scheme first: from a rough policy the clipped one may not settle.
+            rough = SemiLagrangian(problem, grid, pace * grid.spacing).solve(value, control, ROUGH)
+            scheme = SemiLagrangian(problem, grid, pace * grid.spacing, rise)
+            start = scheme.solve(rough.value, rough.control, TOLERANCE)
+            solutions.append(start)
+        estimates = tuple(_mean(problem, s) for s in solutions)
+        between = look_between(problem, start.grid)
+        change = float((_carried(solutions[1], start.grid)[0] - start.value).abs().max())
+    spacings = tuple(1.0 / n for n in sides)
+    noise = max(s.residual + s.defect for s in solutions)
+    result: Extrapolation = extrapolate(spacings, estimates, noise)
+    uneven = "the three grids do not approach evenly" if result.error is None else None
+    unknown = between.sentence or uneven
+    error = None
+    if unknown is None:
+        error = result.error + noise + between.cost + between.mass * float(start.value.abs().max())
+    unsettled = max(s.residual for s in solutions)
+    return Reference(problem, result.optimum, error, result.order, sides, estimates, change, unsettled, start, unknown)
+
+
+def _speed(problem: Problem, coarsest: int) -> tuple[GridSolution, float]:
+    """A rough solution, and the step per spacing: states at their typical speed then move `CELLS` cells a step."""
+    grid = Grid(problem.dim, min(coarsest, SPEED_SIDE[problem.dim]))
+    longest = LONGEST / problem.discount
+    scheme = SemiLagrangian(problem, grid, longest)
+    # Without drift the equation itself gives |u|^q / q' = R*(s) = f - V <= osc f.
+    q = problem.exponent
+    thrust = min((q / (q - 1.0) * scheme.scale) ** (1.0 / q), problem.control_limit or math.inf)
+    fastest = float(scheme.a.abs().max()) + float(scheme.B.flatten(1).norm(dim=-1).max()) * thrust
+    step = min(longest, CELLS * grid.spacing / max(fastest, 1e-300))
+    value, control = scheme.f.clone(), scheme.f.new_zeros(grid.count, problem.control_dim)
+    for _ in range(SPEED_ROUNDS):
+        scheme = SemiLagrangian(problem, grid, step)
+        rough = scheme.solve(value, control, ROUGH)
+        value, control = rough.value, rough.control
+        speed = max(scheme.speed(control), 1e-300)
+        step = min(longest, CELLS * grid.spacing / speed)
+    return rough, min(CELLS / speed, longest * coarsest)
+
+
+def _carried(solution: GridSolution, grid: Grid) -> tuple[Tensor, Tensor]:
+    """Value and control of ``solution`` at the nodes of another grid, the control from the nearest node."""
+    values, controls = [], []
+    for part in grid.nodes().split(PIECE):
+        stencil = solution.grid.stencil(part)
+        values.append((stencil.cubic * solution.value[stencil.index]).sum(dim=-1))
+        nearest = stencil.index.gather(1, stencil.linear.argmax(dim=1, keepdim=True)).squeeze(1)
+        controls.append(solution.control[nearest])
+    return torch.cat(values), torch.cat(controls)
+
+
+def _mean(problem: Problem, solution: GridSolution) -> float:
+    """`int V dmu0` by the rule of equal weights, which on a torus is the trapezoidal one."""
+    density = torch.cat([problem.initial_density(part) for part in solution.grid.nodes().split(PIECE)])
+    return math.fsum((solution.value * density).tolist()) / solution.grid.count
+
+
+def _interpolated(problem: Problem, solution: GridSolution, x: Tensor) -> tuple[Tensor, Tensor]:
+    grid, V = solution.grid, solution.value
+    stencil = grid.stencil(x)
+    clip = CLIP * float(V.max() - V.min()) * grid.spacing**1.5
+    extra = ((stencil.cubic - stencil.linear) * V[stencil.index]).sum(dim=-1)
+    value = (stencil.linear * V[stencil.index]).sum(dim=-1) + extra.clamp(-clip, clip)
+    gradient = (stencil.linear.unsqueeze(-1) * grid.gradient(V)[stencil.index]).sum(dim=1)
+    pull = torch.einsum("ndm,nd->nm", problem.control_matrix(x), gradient)
+    return value, minimiser(-pull / problem.discount, problem.exponent, problem.control_limit)

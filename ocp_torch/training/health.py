@@ -1,0 +1,141 @@
+"""Whether a run is going anywhere: its best look at the bounds so far, and signs that it diverges or learns nothing."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import Tensor
+
+from ocp_torch.certificate import Certificate
+from ocp_torch.errors import notes
+from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.problems import Problem
+from ocp_torch.problems.constants import Bounds
+
+# A run whose weights or losses have grown by so much since it began is not coming back.
+GROWN_WEIGHTS, GROWN_LOSS = 100.0, 1e4
+# States on which the bound of the best constant V is computed.
+CONSTANT_STATES, CONSTANT_STREAM = 2**13, 7
+CONTRADICTED = "bounds contradicted each other at step"
+# A lower bound that falls short of it by less is as good: networks round, and both are sampled.
+ROUNDING = 1e-4
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the bounds were at ``step``; ``noise`` is half of the intervals of both sides, in the units of ``gap``.
+
+    Where bounds contradict each other nothing counts: such a look has neither a gap nor a performance.
+    """
+
+    step: int
+    gap: (
+        float | None
+    )  # relative, from the lower bound to the simulated performance, between the far ends of their intervals
+    perf: float | None  # simulated, the upper end of its interval
+    noise: float
+
+    @classmethod
+    def at(cls, step: int, certificate: Certificate) -> Look:
+        lower, perf = certificate.best_lower, certificate.best_perf
+        errors = certificate.lower[lower[0]].half_width(certificate.confidence) if lower else 0.0
+        errors += certificate.perf[perf[0]].half_width(certificate.confidence) if perf else 0.0
+        gap = certificate.gap["simulated"]
+        unit = lower[1] if gap is not None else perf[1] if perf else 1.0
+        return cls(step, gap, perf[1] if perf else None, errors / abs(unit) if unit else 0.0)
+
+    def better_than(self, other: Look | None, sure: bool = False) -> bool:
+        """By the gap, or by the performance where neither has one; with ``sure``, by more than the noise of both."""
+        if other is None:
+            return self.gap is not None or self.perf is not None
+        margin = self.noise + other.noise if sure else 0.0
+        if self.gap is None and other.gap is None:
+            if self.perf is None or other.perf is None:
+                return self.perf is not None
+            return self.perf + margin * abs(other.perf) < other.perf
+        if self.gap is None or other.gap is None:
+            return self.gap is not None
+        return self.gap + margin < other.gap
+
+
+class Watch:
+    """Follows a run. ``best`` is the best `Look` so far, ``fields`` the averaged fields it was of and ``certificate`` what it
+    said (not kept in checkpoints); ``notes`` are what a user should be told of the run's health; ``unit`` is the size of the
+    problem's costs."""
+
+    def __init__(self, unit: float) -> None:
+        self.best: Look | None = None
+        self.fields: dict | None = None
+        self.certificate: Certificate | None = None
+        self.notes: list[str] = []
+        self.warned = False  # that a look was hopeless
+        self._unit, self._start = unit, {}
+
+    def looked(self, look: Look, fields: torch.nn.Module, certificate: Certificate | None = None) -> bool:
+        """Take note of a look at ``fields``; whether it is the best so far."""
+        if not look.better_than(self.best):
+            return False
+        self.best, self.certificate = look, certificate
+        self.fields = {name: tensor.detach().clone() for name, tensor in fields.state_dict().items()}
+        return True
+
+    def stepped(self, step: int, losses: dict[str, Tensor], parameters: dict[str, list[Tensor]]) -> list[str]:
+        """Hold sizes against those at the start; a sentence, once, on each that has grown without end."""
+        sizes = {f"the loss of player {p!r}": (abs(float(loss)), GROWN_LOSS, self._unit) for p, loss in losses.items()}
+        for player in losses:
+            norm = float(torch.nn.utils.get_total_norm(parameters[player]))
+            sizes[f"the norm of the weights of player {player!r}"] = (norm, GROWN_WEIGHTS, 1e-12)
+        fresh = []
+        for what, (size, limit, unit) in sizes.items():
+            start = self._start.setdefault(what, max(size, unit))
+            if size > limit * start and not any(note.startswith(what) for note in self.notes):
+                fresh.append(
+                    f"{what} grew from {start:.3g} to {size:.3g} by step {step}: this run diverges; "
+                    "try a smaller optimizer.lr, stepper.clip or stepper.radius."
+                )
+        self.notes += fresh
+        return fresh
+
+    def contradicted(self, step: int, sentence: str) -> list[str]:
+        """Take note, once, that bounds contradicted each other at ``step``; the sentence that says so, if it is news."""
+        if any(note.startswith(CONTRADICTED) for note in self.notes):
+            return []
+        self.notes.append(f"{CONTRADICTED} {step}: {sentence}")
+        return self.notes[-1:]
+
+    def state_dict(self) -> dict:
+        best = asdict(self.best) if self.best else None
+        told = {"notes": list(self.notes), "warned": self.warned}
+        return {"best": best, "fields": self.fields, "start": dict(self._start), **told}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.best, self.certificate = Look(**state["best"]) if state["best"] else None, None
+        self.fields = copy.deepcopy(state["fields"])
+        self.notes, self.warned = list(notes(state["notes"])), bool(state["warned"])
+        self._start = dict(state["start"])
+
+
+def hopeless(problem: Problem, bounds: Bounds, certificate: Certificate, seed: int) -> list[str]:
+    """What ``certificate`` shows to be no better than not having trained."""
+    notes = []
+    lower, zero, perf = certificate.best_lower, certificate.baseline.get("zero"), certificate.best_perf
+    trained = [e for e in certificate.lower.values() if e is not None]
+    constant = best_constant(problem, bounds, seed) if trained else None
+    if constant is not None and certificate.counts("F_M"):
+        estimate = certificate.lower[lower[0]] if lower else None
+        if estimate is None or estimate.above < constant - ROUNDING * abs(constant):
+            value = f"{estimate.value:.6g}" if estimate else "not finite"
+            notes.append(f"the lower bound, {value}, is worse than {constant:.6g}, that of the best constant V.")
+    if perf is not None and zero is not None and zero.finite and perf[1] > zero.above:
+        notes.append("the best controller is worse than doing nothing.")
+    return notes
+
+
+@torch.no_grad()
+def best_constant(problem: Problem, bounds: Bounds, seed: int) -> float:
+    """`max_c F_M(c) = max_c c - M E[(c - f)_+]` over constants `c`, reached at the `1 / M` quantile of `f`."""
+    f, weight = problem.survey(CONSTANT_STATES, derive_seed(seed, CONSTANT_STREAM), "f", "weight")
+    c = torch.quantile(f, min(1.0, 1.0 / bounds.M))  # any c gives a lower bound: that of unweighted states will do
+    return float(c - bounds.M * (weight * (c - f).clamp_min(0.0)).mean())
