@@ -13,9 +13,9 @@ from adversarial import gaussian
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.certificate import known
 from ocp_torch.certificate.external.external import GIVEN, certify_policy
-from ocp_torch.control.policies import NETWORK, zero_law
+from ocp_torch.control.policies import NETWORK, zero_policy
 from ocp_torch.fields import Fields, PeriodicMLP
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from test_traps import Field
 
 # Standard errors by which what counts may be off.
@@ -111,13 +111,13 @@ def faults_of_idling(certificate, problem, name) -> list[str]:
     return found
 
 
-def certified(problem, settings, seed=0, bounds=None, occupation=None, **formulas):
+def certified(problem, settings, seed=0, constants=None, occupation=None, **formulas):
     """The certificate of fields given by formulas or networks."""
     fields = Fields({n: f if isinstance(f, torch.nn.Module) else Field(f) for n, f in formulas.items()}).float()
     return certify_fields(
         problem,
         Trained(fields, occupation, NETWORKS),
-        bounds or resolve_bounds(problem),
+        constants or resolve_constants(problem),
         settings,
         Run("x", "x", seed),
     )
@@ -174,8 +174,8 @@ def certified_with_density(problem, name, settings, seed=0, value=None):
 def certified_idling(problem, settings, seed=0, value="truth"):
     """Of doing nothing, by the path of a given controller."""
     V = None if value is None else Field(values(problem, seed)[value]).double()
-    law = zero_law(problem)
-    return certify_policy(problem, law, V, NETWORKS, resolve_bounds(problem), settings, Run("x", "given", seed))
+    policy = zero_policy(problem)
+    return certify_policy(problem, policy, V, NETWORKS, resolve_constants(problem), settings, Run("x", "given", seed))
 
 
 __all__ = ["CHEAP", "GIVEN", "THOROUGH", "replace"]

@@ -25,9 +25,9 @@ from honesty import (
 from ocp_torch.certificate import StageSettings
 from ocp_torch.certificate.report import table
 from ocp_torch.certificate.simulated.performance import simulate_performance
-from ocp_torch.control.policies import ValueLaw
+from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.problems import Dataset
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.runs import build as config
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.training.monitor import Silent
@@ -154,8 +154,8 @@ def test_a_controller_that_slides_on_a_kink_of_V_costs_what_it_costs(tilt, horiz
     V = lambda x: tilt * problem.formula(x)
     x = (torch.arange(2**14, dtype=torch.float64).unsqueeze(-1) + 0.5) / 2**14
     initial = [float(V(x).mean())] * 8
-    law = ValueLaw(problem, V)
-    perf = lambda value, initial: simulate_performance(problem, law, 16, 8, 0, value, initial, horizon, 1e-2).perf
+    policy = ValuePolicy(problem, V)
+    perf = lambda value, initial: simulate_performance(problem, policy, 16, 8, 0, value, initial, horizon, 1e-2).perf
     (low, high), (least, most) = perf(V, initial).interval(0.999), perf(None, None).interval(0.999)
     assert high >= problem.truth[0]
     assert low <= most
@@ -165,12 +165,12 @@ def test_a_controller_that_slides_on_a_kink_of_V_costs_what_it_costs(tilt, horiz
 def test_the_value_bound_knows_a_spike_of_the_cost():
     for sigma in (0.0025, 0.001):
         problem = Lines(Line(spike(0.3, sigma)), Line(spike(0.7, 0.004)))
-        assert resolve_bounds(problem).C_V >= float(problem.state_cost(torch.tensor([[0.3, 0.7]]).double()))
+        assert resolve_constants(problem).C_V >= float(problem.state_cost(torch.tensor([[0.3, 0.7]]).double()))
 
 
 def test_a_bound_of_the_cost_that_is_too_small_is_not_believed():
     problem = Lines(Line(spike(0.3)), Line(waves(3)), state_cost_bound=2.0)
-    assert resolve_bounds(problem).C_V > 30.0
+    assert resolve_constants(problem).C_V > 30.0
 
 
 def test_an_M_that_is_too_small_is_refuted_by_a_controller_that_gathers_mass():

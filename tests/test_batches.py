@@ -15,7 +15,7 @@ from ocp_torch.maths import calculus
 from ocp_torch.maths.sampling import UniformSampler
 from ocp_torch.objectives import Dual, primal
 from ocp_torch.problems import Problem, formulas
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.training.batches import VISITED, Batches
 
 
@@ -43,8 +43,8 @@ class Flat(nn.Module):
         return self.constant + 0.0 * x.sum(dim=-1)
 
 
-def build(problem, visited, size=1000, seed=0, bounds=None, value=None, method=Dual):
-    objective = method(problem, bounds or resolve_bounds(problem))
+def build(problem, visited, size=1000, seed=0, constants=None, value=None, method=Dual):
+    objective = method(problem, constants or resolve_constants(problem))
     fields = Fields.build(problem, objective.fields, partial(PeriodicMLP, width=16), 0)
     if value is not None:
         fields.networks[VALUE] = value
@@ -83,14 +83,14 @@ def test_integrals_are_those_of_the_uniform_states(visited):
 
 def test_the_penalty_sees_the_visited_states_too():
     problem = zoo.build("arm n=2")
-    bounds = replace(resolve_bounds(problem), unbounded=False, M=3.0)
-    batches = build(problem, 0.25, size=400, bounds=bounds)
+    constants = replace(resolve_constants(problem), unbounded=False, M=3.0)
+    batches = build(problem, 0.25, size=400, constants=constants)
     batches.draw()
     s = batches.draw()
     assert int((s.weight == 0.0).sum()) == 100
     value, gradient = calculus.value_and_gradient(batches.fields.value, s.x)
     slack = formulas.hjb_slack(s, value, gradient, problem.control_cost, problem.discount)
-    loss = Dual(problem, bounds, residual=0.0).losses(batches.fields, s)["value"]
+    loss = Dual(problem, constants, residual=0.0).losses(batches.fields, s)["value"]
     assert bool((s.attention[:300] == 1.0).all())
     assert bool((s.attention > 0.0).all())
     expected = 3.0 * (s.attention * slack.clamp_min(0.0)).mean() - (value * s.mu0)[:300].mean()

@@ -9,12 +9,12 @@ import torch
 
 import zoo
 from ocp_torch.cli.launch import composed
-from ocp_torch.control import policies as control_laws
+from ocp_torch.control import policies
 from ocp_torch.errors import InputError
 from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields, SobolevField
 from ocp_torch.gym.environment import make_environment, observe
 from ocp_torch.problems import formulas
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.samples import Samples
 from ocp_torch.studies.benchmark import measure
 from ocp_torch.studies.benchmark.contest import build, contest
@@ -67,15 +67,15 @@ def learned(problem, seed=0) -> Fields:
 
 
 def test_the_judge_agrees_with_quadrature_on_a_dense_grid():
-    problem, bounds = circle()
+    problem, constants = circle()
     fields, n = learned(problem), 200_000
-    numbers = Judge(problem, bounds)(fields, control_laws.SADDLE)
+    numbers = Judge(problem, constants)(fields, policies.SADDLE)
     x = ((torch.arange(n, dtype=torch.float64) + 0.5) / n).unsqueeze(-1)
     samples = Samples.of(problem, x)
     V, gradient = fields.value.value_and_gradient(x)
     slack = formulas.hjb_slack(samples, V, gradient, problem.control_cost, problem.discount)
     assert numbers["F_M"] == pytest.approx(float((V - 2.0 * slack.clamp_min(0.0)).mean()), abs=2e-5)
-    w, inflow = formulas.controlled_inflow(samples, fields.control_density, problem.discount)
+    w, inflow = formulas.control_inflow(samples, fields.control_density, problem.discount)
     G = problem.control_cost.primal_minimum(w, samples.f, 2.0, inflow).mean()
     assert numbers["G"] == pytest.approx(float(G), abs=2e-5)
     assert numbers["F_M"] < problem.exact_optimum < numbers["G"] <= numbers["J"]
@@ -83,12 +83,12 @@ def test_the_judge_agrees_with_quadrature_on_a_dense_grid():
 
 
 def test_the_judge_finds_the_optimum_of_the_optimal_controller():
-    """Simulated from a table of the control law; without drift, and with."""
+    """Simulated from a table of the policy; without drift, and with."""
     problem = zoo.build("circle rho=2")
-    judge = Judge(problem, resolve_bounds(problem))
+    judge = Judge(problem, resolve_constants(problem))
     assert judge.performance(problem.exact_control) == pytest.approx(problem.exact_optimum, rel=5e-4)
     drifting = zoo.build("manufactured 1-d q=2")
-    found = Judge(drifting, resolve_bounds(drifting)).performance(drifting.exact_control)
+    found = Judge(drifting, resolve_constants(drifting)).performance(drifting.exact_control)
     assert found == pytest.approx(drifting.exact_optimum, rel=5e-4)
 
 
@@ -101,17 +101,17 @@ class Exact(torch.nn.Module):
 def test_beyond_one_dimension_the_value_is_a_control_variate(quick):
     """With `V*` itself nothing is left to simulate: sixteen starts give `OPT` as exactly as its mean is known."""
     problem = zoo.build("manufactured 2-d mu0")
-    judge = Judge(problem, resolve_bounds(problem))
+    judge = Judge(problem, resolve_constants(problem))
     numbers = judge(Fields({VALUE: Exact(problem)}), None)
     assert numbers["value"] == pytest.approx(numbers["F_M"], rel=1e-6)
-    alone = judge.performance(control_laws.ValueLaw(problem, Exact(problem)))
+    alone = judge.performance(policies.ValuePolicy(problem, Exact(problem)))
     assert abs(alone - numbers["value"]) > 1e-4 * numbers["value"]
 
 
 def test_a_table_of_a_law_is_periodic_and_of_second_order():
-    law = lambda x: torch.sin(2 * math.pi * x)
+    policy = lambda x: torch.sin(2 * math.pi * x)
     x = torch.cat([zoo.states(zoo.Problem(1), 500), torch.tensor([[0.0], [1.0], [-0.25], [7.3]], dtype=torch.float64)])
-    coarse, fine = ((tabulated(law, n)(x) - law(x)).abs().max() for n in (64, 256))
+    coarse, fine = ((tabulated(policy, n)(x) - policy(x)).abs().max() for n in (64, 256))
     assert fine < 1e-4
     assert coarse / fine == pytest.approx(16.0, rel=0.3)
 
@@ -277,9 +277,9 @@ def test_sac_runs_as_a_contender():
     pytest.importorskip("stable_baselines3")
     from ocp_torch.studies.benchmark.rl import RLContender
 
-    problem, bounds = circle()
+    problem, constants = circle()
     made = RLContender("sac", problem, 0.5, steps=150, time_step=0.1, horizon=4.0)
-    result = made.run(0, Judge(problem, bounds), None)
+    result = made.run(0, Judge(problem, constants), None)
     assert result.points[-1].samples == 150
     assert problem.exact_optimum < result.points[-1].perf < math.inf
 
@@ -325,14 +325,14 @@ def test_a_recipe_in_small_gives_its_numbers_and_figures(name, quick):
 
 def test_the_exact_kernel_does_more_work_at_each_step_and_features_do_not():
     """Counted instead of timed: the numbers that enter one evaluation."""
-    problem, bounds = circle()
+    problem, constants = circle()
     from ocp_torch.studies.kernel import Iteration, step_sizes
     from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
     from ocp_torch.studies.kernel.expansions import FeatureExpansion, KernelExpansion
     from ocp_torch.studies.kernel.iterations import SobolevFeatures
 
-    exact = Iteration(problem, "dual", bounds, (0,), kernel=BernoulliKernel(2), capacity=60)
-    truncated = Iteration(problem, "dual", bounds, (0,), features=SobolevFeatures(1, modes=8))
+    exact = Iteration(problem, "dual", constants, (0,), kernel=BernoulliKernel(2), capacity=60)
+    truncated = Iteration(problem, "dual", constants, (0,), features=SobolevFeatures(1, modes=8))
     for n in (20, 40, 60):
         exact.advance(step_sizes(1e-3, 20))
         truncated.advance(step_sizes(1e-3, 20))

@@ -17,9 +17,9 @@ from ocp_torch.errors import InputError
 from ocp_torch.maths import calculus
 from ocp_torch.objectives import primal, saddle
 from ocp_torch.objectives.saddle import Saddle
-from ocp_torch.problems import Callable
+from ocp_torch.problems import Simulator
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.resume import OWN_TARGETS
 from test_config import outcome
@@ -55,7 +55,7 @@ def wrapped(name, single=False, **options):
     given_ = dict(
         dim=problem.dim, control_dim=problem.control_dim, discount=problem.discount, exponent=problem.exponent
     )
-    return problem, Callable(one_at_a_time(oracle) if single else oracle, **given_, **options)
+    return problem, Simulator(one_at_a_time(oracle) if single else oracle, **given_, **options)
 
 
 NAMES = ("manufactured 2-d mu0", "manufactured 3-d m=2 B(x) q=1.5", "swing", "circle rho=2")
@@ -80,14 +80,14 @@ def test_differences_go_through_every_transform_the_package_uses(name):
     x = zoo.states(problem, 9)
     network = zoo.rough_network(problem.dim, 0)
 
-    def law(owner):
+    def policy(owner):
         def control(x):
             _, gradient = calculus.value_and_gradient(network, x)
             return -torch.einsum("ndm,nd->nm", owner.control_matrix(x), gradient)
 
         return control
 
-    ours, its = ClosedLoop(problem, law(problem)), ClosedLoop(box, law(box))
+    ours, its = ClosedLoop(problem, policy(problem)), ClosedLoop(box, policy(box))
     torch.testing.assert_close(its.drift_divergence(x), ours.drift_divergence(x), rtol=1e-5, atol=1e-5)
     slopes = []
     for owner in (problem, box):
@@ -104,7 +104,7 @@ def test_calls_are_counted_honestly():
         return np.ones(len(x)), None, np.broadcast_to(np.eye(3), (len(x), 3, 3))
 
     for differences, expected in ((False, [50]), (True, [50, 2 * 3 * 50])):
-        box = Callable(oracle, dim=3, differences=differences)
+        box = Simulator(oracle, dim=3, differences=differences)
         assert box.driftless
         assert box.gives_divergences is differences
         calls.clear()
@@ -168,19 +168,19 @@ HOSTILE = {
 def test_what_goes_wrong_is_named_with_the_state(name):
     oracle, sentence = HOSTILE[name]
     with pytest.raises(InputError, match=sentence) as caught:
-        Callable(oracle, dim=2, control_dim=1)
+        Simulator(oracle, dim=2, control_dim=1)
     assert "\n" not in str(caught.value)
 
 
 def test_a_drift_that_is_zero_at_the_seam_does_not_jump_there():
     oracle = lambda x: (np.ones(len(x)), -0.3 * np.sin(TURN * x), np.ones((len(x), 1, 1)))
-    assert Callable(oracle, dim=1).dim == 1
+    assert Simulator(oracle, dim=1).dim == 1
 
 
 @given(st.floats(0.55, 0.999))
 def test_an_exception_met_later_is_traced_to_its_state(limit):
     oracle = raises_beyond(2.0)
-    box = Callable(lambda x: oracle(x), dim=2, control_dim=1)
+    box = Simulator(lambda x: oracle(x), dim=2, control_dim=1)
     oracle = raises_beyond(limit)
     x = torch.cat([torch.rand(40, 2, dtype=torch.float64) * limit, torch.tensor([[0.9995, 0.25]], dtype=torch.float64)])
     with pytest.raises(InputError, match=r"x = \[0\.9995, 0\.25\]: no mass"):
@@ -227,24 +227,24 @@ def test_targets_that_name_no_oracle_are_refused(module, target):
 def test_a_missing_target_is_asked_for():
     assert "problem.target" in outcome("problem=callable")
     with pytest.raises(InputError, match="by name"):
-        Callable(plain, dim=2, control_dim=1, workers=2)
+        Simulator(plain, dim=2, control_dim=1, workers=2)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["single"])
 def test_worker_processes_give_the_same_numbers(module, name):
-    alone, shared = (Callable(f"{module}:{name}", dim=1, workers=k) for k in (1, 2))
+    alone, shared = (Simulator(f"{module}:{name}", dim=1, workers=k) for k in (1, 2))
     x = torch.rand(11, 1, dtype=torch.float64)
     for column in ("f", "a", "B"):
         assert torch.equal(getattr(Samples.of(alone, x), column), getattr(Samples.of(shared, x), column))
     with pytest.raises(InputError, match="OSError"):
-        Callable(f"{module}:fails", dim=1, workers=2)
+        Simulator(f"{module}:fails", dim=1, workers=2)
 
 
 def test_methods_fall_back_without_divergences():
     _, bare = wrapped("swing")
-    bounds = resolve_bounds(bare)
-    assert type(saddle(bare, bounds)) is type(primal(bare, bounds)) is Saddle
+    constants = resolve_constants(bare)
+    assert type(saddle(bare, constants)) is type(primal(bare, constants)) is Saddle
 
 
 @pytest.mark.slow
@@ -261,7 +261,7 @@ def test_a_run_on_a_simulator_leaves_bounds_and_a_controller_that_needs_the_simu
     path = tmp_path / "run" / "controller.safetensors"
     with pytest.raises(InputError, match="load_controller"):
         load_controller(path)  # a file does not name a function to be imported
-    u = load_controller(path, problem=Callable(f"{module}:single", dim=1))
+    u = load_controller(path, problem=Simulator(f"{module}:single", dim=1))
     assert u(np.random.default_rng(0).random((4, 1))).shape == (4, 1)
 
 

@@ -10,11 +10,11 @@ import zoo
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
-from ocp_torch.control.policies import ValueLaw
+from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems import Circle, Manufactured
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import ESTIMATED, resolve_bounds
+from ocp_torch.problems.constants import ESTIMATED, resolve_constants
 from ocp_torch.problems.needs import GUESSED, SEARCHED
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_trainer
@@ -44,9 +44,9 @@ def fields_near_the_truth(problem) -> Fields:
     return Fields({"value": Near()})
 
 
-def certificate_of(problem, bounds=None, settings=CHEAP):
+def certificate_of(problem, constants=None, settings=CHEAP):
     trained = Trained(fields_near_the_truth(problem), None, partial(PeriodicMLP, width=8, depth=1))
-    return certify_fields(problem, trained, bounds or resolve_bounds(problem), settings, Run("test", "dual"))
+    return certify_fields(problem, trained, constants or resolve_constants(problem), settings, Run("test", "dual"))
 
 
 @pytest.mark.parametrize("problem", [Manufactured(dim=1), Manufactured(dim=2, exponent=1.6)], ids=["q=2", "q=1.6"])
@@ -55,7 +55,7 @@ def test_the_lagrangian_bound_is_second_order_where_J_is_first(problem):
 
     def excess(eps):
         value = lambda x: problem.exact_value(x) + eps * bump_V(x)
-        loop = ClosedLoop(problem, ValueLaw(problem, value))
+        loop = ClosedLoop(problem, ValuePolicy(problem, value))
         log_mu = lambda x: problem.exact_occupation(x).log() + eps * bump_mu(x)
         samples = replicated_samples(problem, 2**12, 2, 0, divergences=False)
         found = closed_loop_bounds(loop, value, log_mu, [Samples.of(loop, s.x) for s in samples], 16, "value")
@@ -69,7 +69,7 @@ def test_the_lagrangian_bound_is_second_order_where_J_is_first(problem):
 
 def test_an_M_below_sup_mu_is_noticed_and_its_bound_left_out():
     problem = Manufactured(dim=1)
-    certificate = certificate_of(problem, resolve_bounds(problem, occupation_bound=0.5 * problem.occupation_bound))
+    certificate = certificate_of(problem, resolve_constants(problem, occupation_bound=0.5 * problem.occupation_bound))
     assert certificate.lower["F_M"].value > 0
     assert certificate.gap["lower_from"] == "shifted"
     assert not certificate.assumptions.hold
@@ -92,11 +92,11 @@ class Anonymous(Manufactured):
 
 
 def test_what_nobody_knows_is_estimated_with_a_warning():
-    bounds = resolve_bounds(Anonymous(dim=1, contrast=0.9, seed=3))
-    assert set(bounds.sources.values()) == {ESTIMATED}
-    assert len(bounds.warnings) == 3
-    assert bounds.C_V >= Manufactured(dim=1, contrast=0.9, seed=3).value_bound * 0.9
-    assert (bounds.basis("M"), bounds.basis("C_V")) == (GUESSED, SEARCHED)
+    constants = resolve_constants(Anonymous(dim=1, contrast=0.9, seed=3))
+    assert set(constants.sources.values()) == {ESTIMATED}
+    assert len(constants.warnings) == 3
+    assert constants.C_V >= Manufactured(dim=1, contrast=0.9, seed=3).value_bound * 0.9
+    assert (constants.basis("M"), constants.basis("C_V")) == (GUESSED, SEARCHED)
 
 
 def test_a_guessed_M_makes_a_conditional_bound_that_enters_nothing_else():
@@ -114,7 +114,7 @@ def test_a_guessed_M_makes_a_conditional_bound_that_enters_nothing_else():
 
 def test_a_guess_that_the_controller_s_density_refutes_makes_no_bound_at_all():
     problem = Anonymous(dim=1, contrast=0.9, seed=3)
-    certificate = certificate_of(problem, replace(resolve_bounds(problem), M=1.1))
+    certificate = certificate_of(problem, replace(resolve_constants(problem), M=1.1))
     assert certificate.assumptions.estimated_sup_occupation == pytest.approx(1.9, rel=0.05)
     assert certificate.gap["conditional"] is None
     assert certificate.gap["lower_from"] == "shifted"
@@ -124,10 +124,10 @@ def test_a_guess_that_the_controller_s_density_refutes_makes_no_bound_at_all():
 def test_an_M_that_was_held_against_nothing_makes_nothing_count(basis):
     problem = Anonymous(dim=1)
     given = 10.0 if basis == "given" else None
-    bounds = resolve_bounds(problem, occupation_bound=given)
+    constants = resolve_constants(problem, occupation_bound=given)
     blind = replace(CHEAP, occupation_states=0)
-    assert not certificate_of(problem, bounds, blind).counts("F_M")
-    assert certificate_of(problem, bounds).counts("F_M") == (basis == "given")
+    assert not certificate_of(problem, constants, blind).counts("F_M")
+    assert certificate_of(problem, constants).counts("F_M") == (basis == "given")
 
 
 def rounds_of(*overrides: str):

@@ -12,12 +12,12 @@ from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.certificate.simulated.simulation import discounted_integral
 from ocp_torch.certificate.upper.lagrangian import Terms, _integrands, best_multiples, closed_loop_bounds
 from ocp_torch.certificate.upper.policy_evaluation import StageSettings, fit_closed_loop, missing_price, relative_excess
-from ocp_torch.control.policies import ValueLaw
+from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.maths import calculus
 from ocp_torch.problems import formulas
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.samples import Samples
 
 
@@ -54,7 +54,7 @@ def test_any_density_gives_the_performance_once_the_value_of_its_residual_is_add
     value, log_mu = (zoo.rough_network(problem.dim, seed, size=0.2) for seed in (6, 7))
 
     def performance(samples):
-        mu, spent = formulas.drifting_loss(samples, log_mu, loop.discount)
+        mu, spent = formulas.occupation_outflow(samples, log_mu, loop.discount)
         r, v = samples.mu0 - spent, value(samples.x)
         lagrangian = samples.f * mu + v * r
         return float((lagrangian + (problem.exact_value(samples.x) - v) * r).mean())
@@ -80,15 +80,15 @@ def test_the_bounds_of_a_poor_controller_are_above_its_own_performance(problem):
     """Not only above OPT: a bound speaks of the controller it is given."""
     bump = zoo.rough_network(problem.dim, 9, size=0.05)
     value = lambda x: problem.exact_value(x) + bump(x)
-    law = ValueLaw(problem, value)
-    loop = ClosedLoop(problem, law)
+    policy = ValuePolicy(problem, value)
+    loop = ClosedLoop(problem, policy)
     sets = replicated_samples(problem, 2048, 8, 0, divergences=False)
     log_mu = lambda x: problem.exact_occupation(x).log() + 0.3 * bump(x)
-    bounds = closed_loop_bounds(loop, value, log_mu, [Samples.of(loop, s.x) for s in sets], 8, "value")
+    constants = closed_loop_bounds(loop, value, log_mu, [Samples.of(loop, s.x) for s in sets], 8, "value")
     initial = [float((value(s.x) * s.mu0).mean()) for s in sets]
-    perf = simulate_performance(problem, law, 64, 8, 0, value=value, initial=initial, tolerance=1e-3).perf
+    perf = simulate_performance(problem, policy, 64, 8, 0, value=value, initial=initial, tolerance=1e-3).perf
     assert perf.value - 3.0 * perf.se > problem.exact_optimum
-    for bound in (bounds.lagrangian, bounds.J):
+    for bound in (constants.lagrangian, constants.J):
         assert bound.value >= perf.value - perf.bias - 4.0 * (perf.se + bound.se)
 
 
@@ -96,10 +96,10 @@ def test_the_stage_takes_another_round_only_while_the_residual_costs_too_much():
     problem = zoo.build("manufactured 2-d q=2")
     network = partial(PeriodicMLP, modes=1, width=16, depth=2)
     fields = Fields.build(problem, ("value",), network, 0)
-    law = ValueLaw(problem, problem.exact_value)
+    policy = ValuePolicy(problem, problem.exact_value)
     settings = StageSettings(steps=40, rounds=3, batch=64)
     fit = lambda **change: fit_closed_loop(
-        problem, law, fields, network, resolve_bounds(problem), replace(settings, **change), seed=0
+        problem, policy, fields, network, resolve_constants(problem), replace(settings, **change), seed=0
     )
     weights = lambda fitted: torch.cat([p.flatten() for p in fitted.log_occupation.parameters()])
     once = weights(fit(rounds=1))

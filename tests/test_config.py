@@ -69,7 +69,7 @@ def test_values_reach_what_they_name():
         "seed=7",
     )
     assert trainer.problem.dim == 3
-    assert trainer.bounds.C_V == 0.3
+    assert trainer.constants.C_V == 0.3
     assert trainer.stepper.learning_rates() == {"density": 0.25}
     assert trainer.stepper.radius == 5
     assert trainer.batches.sampler.draw(2).dtype == torch.float64

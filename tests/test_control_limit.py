@@ -16,7 +16,7 @@ from ocp_torch.certificate.proof.rigorous import obstacle, rigorous_lower_bound
 from ocp_torch.certificate.sides import lower_side, upper_side
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.controller import load_controller
-from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, admissible_density, control_laws, occupation_density
+from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, admissible_density, occupation_density, trained_policies
 from ocp_torch.errors import InputError
 from ocp_torch.maths import calculus
 from ocp_torch.maths.taylor import Box
@@ -24,7 +24,7 @@ from ocp_torch.objectives.primal import ClosedPrimal, NetworkPrimal
 from ocp_torch.objectives.saddle import Saddle
 from ocp_torch.problems import Circle, Manufactured, Torus, formulas
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.control_limit import LimitedCost
 from ocp_torch.problems.samples import Samples
@@ -171,7 +171,7 @@ def test_taylor_models_hold_the_conjugate_below_across_and_beyond_the_limit(q, d
         centre = 2.0 * torch.rand(300, dim, generator=generator, dtype=torch.float64)
         box = Box(centre, torch.full_like(centre, half), 4)
         model = cost.conjugate_model(box.coordinates())
-        low, high = model.bounds()
+        low, high = model.constants()
         inner = 2.0 * torch.rand(20, 300, dim, generator=generator, dtype=torch.float64) - 1.0
         # The corner farthest from 0 is where R* exceeds its limited version most.
         for t in (*inner, torch.ones(300, dim, dtype=torch.float64)):
@@ -219,8 +219,8 @@ def test_the_bounds_at_the_exact_truth_are_the_optimum(problem):
     loop = ClosedLoop(problem, problem.exact_control)
     own = [Samples.of(loop, s.x) for s in sets]
     log_mu = lambda x: problem.exact_occupation(x).log()
-    bounds = closed_loop_bounds(loop, problem.exact_value, log_mu, own, ascents=4, controller="value")
-    assert bounds.lagrangian.value == pytest.approx(problem.exact_optimum, rel=1e-9)
+    constants = closed_loop_bounds(loop, problem.exact_value, log_mu, own, ascents=4, controller="value")
+    assert constants.lagrangian.value == pytest.approx(problem.exact_optimum, rel=1e-9)
 
 
 @pytest.mark.slow
@@ -229,38 +229,38 @@ def test_the_bounds_at_the_exact_truth_are_the_optimum(problem):
 def test_random_networks_obey_weak_duality_and_the_limit(name, seed, size):
     """Networks that say anything: the density player's flux is cut to the limit, its divergence with it."""
     problem, fields = zoo.build(name), random_fields(zoo.build(name), seed, size)
-    bounds = resolve_bounds(problem)
+    constants = resolve_constants(problem)
     sets = replicated_samples(problem, 256, 8, seed=seed, divergences=True)
-    lower = lower_side(problem, fields.value, sets, bounds.M, ascents=4)
+    lower = lower_side(problem, fields.value, sets, constants.M, ascents=4)
     for low in (lower.F_M, lower.shifted):
         assert low.value <= problem.exact_optimum + ERRORS * low.se + 1e-9
-    form = (NETWORK, problem, fields, bounds)
-    J, *_ = upper_side(problem, admissible_density(*form), occupation_density(*form), sets, bounds.C_V)
+    form = (NETWORK, problem, fields, constants)
+    J, *_ = upper_side(problem, admissible_density(*form), occupation_density(*form), sets, constants.C_V)
     assert math.isfinite(J.value)
     assert J.value >= problem.exact_optimum - ERRORS * J.se - 1e-9
-    losses = [NetworkPrimal(problem, bounds).losses(fields, s)["density"].item() for s in sets]
+    losses = [NetworkPrimal(problem, constants).losses(fields, s)["density"].item() for s in sets]
     assert Estimate.of(losses).value == pytest.approx(J.value, rel=1e-9)
     x = zoo.states(problem, 200, seed=seed)
     for kind in (NETWORK, SADDLE):
-        for law in control_laws(kind, problem, fields, bounds).values():
-            assert float(law(x).norm(dim=-1).max()) <= problem.control_limit * (1.0 + 1e-9)
-    assert all(torch.isfinite(loss) for loss in Saddle(problem, bounds).losses(fields, sets[0]).values())
+        for policy in trained_policies(kind, problem, fields, constants).values():
+            assert float(policy(x).norm(dim=-1).max()) <= problem.control_limit * (1.0 + 1e-9)
+    assert all(torch.isfinite(loss) for loss in Saddle(problem, constants).losses(fields, sets[0]).values())
 
 
 @settings(max_examples=10)
 @given(st.integers(0, 10**6), st.sampled_from([0.1, 1.0, 5.0]), st.sampled_from([0.02, 0.1, 0.3]))
 def test_without_drift_the_closed_occupation_carries_any_flux(seed, size, limit):
     problem = Torus(control_limit=limit, seed=1)
-    fields, bounds = random_fields(problem, seed, size), resolve_bounds(problem)
+    fields, constants = random_fields(problem, seed, size), resolve_constants(problem)
     sets = replicated_samples(problem, 256, 4, seed=seed, divergences=True)
-    form = (CLOSED, problem, fields, bounds)
-    J, G, *_ = upper_side(problem, admissible_density(*form), occupation_density(*form), sets, bounds.C_V)
+    form = (CLOSED, problem, fields, constants)
+    J, G, *_ = upper_side(problem, admissible_density(*form), occupation_density(*form), sets, constants.C_V)
     assert J.value == pytest.approx(G.value, rel=1e-9)
-    mean = Estimate.of([float(ClosedPrimal(problem, bounds).losses(fields, s)["density"]) for s in sets]).value
+    mean = Estimate.of([float(ClosedPrimal(problem, constants).losses(fields, s)["density"]) for s in sets]).value
     assert mean == pytest.approx(G.value, rel=1e-9)
     # A tighter limit costs more, never less.
     free = Torus(seed=1)
-    unlimited = [float(ClosedPrimal(free, bounds).losses(fields, s)["density"]) for s in sets]
+    unlimited = [float(ClosedPrimal(free, constants).losses(fields, s)["density"]) for s in sets]
     assert mean >= Estimate.of(unlimited).value - 1e-12
 
 
@@ -278,8 +278,8 @@ def test_exact_truth_is_claimed_only_where_the_limit_is_out_of_reach():
     )
     assert told == (None,) * 5
     assert tight.exact_occupation(x) is None
-    assert tight.control_bound == resolve_bounds(tight).C_u == 0.5 * near
-    assert resolve_bounds(tight, control_bound=9.0).C_u == 0.5 * near
+    assert tight.control_bound == resolve_constants(tight).C_u == 0.5 * near
+    assert resolve_constants(tight, control_bound=9.0).C_u == 0.5 * near
 
 
 def test_rigorous_bounds_stand_with_a_limit_or_are_refused():
@@ -297,7 +297,7 @@ def test_rigorous_bounds_stand_with_a_limit_or_are_refused():
 def test_the_kernel_methods_refuse_a_limit():
     problem = Circle(control_limit=0.1)
     with pytest.raises(InputError, match=r"control_limit is 0\.1, but the kernel methods"):
-        DualRule(problem, resolve_bounds(problem))
+        DualRule(problem, resolve_constants(problem))
 
 
 @pytest.mark.parametrize("problem", [Manufactured(dim=1, control_limit=0.5, exponent=1.5), Circle(control_limit=0.1)])

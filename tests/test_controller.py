@@ -37,7 +37,7 @@ def controller_of(config: dict, problem: Problem | None = None) -> list[Controll
     for weight in fields.parameters():
         weight += 0.2 * torch.randn(weight.shape, generator=generator).to(weight)
     kinds = {"value": fields.value, "density": fields.control_density}
-    common = (problem, fields, trainer.bounds, trainer.objective.occupation)
+    common = (problem, fields, trainer.constants, trainer.objective.occupation)
     rest = (trainer.config["model"], CERTIFICATE, trainer.config)
     return [Controller(*common, kind, *rest) for kind, field in kinds.items() if field]
 
@@ -74,7 +74,7 @@ def test_a_loaded_controller_is_the_saved_one_to_the_bit(method, dtype, tmp_path
         assert torch.equal(loaded(x), u)
         assert type(loaded.problem) is type(controller.problem)
         assert loaded.problem.parameters == controller.problem.parameters
-        assert (loaded.kind, loaded.bounds) == (controller.kind, controller.bounds)
+        assert (loaded.kind, loaded.constants) == (controller.kind, controller.constants)
         assert loaded.certificate == CERTIFICATE
         assert loaded.config == controller.config
 

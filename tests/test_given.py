@@ -11,7 +11,7 @@ from ocp_torch import InputError, certify
 from ocp_torch.certificate import CertificateSettings, StageSettings, table
 from ocp_torch.certificate.external.black_box import BlackBox
 from ocp_torch.problems import Circle, Manufactured
-from ocp_torch.runs.loading import load_law
+from ocp_torch.runs.loading import load_policy
 from test_cli import assert_succeeded, certificate_in, script
 from test_controller import controllers
 from test_jumps import cost_of_switching
@@ -60,8 +60,8 @@ LAWS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_the_true_suboptimality_is_inside_the_printed_interval(name):
-    problem, (law, truth) = Circle(), LAWS[name]
-    certificate = certify(problem, law, value=problem.exact_value, settings=CHEAP, seed=3)
+    problem, (policy, truth) = Circle(), LAWS[name]
+    certificate = certify(problem, policy, value=problem.exact_value, settings=CHEAP, seed=3)
     low, high = certificate.perf["given"].interval(0.999)
     assert low <= truth <= high
     worse = truth / problem.exact_optimum - 1.0
@@ -142,16 +142,16 @@ def test_what_is_no_controller_is_refused_in_one_sentence(name):
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_derivatives_of_a_black_box_are_those_of_its_function(dtype):
-    law = lambda x: torch.stack([(TURN * x[:, 0]).sin(), x[:, 1].cos() * (TURN * x[:, 0]).cos()], dim=-1)
-    box = BlackBox(lambda x: law(x.to(dtype)), Manufactured(dim=2))
+    policy = lambda x: torch.stack([(TURN * x[:, 0]).sin(), x[:, 1].cos() * (TURN * x[:, 0]).cos()], dim=-1)
+    box = BlackBox(lambda x: policy(x.to(dtype)), Manufactured(dim=2))
     x = 0.1 + 0.8 * torch.rand(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     tangent = torch.randn(20, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     forward = torch.func.jvp(box, (x,), (tangent,))[1]
     _, pull = torch.func.vjp(box, x)
     close = dict(rtol=0.0, atol=1e-6 if dtype is torch.float64 else 2e-2)
-    torch.testing.assert_close(forward, torch.func.jvp(law, (x,), (tangent,))[1], **close)
-    torch.testing.assert_close(pull(tangent)[0], torch.func.vjp(law, x)[1](tangent)[0], **close)
-    torch.testing.assert_close(box(x + 3.0), law(x), rtol=0.0, atol=1e-5)
+    torch.testing.assert_close(forward, torch.func.jvp(policy, (x,), (tangent,))[1], **close)
+    torch.testing.assert_close(pull(tangent)[0], torch.func.vjp(policy, x)[1](tangent)[0], **close)
+    torch.testing.assert_close(box(x + 3.0), policy(x), rtol=0.0, atol=1e-5)
 
 
 class Sine(torch.nn.Module):
@@ -173,7 +173,7 @@ def test_files_are_loaded_or_refused(tmp_path):
     controllers("dual")[0].save(tmp_path / "controller.safetensors")
     x = torch.rand(5, 1, dtype=torch.float64)
     for source in ("law.py:u", "law.pt"):
-        found = BlackBox(load_law(str(tmp_path / source), Circle()), Circle())(x)
+        found = BlackBox(load_policy(str(tmp_path / source), Circle()), Circle())(x)
         torch.testing.assert_close(found, 0.3 * (TURN * x).sin(), rtol=1e-6, atol=1e-6)
     (tmp_path / "broken.pt").write_text("nothing")
     (tmp_path / "broken.py").write_text("def u(x:")
@@ -187,7 +187,7 @@ def test_files_are_loaded_or_refused(tmp_path):
     }
     for source, words in refusals.items():
         with pytest.raises(InputError, match=words):
-            load_law(str(tmp_path / source), Circle())
+            load_policy(str(tmp_path / source), Circle())
 
 
 @pytest.mark.slow

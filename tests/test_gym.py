@@ -47,7 +47,7 @@ def test_a_state_is_drawn_as_clocks():
     assert (one != other).any()
 
 
-SIMULABLE = sorted(name for name, c in PROBLEMS.items() if c.evaluable)
+SIMULABLE = sorted(name for name, c in PROBLEMS.items() if c.has_simulator)
 
 
 @pytest.mark.parametrize("name", SIMULABLE)
@@ -270,16 +270,16 @@ def test_the_pendulum_is_gymnasiums_over_a_short_time(theirs):
 
 def test_a_saved_pendulum_controller_plays_gymnasiums_untouched(gymnasium, tmp_path):
     """The classical swing-up through the same maps: what does not swing up returns about -1200."""
-    from ocp_torch.runs.practice import classical_law
+    from ocp_torch.runs.practice import classical_policy
 
     pendulum = PROBLEMS["pendulum"](torque_cost=0.001, control_limit=1.0)
-    law = classical_law(pendulum)
+    policy = classical_policy(pendulum)
 
     class Classical:
         problem = pendulum
 
         def __call__(self, x):
-            return law(torch.from_numpy(x)).numpy()
+            return policy(torch.from_numpy(x)).numpy()
 
     env = made("Pendulum-v1", None)
     found = play(Classical(), env, "Pendulum-v1", 20, 0)

@@ -17,7 +17,7 @@ from ocp_torch.control.policies import CLOSED, NETWORK
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems import Dataset
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.samples import Samples
 from test_recording import Exactly, certificate_of, record
 
@@ -145,7 +145,7 @@ def certified(problem, occupation, settings=CHEAP):
     names = ("control_density", "log_occupation") if occupation == NETWORK else ("control_density",)
     fields = Fields.build(problem, names, partial(PeriodicMLP, width=8, depth=1), 3)
     trained = Trained(fields, occupation, partial(PeriodicMLP, width=8, depth=1))
-    return certify_fields(problem, trained, resolve_bounds(problem), settings, Run("jump", "primal"))
+    return certify_fields(problem, trained, resolve_constants(problem), settings, Run("jump", "primal"))
 
 
 @pytest.mark.parametrize("width", [0.0, 1e-6])

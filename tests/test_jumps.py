@@ -96,8 +96,8 @@ REGULAR = {
 @pytest.mark.parametrize("dim", [1, 3])
 @pytest.mark.parametrize("name", JUMPING)
 def test_jumps_are_found_with_their_size(name, dim):
-    law, size = JUMPING[name]
-    found = largest_jump(lambda x: law(x[:, :1]), dim)
+    policy, size = JUMPING[name]
+    found = largest_jump(lambda x: policy(x[:, :1]), dim)
     assert found.size == pytest.approx(size, rel=1e-3)
 
 

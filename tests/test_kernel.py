@@ -11,7 +11,7 @@ from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields
 from ocp_torch.fields.sobolev import SobolevFeatures, SobolevField
 from ocp_torch.objectives import METHODS
 from ocp_torch.problems import Manufactured
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_trainer
 from ocp_torch.steppers import schedule_maker
@@ -112,9 +112,9 @@ def test_a_rule_is_minus_the_gradient_of_the_package_s_loss(method, name, tight)
     if method == "primal" and not problem.driftless:
         return
     given = dict(occupation_bound=0.3, value_bound=0.1) if tight else dict(occupation_bound=2.0, value_bound=2.0)
-    bounds = resolve_bounds(problem, **given)
-    rule = RULES[method](problem, bounds)
-    objective = METHODS[method](problem, bounds, **PLAIN[method])
+    constants = resolve_constants(problem, **given)
+    rule = RULES[method](problem, constants)
+    objective = METHODS[method](problem, constants, **PLAIN[method])
     moving = 0
     for seed, size in enumerate((0.03, 0.3, 3.0)):
         fields = random_fields(problem, rule.fields, seed, size)
@@ -140,13 +140,15 @@ def test_a_rule_is_minus_the_gradient_of_the_package_s_loss(method, name, tight)
 def test_the_primal_rule_meets_all_of_its_branches():
     """Free mass, mass at the bound, and mass that is given up, each at some state of the test above."""
     problem = Costly()
-    bounds = resolve_bounds(problem, occupation_bound=2.0, value_bound=0.5)
+    constants = resolve_constants(problem, occupation_bound=2.0, value_bound=0.5)
     fields, x = random_fields(problem, (CONTROL_DENSITY,), 1, 0.3), zoo.states(problem, 200)
     samples = Samples.of(problem, x)
     jets = fields.control_density.features.jets(x).numpy()
     columns = (samples.x, samples.f, samples.a, samples.B, samples.mu0, samples.div_B)
     theta = fields.control_density.coefficients.detach().numpy().T
-    step = RULES["primal"](problem, bounds)(Datum(*(c.numpy() for c in columns), jets), {CONTROL_DENSITY: jets @ theta})
+    step = RULES["primal"](problem, constants)(
+        Datum(*(c.numpy() for c in columns), jets), {CONTROL_DENSITY: jets @ theta}
+    )
     push = np.abs(step[CONTROL_DENSITY][:, 1:]).max(axis=(1, 2)) / np.abs(samples.B.numpy()).max(axis=(1, 2))
     push *= problem.discount
     free, kept, lost = push < 1e-12, (push > 1e-6) & (push < 0.5 - 1e-6), push > 0.5 - 1e-9
@@ -157,16 +159,16 @@ def test_the_primal_rule_meets_all_of_its_branches():
 
 def iterations(problem, method, steps, modes, radius=None, regularity=2, seeds=(0, 1), size=2e-3):
     """The exact iteration and its truncations to each of ``modes``, after the same steps on the same samples."""
-    bounds = resolve_bounds(problem, occupation_bound=2.0, value_bound=2.0)
+    constants = resolve_constants(problem, occupation_bound=2.0, value_bound=2.0)
     sizes = step_sizes(size, steps)
     exact = Iteration(
-        problem, method, bounds, seeds, kernel=BernoulliKernel(regularity), capacity=2 * steps, radius=radius
+        problem, method, constants, seeds, kernel=BernoulliKernel(regularity), capacity=2 * steps, radius=radius
     )
     exact.advance(sizes)
     truncated = []
     for count in modes:
         features = SobolevFeatures(problem.dim, regularity, modes=count)
-        truncated.append(Iteration(problem, method, bounds, seeds, features=features, radius=radius))
+        truncated.append(Iteration(problem, method, constants, seeds, features=features, radius=radius))
         truncated[-1].advance(sizes)
     return exact, truncated
 
@@ -226,11 +228,11 @@ def test_the_norm_kept_up_to_date_is_that_of_the_gram_matrix():
 
 
 def test_runs_side_by_side_are_the_runs_one_by_one():
-    problem, bounds = circle()
-    both = Iteration(problem, "pd", bounds, (3, 8), features=SobolevFeatures(1, modes=8))
+    problem, constants = circle()
+    both = Iteration(problem, "pd", constants, (3, 8), features=SobolevFeatures(1, modes=8))
     both.advance(step_sizes(1e-2, 50))
     for run, seed in enumerate((3, 8)):
-        alone = Iteration(problem, "pd", bounds, (seed,), features=SobolevFeatures(1, modes=8))
+        alone = Iteration(problem, "pd", constants, (seed,), features=SobolevFeatures(1, modes=8))
         alone.advance(step_sizes(1e-2, 50))
         for name in (VALUE, CONTROL_DENSITY):
             np.testing.assert_allclose(
@@ -247,7 +249,7 @@ def test_the_trainer_makes_the_paper_s_steps(method):
     trainer = build_trainer(config)
     trainer.fit(Silent())
     features = SobolevFeatures(1, modes=12)
-    iteration = Iteration(trainer.problem, method, trainer.bounds, (5,), features=features)
+    iteration = Iteration(trainer.problem, method, trainer.constants, (5,), features=features)
     iteration.advance(step_sizes(config["optimizer"]["lr"], steps))
     for name, network in iteration.fields(0).networks.items():
         theta = iteration.expansions[name].theta[0].T.reshape(network.coefficients.shape)
@@ -287,18 +289,18 @@ def test_the_theorems_step_sizes():
 def test_the_primal_with_drift_is_refused():
     problem = zoo.Swing()
     with pytest.raises(InputError, match="drift"):
-        Iteration(problem, "primal", resolve_bounds(problem), (0,), features=SobolevFeatures(2, modes=2))
+        Iteration(problem, "primal", resolve_constants(problem), (0,), features=SobolevFeatures(2, modes=2))
 
 
 @pytest.mark.slow
 def test_the_paper_s_dual_and_primal_after_five_and_twenty_thousand_samples():
     """Wide enough for any seed: eight seeds spread over 5.0-5.6 and 2.4-2.6 % (`F_M`), 0.37-0.75 and 0.12-0.23 % (`G`)."""
-    problem, bounds = circle()
-    judge = Judge(problem, bounds)
+    problem, constants = circle()
+    judge = Judge(problem, constants)
     wanted = {"dual": ("F_M", (-6.2, -4.4), (-3.0, -2.1)), "primal": ("G", (0.2, 1.1), (0.08, 0.32))}
     for method, size in (("dual", 5e-4), ("primal", 2e-3)):
         number, *ranges = wanted[method]
-        iteration = Iteration(problem, method, bounds, (11, 12), features=SobolevFeatures(1, modes=64))
+        iteration = Iteration(problem, method, constants, (11, 12), features=SobolevFeatures(1, modes=64))
         for steps, (low, high) in zip((5000, 15000), ranges, strict=True):
             iteration.advance(step_sizes(size, steps))
             for run in range(2):
@@ -310,9 +312,9 @@ def test_the_paper_s_dual_and_primal_after_five_and_twenty_thousand_samples():
 @pytest.mark.slow
 def test_the_paper_s_primal_dual_squeezes_the_optimum():
     """Weak duality at every look, and a gap that shrinks by the step."""
-    problem, bounds = circle()
-    judge, gaps = Judge(problem, bounds), []
-    iteration = Iteration(problem, "pd", bounds, (21,), features=SobolevFeatures(1, modes=64))
+    problem, constants = circle()
+    judge, gaps = Judge(problem, constants), []
+    iteration = Iteration(problem, "pd", constants, (21,), features=SobolevFeatures(1, modes=64))
     for steps in (2000, 4000, 10000):
         iteration.advance(step_sizes(1e-3, steps, "decay"))
         numbers = judge(iteration.fields(0), OCCUPATION["pd"], perf=False)

@@ -40,7 +40,7 @@ def test_the_liouville_residual_is_that_of_finite_differences(way):
     trainer = small(*WAYS[way], "trainer.dtype=float64")
     problem, fields, h = trainer.problem, trainer.fields, 1e-5
     x = torch.rand(64, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    density = occupation_density(trainer.objective.occupation, problem, fields, trainer.bounds)
+    density = occupation_density(trainer.objective.occupation, problem, fields, trainer.constants)
 
     def flux(x):
         pushed = torch.einsum("ndm,nm->nd", problem.control_matrix(x), fields.control_density(x))

@@ -490,7 +490,7 @@ def test_the_practitioners_numbers_hold_every_law_to_the_limit():
     pendulum = Pendulum(control_limit=0.3)
     reckless = lambda x: torch.full_like(x[:, :1], 50.0)
     at_limit = lambda x: torch.full_like(x[:, :1], 0.3)
-    one, other = (metrics(pendulum, law, seed=1, starts=8)["controller"] for law in (reckless, at_limit))
+    one, other = (metrics(pendulum, policy, seed=1, starts=8)["controller"] for policy in (reckless, at_limit))
     assert one == other
     assert math.isfinite(one["cost"])
 

@@ -7,11 +7,11 @@ import torch
 from PIL import Image
 
 import zoo
-from ocp_torch.control.policies import zero_law
+from ocp_torch.control.policies import zero_policy
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Arm, Circle, Unicycle
 from ocp_torch.runs.pictures import animate, motion
-from ocp_torch.runs.practice import classical_law, metrics, metrics_table, simulate
+from ocp_torch.runs.practice import classical_policy, metrics, metrics_table, simulate
 from ocp_torch.runs.practice.metrics import admissible, measure, random_starts
 
 # Whether the number should be larger than with no control.
@@ -48,8 +48,8 @@ def test_states_of_a_path_are_those_of_the_flow():
 @zoo.on(list(BETTER))
 def test_the_classical_controller_does_what_no_control_does_not(request, problem):
     number, larger = BETTER[request.node.callspec.params["problem"]]
-    law = classical_law(problem)
-    found = metrics(problem, law, seed=3, starts=48)
+    policy = classical_policy(problem)
+    found = metrics(problem, policy, seed=3, starts=48)
     gain = found["classical"][number] - found["zero"][number]
     assert gain >= 0.2 if larger else gain <= -0.2
     assert found["controller"] == found["classical"]
@@ -58,16 +58,16 @@ def test_the_classical_controller_does_what_no_control_does_not(request, problem
 
 def test_numbers_repeat_with_a_seed_and_change_with_another():
     arm = zoo.build("arm n=2")
-    found = [metrics(arm, zero_law(arm), seed=seed, starts=16) for seed in (3, 3, 4)]
+    found = [metrics(arm, zero_policy(arm), seed=seed, starts=16) for seed in (3, 3, 4)]
     assert found[0] == found[1]
     assert found[0]["zero"] != found[2]["zero"]
 
 
 def test_problems_that_ask_for_nothing_but_a_low_cost_have_no_numbers_and_no_scene():
     circle = zoo.build("circle rho=2")
-    assert metrics(circle, zero_law(circle)) is None
-    assert motion(circle, zero_law(circle)) is None
-    assert classical_law(circle) is None
+    assert metrics(circle, zero_policy(circle)) is None
+    assert motion(circle, zero_policy(circle)) is None
+    assert classical_policy(circle) is None
 
 
 def test_starts_keep_the_clearance_where_they_can():
@@ -94,7 +94,7 @@ def test_a_path_through_an_obstacle_is_no_success_although_it_reaches_the_target
 @pytest.mark.slow
 @zoo.on(["arm n=2", "unicycle", "kuramoto n=3", "pendulum"])
 def test_every_system_has_a_picture_that_is_drawn(problem, tmp_path):
-    figure = motion(problem, classical_law(problem))
+    figure = motion(problem, classical_policy(problem))
     figure.savefig(tmp_path / "motion.png", dpi=40)
     shades = Image.open(tmp_path / "motion.png").convert("L").getextrema()
     assert shades[0] < 100 < 250 < shades[1]
@@ -107,7 +107,7 @@ def test_an_animation_is_a_gif_whose_frames_differ(tmp_path, monkeypatch):
 
     monkeypatch.setattr(animation, "STRIDE", 80)
     kuramoto = zoo.build("kuramoto n=3")
-    with Image.open(animate(kuramoto, classical_law(kuramoto), tmp_path / "phases.gif")) as gif:
+    with Image.open(animate(kuramoto, classical_policy(kuramoto), tmp_path / "phases.gif")) as gif:
         assert gif.n_frames == 3
         frames = []
         for k in range(3):
@@ -119,8 +119,8 @@ def test_an_animation_is_a_gif_whose_frames_differ(tmp_path, monkeypatch):
 def test_animations_that_cannot_be_are_refused(tmp_path):
     kuramoto, circle = zoo.build("kuramoto n=3"), zoo.build("circle rho=2")
     with pytest.raises(InputError, match="must be a file that ends in .gif"):
-        animate(kuramoto, zero_law(kuramoto), tmp_path / "phases.mp4")
+        animate(kuramoto, zero_policy(kuramoto), tmp_path / "phases.mp4")
     with pytest.raises(InputError, match="no picture that moves"):
-        animate(circle, zero_law(circle), tmp_path / "circle.gif")
+        animate(circle, zero_policy(circle), tmp_path / "circle.gif")
     with pytest.raises(InputError, match="cannot be written"):
-        animate(kuramoto, zero_law(kuramoto), tmp_path / "none" / "phases.gif")
+        animate(kuramoto, zero_policy(kuramoto), tmp_path / "none" / "phases.gif")

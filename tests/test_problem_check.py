@@ -6,7 +6,7 @@ import torch
 import hostile_problems
 from hostile_problems import LEGAL, REFUSED, Good, with_
 from ocp_torch.errors import InputError
-from ocp_torch.problems import Callable
+from ocp_torch.problems import Simulator
 from ocp_torch.problems.check import check_once
 from ocp_torch.problems.mass import sampled_mass
 from ocp_torch.runs.build import build_problem
@@ -47,7 +47,7 @@ def test_a_simulator_is_held_against_the_same():
         return np.cos(2.0 * np.pi * x[:, 0]), None, np.ones((len(x), 2, 1))
 
     with pytest.raises(InputError, match="state_cost .* must be at least 0"):
-        check_once(Callable(oracle, dim=2, control_dim=1))
+        check_once(Simulator(oracle, dim=2, control_dim=1))
 
 
 @pytest.mark.parametrize(("dim", "width"), [(1, 0.004), (2, 0.004), (3, 0.03), (5, 0.03)])

@@ -18,13 +18,13 @@ import zoo
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.external.recorded import closed_loop_samples, groups
 from ocp_torch.control.controller import load_controller
-from ocp_torch.control.policies import NETWORK, control_laws
+from ocp_torch.control.policies import NETWORK, trained_policies
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.objectives import Dual, primal, saddle
 from ocp_torch.problems import Circle, Dataset, Manufactured
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.recorded import recording
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
@@ -240,7 +240,7 @@ def test_parts_are_disjoint_and_follow_the_seed(plain):
     assert torch.equal(problem.held_out.x, again.held_out.x)
     assert not torch.equal(problem.held_out.x, other.held_out.x)
     rows = lambda samples: {tuple(x) for x in samples.x.tolist()}
-    parts = [rows(problem.training), rows(problem.held_out), rows(problem.rehearsal.held_out)]
+    parts = [rows(problem.training), rows(problem.held_out), rows(problem.validation_view.held_out)]
     assert sum(map(len, parts)) == len(set.union(*parts)) == 1500
     assert len(problem.held_out) == 300
     sets = groups(problem.held_out)
@@ -266,9 +266,11 @@ def test_closed_loops_from_samples_are_those_of_the_problem(tmp_path, name):
     problem = zoo.build(name)
     data = Dataset(str(record(tmp_path, problem, 400)))
     fields = Fields({"value": zoo.rough_network(problem.dim, 1)})
-    law = control_laws(None, data, fields, resolve_bounds(data))["value"]
-    found = closed_loop_samples(data.held_out, law, data.control_cost)
-    true = Samples.of(ClosedLoop(problem, control_laws(None, problem, fields, resolve_bounds(data))["value"]), found.x)
+    policy = trained_policies(None, data, fields, resolve_constants(data))["value"]
+    found = closed_loop_samples(data.held_out, policy, data.control_cost)
+    true = Samples.of(
+        ClosedLoop(problem, trained_policies(None, problem, fields, resolve_constants(data))["value"]), found.x
+    )
     for column in ("f", "a", "div_a", "mu0"):
         torch.testing.assert_close(getattr(found, column), getattr(true, column), rtol=1e-9, atol=1e-9)
 
@@ -292,8 +294,8 @@ def certificate_of(data, problem, seed, value=None, steps=0):
     fields = Fields({"value": value}).double()
     settings_ = CertificateSettings(stage=StageSettings(steps=steps, rounds=1, batch=64))
     network = lambda **form: PeriodicMLP(width=16, depth=2, modes=2, **form)
-    bounds = resolve_bounds(data, occupation_bound=problem.occupation_bound)
-    return certify_fields(data, Trained(fields, None, network), bounds, settings_, Run("dataset", "dual", seed))
+    constants = resolve_constants(data, occupation_bound=problem.occupation_bound)
+    return certify_fields(data, Trained(fields, None, network), constants, settings_, Run("dataset", "dual", seed))
 
 
 @pytest.mark.slow
@@ -340,9 +342,9 @@ def test_nothing_is_claimed_that_samples_do_not_give(tmp_path):
         bare.control_matrix(torch.rand(2, 2))
     with pytest.raises(InputError, match="recorded states only"):
         bare.state_cost(torch.rand(2, 2))
-    bounds = resolve_bounds(bare)
-    assert {type(Dual(bare, bounds)).__name__, type(saddle(bare, bounds)).__name__} == {"Dual", "Saddle"}
-    assert type(primal(bare, bounds)).__name__ == "Saddle"
+    constants = resolve_constants(bare)
+    assert {type(Dual(bare, constants)).__name__, type(saddle(bare, constants)).__name__} == {"Dual", "Saddle"}
+    assert type(primal(bare, constants)).__name__ == "Saddle"
     certificate = certificate_of(bare, problem, 0, steps=3)
     assert certificate.upper["J"] is certificate.subject is None
     assert any("B varies" in w for w in certificate.warnings)
@@ -359,9 +361,9 @@ def test_a_torus_recorded_without_divergences_has_them_all_the_same(tmp_path):
     data = Dataset(str(record(tmp_path, zoo.build("torus 2-d chain"), 400, divergences=False)))
     assert data.driftless
     assert data.gives_divergences
-    assert primal(data, resolve_bounds(data)).occupation == NETWORK
+    assert primal(data, resolve_constants(data)).occupation == NETWORK
     with pytest.raises(InputError, match=r"method\.occupation"):
-        primal(data, resolve_bounds(data), occupation="closed")
+        primal(data, resolve_constants(data), occupation="closed")
 
 
 @pytest.mark.parametrize(("discount", "bounded"), [(4.0, True), (0.5, False)])
@@ -374,7 +376,7 @@ def test_a_density_without_bound_is_noticed_without_a_simulation(tmp_path, disco
     settings_ = CertificateSettings(stage=StageSettings(steps=200, rounds=1, batch=64))
     network = lambda **form: PeriodicMLP(width=24, depth=2, modes=3, **form)
     trained = Trained(fields, None, network)
-    given = resolve_bounds(data, occupation_bound=4.0)
+    given = resolve_constants(data, occupation_bound=4.0)
     found = certify_fields(data, trained, given, settings_, Run("dataset", "dual"))
     assert found.assumptions.occupation_holds is bounded
     assert (found.best_lower is not None) is bounded

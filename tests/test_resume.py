@@ -71,12 +71,12 @@ def test_the_looks_so_far_are_part_of_the_state(monkeypatch, tmp_path):
     way = ("method=dual", "trainer.evaluate_every=4")
     whole = small(*way)
     whole.fit(Recorder(tmp_path, 6, 13), tmp_path / "run" / "last.pt")
-    assert whole.watch.best.step == 8
+    assert whole.health.best.step == 8
     assert load_checkpoint(tmp_path / "run" / "best.pt")["step"] == 8
     for step, best in ((6, 4), (13, 8)):
         resumed = small(*way)
         resumed.resume(tmp_path / f"{step}.pt")
-        assert resumed.watch.best.step == best
+        assert resumed.health.best.step == best
         resumed.fit(Silent())
         assert differences(state_of(resumed), state_of(whole)) == []
 

@@ -23,7 +23,7 @@ from ocp_torch.maths import calculus
 from ocp_torch.maths.enclosure import Lipschitz, contradiction
 from ocp_torch.maths.taylor import Box, TaylorModel
 from ocp_torch.problems import Circle, Manufactured, Torus
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 
 # Every problem of the zoo in at most two dimensions that encloses its data, and a few odd ones.
 LOW = [n for n in zoo.EXACT if zoo.build(n).dim <= 2]
@@ -420,7 +420,7 @@ def certificate_of(problem, V, rigorous):
         points=256, replicates=2, trajectories=0, ascents=4, rigorous=rigorous, stage=StageSettings(steps=0)
     )
     trained = Trained(Fields({"value": V.requires_grad_(True)}), None, PeriodicMLP)
-    return certify_fields(problem, trained, resolve_bounds(problem), settings, Run("test", "dual"))
+    return certify_fields(problem, trained, resolve_constants(problem), settings, Run("test", "dual"))
 
 
 def test_the_certificate_carries_the_proved_bound_when_asked():

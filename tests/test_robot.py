@@ -8,7 +8,7 @@ from PIL import Image
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Arm, RobotArm
 from ocp_torch.runs.pictures import motion
-from ocp_torch.runs.practice import classical_law, metrics
+from ocp_torch.runs.practice import classical_policy, metrics
 
 IDENTITY = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 
@@ -145,11 +145,11 @@ def test_the_gap_to_a_ball_is_what_points_along_the_links_say():
 @pytest.mark.slow
 def test_the_resolved_rate_law_reaches_the_target_in_space_and_a_picture_shows_it(tmp_path):
     robot = RobotArm(**ELBOW_AMONG_BALLS)
-    law = classical_law(robot)
-    found = metrics(robot, law, seed=1, starts=24)
+    policy = classical_policy(robot)
+    found = metrics(robot, policy, seed=1, starts=24)
     assert found["classical"]["reached"] == 1.0
     assert found["zero"]["reached"] < 0.2
-    figure = motion(robot, law)
+    figure = motion(robot, policy)
     assert {axes.name for axes in figure.axes} == {"3d"}
     figure.savefig(tmp_path / "motion.png", dpi=40)
     shades = Image.open(tmp_path / "motion.png").convert("L").getextrema()

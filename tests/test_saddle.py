@@ -15,7 +15,7 @@ from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.objectives import primal, saddle
 from ocp_torch.objectives.saddle import AugmentedSaddle, Saddle
 from ocp_torch.problems import Manufactured
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.samples import Samples
 
 SMOOTH = {
@@ -53,7 +53,7 @@ def exact_fields(problem, **bumps) -> Fields:
 @pytest.mark.parametrize("problem", SMOOTH.values(), ids=SMOOTH.keys())
 @pytest.mark.parametrize("coupling", [0.0, 1.0])
 def test_no_player_gains_by_leaving_the_truth(problem, coupling):
-    objective = saddle(problem, resolve_bounds(problem), augmentation=0.5, coupling=coupling, warm_start=0.0)
+    objective = saddle(problem, resolve_constants(problem), augmentation=0.5, coupling=coupling, warm_start=0.0)
     samples = Samples.of(problem, scrambled_sobol(2**13, problem.dim, 3, torch.float64))
     at_truth = {k: float(v) for k, v in objective.losses(exact_fields(problem), samples).items()}
     for seed in range(6):
@@ -67,7 +67,7 @@ def test_no_player_gains_by_leaving_the_truth(problem, coupling):
 
 @pytest.mark.parametrize("problem", SMOOTH.values(), ids=SMOOTH.keys())
 def test_the_losses_at_the_truth_are_the_optimum(problem):
-    objective = saddle(problem, resolve_bounds(problem), augmentation=0.5, coupling=1.0, residual=7.0)
+    objective = saddle(problem, resolve_constants(problem), augmentation=0.5, coupling=1.0, residual=7.0)
     # The Lagrangian is 0 for either player there: what the other one pays is left out of its loss.
     samples = Samples.of(problem, scrambled_sobol(2**14, problem.dim, 3, torch.float64))
     losses = objective.losses(exact_fields(problem), samples)
@@ -78,7 +78,7 @@ def test_the_losses_at_the_truth_are_the_optimum(problem):
 def test_a_value_that_is_no_subsolution_leaves_the_density_player_bounded():
     """Against `V` above `f` the plain Lagrangian falls without end as `mu` grows; the clipped one must not."""
     problem = Manufactured(dim=2)
-    objective = saddle(problem, resolve_bounds(problem), warm_start=0.0)
+    objective = saddle(problem, resolve_constants(problem), warm_start=0.0)
     samples = Samples.of(problem, scrambled_sobol(1024, 2, 3, torch.float64))
     high = lambda x: torch.full_like(x[:, 0], 50.0)
     losses = []
@@ -90,7 +90,7 @@ def test_a_value_that_is_no_subsolution_leaves_the_density_player_bounded():
 
 def test_the_density_player_rests_during_the_warm_start_and_asks_for_no_divergences():
     problem = Manufactured(dim=1)
-    objective = saddle(problem, resolve_bounds(problem), warm_start=0.5)
+    objective = saddle(problem, resolve_constants(problem), warm_start=0.5)
     objective.progress = 0.49
     assert not objective.needs_divergences
     samples = Samples.of(problem, scrambled_sobol(64, 1, 3, torch.float64), divergences=False)
@@ -105,7 +105,7 @@ def test_the_density_player_works_on_states_that_carry_weight_and_on_so_many_at_
     both = [replace(drawn, weight=4 / 3 * drawn.weight), replace(visited, weight=torch.zeros_like(visited.weight))]
     batch = Samples.concatenate([replace(s, attention=torch.ones_like(s.f)) for s in both])
     fields = exact_fields(problem, value=lambda x: 0.1 * torch.sin(2 * math.pi * x[:, 0]))
-    loss = lambda samples, most: saddle(problem, resolve_bounds(problem), warm_start=0.0, density_batch=most).losses(
+    loss = lambda samples, most: saddle(problem, resolve_constants(problem), warm_start=0.0, density_batch=most).losses(
         fields, samples
     )["density"]
     torch.testing.assert_close(loss(batch, None), loss(drawn, None))
@@ -121,9 +121,9 @@ class WithoutDivergences(Manufactured):
 
 def test_without_divergences_each_method_falls_back_to_what_needs_none_and_says_so():
     problem = WithoutDivergences(dim=2)
-    bounds = resolve_bounds(problem)
-    for objective in (saddle(problem, bounds), primal(problem, bounds)):
+    constants = resolve_constants(problem)
+    for objective in (saddle(problem, constants), primal(problem, constants)):
         assert isinstance(objective, Saddle)
         assert not objective.needs_divergences
         assert "no divergences" in objective.notes[0]
-    assert isinstance(saddle(Manufactured(dim=2), bounds), AugmentedSaddle)
+    assert isinstance(saddle(Manufactured(dim=2), constants), AugmentedSaddle)

@@ -9,7 +9,7 @@ from adversarial import short_way
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.sides import lower_side
 from ocp_torch.problems import Circle, Problem
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.scan import odd_states
 
 
@@ -61,4 +61,4 @@ def test_the_package_s_own_problems_are_not_scanned_but_what_derives_from_them_i
 
     assert (Circle().scan_factor, Mine().scan_factor) == (0, 32)
     assert len(odd_states(Circle(), 0, seed=0)) == 0
-    assert resolve_bounds(Circle()).basis("M") == "given"
+    assert resolve_constants(Circle()).basis("M") == "given"

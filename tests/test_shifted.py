@@ -18,7 +18,7 @@ from ocp_torch.certificate.sides import lower_side
 from ocp_torch.fields import PeriodicMLP
 from ocp_torch.maths.calculus import value_and_gradient
 from ocp_torch.problems import Circle
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.samples import Samples
 
 
@@ -134,8 +134,8 @@ def test_a_narrow_spike_of_the_slack_is_averaged_out():
     ],
 )
 def test_functions_made_of_V_are_tried_where_no_M_will_do_or_somebody_says_so(mollify, unbounded, expected):
-    bounds = replace(resolve_bounds(Circle()), unbounded=unbounded)
-    assert CertificateSettings(mollify=mollify).searches(bounds) is expected
+    constants = replace(resolve_constants(Circle()), unbounded=unbounded)
+    assert CertificateSettings(mollify=mollify).searches(constants) is expected
 
 
 def test_large_sets_are_thinned_to_the_budget():

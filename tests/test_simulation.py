@@ -45,7 +45,7 @@ def test_end_states_are_wrapped_onto_the_torus():
     torch.testing.assert_close(end, torch.tensor([[0.75], [0.25]], dtype=torch.float64))
 
 
-def wrong_law(problem):
+def wrong_policy(problem):
     """The exact controller with a periodic mistake of size 0.4 in every component."""
     mistake = lambda x: 0.4 * (TURN * x[:, :1] + torch.arange(problem.control_dim).to(x)).sin()
     return lambda x: problem.exact_control(x) + mistake(x)
@@ -84,11 +84,11 @@ def test_the_exact_value_as_control_variate_leaves_nothing_to_simulate(problem):
 def test_a_control_variate_does_not_change_the_answer(problem):
     """Any smooth value function will do, and any controller: from the same starts nothing but the bias is left."""
     network = zoo.rough_network(problem.dim, seed=2, size=0.03)
-    law = wrong_law(problem) if problem.exact_optimum else lambda x: 0.5 * (TURN * x[:, :1]).sin()
+    policy = wrong_policy(problem) if problem.exact_optimum else lambda x: 0.5 * (TURN * x[:, :1]).sin()
     starts = [evaluation_points(8, problem.dim, SIMULATION_REPLICATE + r, seed=0) for r in range(2)]
     initial = [float((network(x) * problem.initial_density(x)).mean()) for x in starts]
-    plain = simulate_performance(problem, law, trajectories=8, replicates=2, seed=0).perf
-    varied = simulate_performance(problem, law, 8, 2, seed=0, value=network, initial=initial).perf
+    plain = simulate_performance(problem, policy, trajectories=8, replicates=2, seed=0).perf
+    varied = simulate_performance(problem, policy, 8, 2, seed=0, value=network, initial=initial).perf
     assert abs(plain.value - varied.value) <= plain.bias + varied.bias
     assert plain.bias + varied.bias < 1e-3 * plain.value
     assert varied.se == pytest.approx(plain.se, rel=0.05)
@@ -98,11 +98,11 @@ def test_a_control_variate_does_not_change_the_answer(problem):
 @zoo.on(("manufactured 1-d q=2", "manufactured 2-d mu0", "manufactured 2-d B(x)", "manufactured 3-d m=2"))
 def test_a_controller_loses_half_its_squared_distance_from_the_optimal_one(problem):
     """`Perf(u) - OPT = E_{mu^u} |u - u*|^2 / 2` for `q = 2` and smooth `V*`; the right side simulated by itself."""
-    law = wrong_law(problem)
-    perf = simulate_performance(problem, law, trajectories=64, replicates=8, seed=0).perf
-    half_square = lambda x: 0.5 * (law(x) - problem.exact_control(x)).square().sum(dim=-1)
+    policy = wrong_policy(problem)
+    perf = simulate_performance(problem, policy, trajectories=64, replicates=8, seed=0).perf
+    half_square = lambda x: 0.5 * (policy(x) - problem.exact_control(x)).square().sum(dim=-1)
     x0 = torch.cat([evaluation_points(64, problem.dim, r, seed=7) for r in range(8)])
-    dynamics = lambda x: (problem.velocity(x, law(x)), half_square(x))
+    dynamics = lambda x: (problem.velocity(x, policy(x)), half_square(x))
     losses, _ = discounted_integral(dynamics, x0, problem.discount, 12.0 / problem.discount, 200)
     per_set = (problem.initial_density(x0) * losses).reshape(8, -1).mean(dim=1)
     loss, error = float(per_set.mean()), float(per_set.std()) / math.sqrt(8.0)

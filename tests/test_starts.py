@@ -12,14 +12,14 @@ from ocp_torch.certificate.checks.wellposed import check_problem
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.sides import lower_side
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
-from ocp_torch.control.policies import zero_law
+from ocp_torch.control.policies import zero_policy
 from ocp_torch.gym.environment import make_environment
 from ocp_torch.maths.mixtures import Mixture, fitted_mixture, worth
 from ocp_torch.maths.sampling import evaluation_points
-from ocp_torch.problems import Callable, Problem
-from ocp_torch.problems.constants import OCCUPATION_WEIGHT, resolve_bounds
+from ocp_torch.problems import Problem, Simulator
+from ocp_torch.problems.constants import OCCUPATION_WEIGHT, resolve_constants
 from ocp_torch.problems.samples import Samples
-from ocp_torch.problems.starts import drawn_starts, initial_points, start_law
+from ocp_torch.problems.starts import drawn_starts, initial_points, start_distribution
 from ocp_torch.runs.practice.metrics import random_starts
 
 NARROW = {
@@ -45,13 +45,13 @@ def assert_near(estimate: Estimate, truth: float, most: float):
 
 
 def test_doing_nothing_from_a_narrow_start_costs_what_it_costs(narrow):
-    perf = simulate_performance(narrow, zero_law(narrow), 64, 8, seed=0).perf
+    perf = simulate_performance(narrow, zero_policy(narrow), 64, 8, seed=0).perf
     assert_near(perf, narrow.idle, 0.4)
 
 
 def test_the_random_horizon_starts_there_too():
     problem = NarrowStart(*NARROW["2-d"])
-    perf = simulate_performance(problem, zero_law(problem), 128, 8, seed=0, horizon="random").perf
+    perf = simulate_performance(problem, zero_policy(problem), 128, 8, seed=0, horizon="random").perf
     assert_near(perf, problem.idle, 0.3)
 
 
@@ -119,16 +119,16 @@ def test_broad_starts_are_the_points_they_were(problem):
 
 def test_weights_are_one_over_the_density_of_the_points():
     """Histograms of the points themselves, against the density that is claimed."""
-    law = Mixture(
+    distribution = Mixture(
         torch.tensor([0.3, 0.4], dtype=torch.float64),
         torch.tensor([[0.1], [0.95]], dtype=torch.float64),
         torch.tensor([[0.3], [0.02]], dtype=torch.float64),
     )
-    x, weight = law.draw(2**15, 0, 0)
+    x, weight = distribution.draw(2**15, 0, 0)
     bins = 64
     counts = torch.histc(x[:, 0], bins, 0.0, 1.0) / len(x)
     fine = ((torch.arange(bins * 64, dtype=torch.float64) + 0.5) / (bins * 64)).unsqueeze(-1)
-    claimed = law.density(fine).reshape(bins, 64).mean(dim=1) / bins
+    claimed = distribution.density(fine).reshape(bins, 64).mean(dim=1) / bins
     assert float((counts - claimed).abs().max()) < 3e-4
     assert float(weight.mean()) == pytest.approx(1.0, abs=1e-3)
     assert float(weight.max()) <= 1.0 / 0.3 + 1e-3
@@ -150,8 +150,8 @@ def two_peaks(x):
     ids=["two peaks", "a peak on a plain", "a slit", "a box", "a ridge"],
 )
 def test_what_is_fitted_serves_to_integrate(dim, function, truth):
-    law = fitted_mixture(function, dim).scaled(0.875)
-    sets = [law.draw(512, r, 1) for r in range(8)]
+    distribution = fitted_mixture(function, dim).scaled(0.875)
+    sets = [distribution.draw(512, r, 1) for r in range(8)]
     values = [weight * function(x) for x, weight in sets]
     assert_near(Estimate.of([float(v.mean()) for v in values]), truth, 0.2)
     assert worth(torch.cat(values)) > 0.25
@@ -169,7 +169,7 @@ def test_starts_that_count_the_same_are_drawn_from_the_density():
 def test_the_guess_of_M_knows_how_high_a_narrow_start_is(name):
     problem = NarrowStart(*NARROW[name])
     peak = float(problem.initial_density(torch.tensor([problem.centre], dtype=torch.float64)))
-    assert 0.5 * OCCUPATION_WEIGHT * peak < resolve_bounds(problem).M <= OCCUPATION_WEIGHT * peak
+    assert 0.5 * OCCUPATION_WEIGHT * peak < resolve_constants(problem).M <= OCCUPATION_WEIGHT * peak
 
 
 def test_episodes_of_the_environment_start_there():
@@ -186,9 +186,9 @@ def test_a_simulator_is_asked_at_few_states_for_it():
         asked.append(len(x))
         return np.ones(len(x)), None, np.broadcast_to(np.eye(2), (len(x), 2, 2))
 
-    problem = Callable(oracle, dim=2)
+    problem = Simulator(oracle, dim=2)
     asked.clear()
-    assert start_law(problem).is_uniform
+    assert start_distribution(problem).is_uniform
     assert sum(asked) < 6000
 
 
@@ -198,4 +198,4 @@ def test_the_same_starts_come_again():
         torch.equal(a, b)
         for a, b in zip(initial_points(problem, 64, 3, 7), initial_points(other, 64, 3, 7), strict=True)
     )
-    assert not start_law(problem).is_uniform
+    assert not start_distribution(problem).is_uniform

@@ -15,7 +15,7 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.run import run_session
 from ocp_torch.steppers import NonFiniteError
-from ocp_torch.training.health import Look, Watch, best_constant
+from ocp_torch.training.health import Evaluation, Health, best_constant
 from ocp_torch.training.monitor import Silent
 from ocp_torch.training.trainer import Trainer
 from test_training import small
@@ -140,7 +140,7 @@ def test_where_averages_are_certified_spikes_in_a_look_decide_nothing(monkeypatc
     """The last look is bad; averaged, it is as good as the best one, or it is not; without averages it counts as it is."""
     trainer = small(f"problem={problem}", *WAY)
     trainer.step = 20
-    trainer.watch.looked(Look(4, 0.1, 1.0, 0.0), trainer.averaged_fields)
+    trainer.health.looked(Evaluation(4, 0.1, 1.0, 0.0), trainer.averaged_fields)
     with_gap = lambda gap: certificate(trainer.run, gap)
     monkeypatch.setattr(trainer, "look", lambda: with_gap(0.5))
     monkeypatch.setattr(trainer, "_quick", lambda settings, fields=None: with_gap(last if fields is None else 0.1))
@@ -155,14 +155,14 @@ def test_the_last_fields_are_handed_out_unless_they_are_clearly_worse(tmp_path, 
     last = trainer.averaged_fields.state_dict()
     assert all(torch.equal(t, last[n]) for n, t in tried[0][1].items())
     assert not any("handed out" in w for w in made.warnings)
-    noisy, worse = Look(1, 0.10, 1.0, 0.02), Look(2, 0.12, 1.0, 0.02)
+    noisy, worse = Evaluation(1, 0.10, 1.0, 0.02), Evaluation(2, 0.12, 1.0, 0.02)
     assert noisy.better_than(worse)
     assert not noisy.better_than(worse, sure=True)
-    assert noisy.better_than(Look(2, 0.15, 1.0, 0.02), sure=True)
-    assert noisy.better_than(Look(2, None, 0.1, 0.0))
-    assert Look(1, None, 1.0, 0.01).better_than(Look(2, None, 1.1, 0.01), sure=True)
-    assert not Look(1, None, 1.0, 0.06).better_than(Look(2, None, 1.1, 0.06), sure=True)
-    assert not Look(1, None, None, 0.0).better_than(None)
+    assert noisy.better_than(Evaluation(2, 0.15, 1.0, 0.02), sure=True)
+    assert noisy.better_than(Evaluation(2, None, 0.1, 0.0))
+    assert Evaluation(1, None, 1.0, 0.01).better_than(Evaluation(2, None, 1.1, 0.01), sure=True)
+    assert not Evaluation(1, None, 1.0, 0.06).better_than(Evaluation(2, None, 1.1, 0.06), sure=True)
+    assert not Evaluation(1, None, None, 0.0).better_than(None)
 
 
 def test_a_hopeless_run_is_told_plainly(tmp_path, monkeypatch, caplog):
@@ -179,22 +179,22 @@ def test_a_hopeless_run_is_told_plainly(tmp_path, monkeypatch, caplog):
 
 
 def test_the_best_constant_is_the_best_of_all_constants():
-    problem, bounds = Circle(), small("method=dual").bounds
+    problem, constants = Circle(), small("method=dual").constants
     x = (torch.arange(2**15, dtype=torch.float64).unsqueeze(-1) + 0.5) / 2**15
     f = problem.state_cost(x)
-    values = [float(c - bounds.M * (c - f).clamp_min(0.0).mean()) for c in torch.linspace(0.0, 0.3, 600)]
-    assert best_constant(problem, bounds, 0) == pytest.approx(max(values), rel=2e-4)
+    values = [float(c - constants.M * (c - f).clamp_min(0.0).mean()) for c in torch.linspace(0.0, 0.3, 600)]
+    assert best_constant(problem, constants, 0) == pytest.approx(max(values), rel=2e-4)
 
 
 def test_norms_that_grow_without_end_are_told_once_with_what_would_help():
-    watch, weights = Watch(unit=1.0), [torch.ones(4)]
-    assert watch.stepped(1, {"value": torch.tensor(-0.5)}, {"value": weights}) == []
-    assert watch.stepped(2, {"value": torch.tensor(-5e3)}, {"value": [90.0 * w for w in weights]}) == []
-    first = watch.stepped(3, {"value": torch.tensor(2e4)}, {"value": [200.0 * w for w in weights]})
+    health, weights = Health(unit=1.0), [torch.ones(4)]
+    assert health.stepped(1, {"value": torch.tensor(-0.5)}, {"value": weights}) == []
+    assert health.stepped(2, {"value": torch.tensor(-5e3)}, {"value": [90.0 * w for w in weights]}) == []
+    first = health.stepped(3, {"value": torch.tensor(2e4)}, {"value": [200.0 * w for w in weights]})
     assert len(first) == 2
     assert all("diverges" in s and "optimizer.lr" in s and "step 3" in s for s in first)
-    assert watch.stepped(4, {"value": torch.tensor(3e4)}, {"value": [300.0 * w for w in weights]}) == []
-    assert watch.notes == first
+    assert health.stepped(4, {"value": torch.tensor(3e4)}, {"value": [300.0 * w for w in weights]}) == []
+    assert health.notes == first
 
 
 def test_a_run_that_diverges_hands_out_its_best_look_and_still_fails(tmp_path, monkeypatch):
@@ -280,7 +280,7 @@ def test_bounds_that_contradict_each_other_stop_nothing_and_choose_nothing(tmp_p
     ((step, fields),) = tried
     assert (step, made.run.stopped) == (20, "steps")
     assert all(torch.equal(t, fields[n]) for n, t in trainer.averaged_fields.state_dict().items())
-    assert trainer.watch.best.step == 4
+    assert trainer.health.best.step == 4
     assert sum("contradicted each other at step 12" in line for line in caplog.messages) == 1
     said = json.loads((tmp_path / "certificate.json").read_text())
     assert "contradicts" in said["contradiction"]

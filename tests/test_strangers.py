@@ -32,7 +32,7 @@ from ocp_torch.problems.systems.urdf import read_chain
 from ocp_torch.runs import figures
 from ocp_torch.runs.compare import compare
 from ocp_torch.runs.evaluate import certify_saved, load_run, settings_for
-from ocp_torch.runs.loading import load_law
+from ocp_torch.runs.loading import load_policy
 from ocp_torch.runs.resume import read_configuration, saved_configuration
 from ocp_torch.runs.run import summary
 from ocp_torch.runs.start import prepare
@@ -180,11 +180,11 @@ def test_notes_of_a_checkpoint_and_of_a_controller_are_printed_escaped(run):
     changed(path, "watch/notes", [ESCAPE])
     trainer = going_on(run)().trainer
     assert all(line.isprintable() for line in summary(trainer).split("\n"))
-    assert trainer.watch.notes == [visible(ESCAPE)]
+    assert trainer.health.notes == [visible(ESCAPE)]
     changed(path, "watch/notes", [ESCAPE] * 10**5)
     assert "sentences" in refusal(going_on(run))
     remade(run, lambda m: m["bounds"].update(warnings=[ESCAPE]))
-    assert load_controller(run / "controller.safetensors").bounds.warnings == (visible(ESCAPE),)
+    assert load_controller(run / "controller.safetensors").constants.warnings == (visible(ESCAPE),)
 
 
 def test_a_problem_name_of_a_controller_is_printed_escaped(run, monkeypatch):
@@ -637,10 +637,10 @@ READERS = {
     "a graph": ("graph.npy", lambda p: Kuramoto(graph=str(p))),
     "a graph in text": ("graph.txt", lambda p: Kuramoto(graph=str(p))),
     "a robot": ("robot.urdf", lambda p: read_chain(p, None)),
-    "a function": ("mine.py", lambda p: load_law(f"{p}:u", Torus())),
+    "a function": ("mine.py", lambda p: load_policy(f"{p}:u", Torus())),
     "a target": ("mine.py", lambda p: resolved(f"{p}:u")),
-    "ONNX": ("mine.onnx", lambda p: load_law(str(p), Torus())),
-    "TorchScript": ("mine.pt", lambda p: load_law(str(p), Torus())),
+    "ONNX": ("mine.onnx", lambda p: load_policy(str(p), Torus())),
+    "TorchScript": ("mine.pt", lambda p: load_policy(str(p), Torus())),
     "a run": ("controller.safetensors", lambda p: load_run({"run": str(p), "problem": {}})),
     "what is compared": ("runs", lambda p: compare([p])),
 }
@@ -694,8 +694,8 @@ def test_each_script_says_so(script, arguments, tmp_path):
 def test_torchscript_is_called_code(tmp_path, caplog):
     torch.jit.script(torch.nn.Linear(2, 2)).save(str(tmp_path / "mine.pt"))
     with caplog.at_level(logging.WARNING):
-        load_law(str(tmp_path / "mine.pt"), Torus())
-        load_law(str(tmp_path / "mine.pt"), Torus())
+        load_policy(str(tmp_path / "mine.pt"), Torus())
+        load_policy(str(tmp_path / "mine.pt"), Torus())
     assert caplog.text.count("code that can write your files") == 1
     assert kind(tmp_path / "mine.pt") == "file"
 

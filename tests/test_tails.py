@@ -13,11 +13,11 @@ from ocp_torch.certificate.checks.tails import rarity, sharpened, widened
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
-from ocp_torch.control.policies import NETWORK, zero_law
+from ocp_torch.control.policies import NETWORK, zero_policy
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import resolve_bounds
-from ocp_torch.problems.starts import evaluation_law
+from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.problems.starts import evaluation_distribution
 from test_traps import Field
 
 SPIKES = {
@@ -47,7 +47,7 @@ def assert_covers(estimate: Estimate, truth: float, most: float = 0.05):
 def test_bounds_of_a_closed_loop_know_a_spike_of_the_cost(name):
     """Doing nothing keeps the uniform law: `J` and the Lagrangian bound are the mean cost."""
     problem = spike(name)
-    loop = ClosedLoop(problem, zero_law(problem))
+    loop = ClosedLoop(problem, zero_policy(problem))
     zero = lambda x: 0.0 * x[:, 0]
     judge = lambda sets: closed_loop_bounds(loop, zero, zero, loop.samples_of(sets), 1, "value")
     found = sharpened(judge, problem, replicated_samples(problem, 2048, 8, 0, divergences=False), 0)
@@ -58,7 +58,7 @@ def test_bounds_of_a_closed_loop_know_a_spike_of_the_cost(name):
 @pytest.mark.parametrize(("name", "speed"), [("1-d needle", 0.0), ("2-d", 0.0), ("2-d", 0.05), ("3-d", 0.0)])
 def test_a_simulated_cost_knows_a_spike_where_trajectories_start(name, speed):
     problem = spike(name, speed=speed)
-    low, high = simulate_performance(problem, zero_law(problem), 64, 8, 0).perf.interval(0.999)
+    low, high = simulate_performance(problem, zero_policy(problem), 64, 8, 0).perf.interval(0.999)
     assert low <= problem.idle <= high
 
 
@@ -111,7 +111,7 @@ def test_what_many_states_carry_is_left_alone():
 
 @zoo.on((*zoo.NATURAL, *zoo.FEW))
 def test_problems_without_spikes_keep_their_states(problem):
-    assert evaluation_law(problem).is_uniform
+    assert evaluation_distribution(problem).is_uniform
 
 
 @pytest.mark.parametrize("name", ["2-d", "2-d on waves"])
@@ -122,7 +122,7 @@ def test_a_certificate_of_doing_nothing_holds_what_it_costs(name):
     settings = CertificateSettings(
         points=8192, replicates=8, trajectories=32, ascents=8, occupation_states=0, stage=StageSettings(steps=0)
     )
-    certificate = certify_fields(problem, trained, resolve_bounds(problem), settings, Run("spike", "primal"))
+    certificate = certify_fields(problem, trained, resolve_constants(problem), settings, Run("spike", "primal"))
     assert_covers(certificate.upper["J"], problem.idle)
     low, high = certificate.perf["density"].interval(0.999)
     assert low <= problem.idle <= high

@@ -14,7 +14,7 @@ from ocp_torch.control.policies import NETWORK
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems import Circle, Manufactured
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 
 # Bounds must be true whatever is spent: here few starts, steps that are large, and nothing fitted.
 CHEAP = CertificateSettings(
@@ -42,10 +42,12 @@ class Field(torch.nn.Module):
         return self.formula(x) + self.weight
 
 
-def certified(problem, occupation=None, bounds=None, seed=0, settings=CHEAP, **formulas):
+def certified(problem, occupation=None, constants=None, seed=0, settings=CHEAP, **formulas):
     fields = Fields({name: f if isinstance(f, torch.nn.Module) else Field(f) for name, f in formulas.items()})
     trained = Trained(fields.float(), occupation, partial(PeriodicMLP, width=8, depth=1))
-    return certify_fields(problem, trained, bounds or resolve_bounds(problem), settings, Run("trap", "trap", seed))
+    return certify_fields(
+        problem, trained, constants or resolve_constants(problem), settings, Run("trap", "trap", seed)
+    )
 
 
 def assert_true(certificate, optimum):
@@ -106,7 +108,7 @@ def test_a_density_that_is_zero_on_a_region(flux):
 
 def test_a_controller_that_leaves_its_bound():
     problem = Circle()
-    certificate = certified(problem, value=problem.exact_value, bounds=resolve_bounds(problem, control_bound=0.1))
+    certificate = certified(problem, value=problem.exact_value, constants=resolve_constants(problem, control_bound=0.1))
     assert any("beyond C_u" in w for w in certificate.warnings)
     assert_true(certificate, problem.exact_optimum)
 
@@ -223,8 +225,8 @@ class Hidden(Circle):
 @pytest.mark.parametrize("discount", [1.05, 1.2, 2.0])
 def test_half_of_sup_mu_is_caught_on_a_problem_that_does_not_know_it(discount, seed):
     problem = Hidden(discount)
-    half = resolve_bounds(problem, occupation_bound=0.5 * problem.true_sup)
-    certificate = certified(problem, bounds=half, seed=seed, settings=LOOKING, value=problem.exact_value)
+    half = resolve_constants(problem, occupation_bound=0.5 * problem.true_sup)
+    certificate = certified(problem, constants=half, seed=seed, settings=LOOKING, value=problem.exact_value)
     assert certificate.gap["lower_from"] == "shifted"
     assert not certificate.assumptions.hold
     assert any("F_M is not used" in w for w in certificate.warnings)
@@ -234,7 +236,7 @@ def test_twice_sup_mu_is_believed():
     problem = Hidden(2.0)
     certificate = certified(
         problem,
-        bounds=resolve_bounds(problem, occupation_bound=2.0 * problem.true_sup),
+        constants=resolve_constants(problem, occupation_bound=2.0 * problem.true_sup),
         settings=LOOKING,
         value=problem.exact_value,
     )
@@ -244,8 +246,8 @@ def test_twice_sup_mu_is_believed():
 
 def test_an_unbounded_density_is_caught_without_being_told():
     problem = Hidden(0.8)
-    bounds = resolve_bounds(problem, occupation_bound=50.0)
-    certificate = certified(problem, bounds=bounds, settings=LOOKING, value=problem.exact_value)
+    constants = resolve_constants(problem, occupation_bound=50.0)
+    certificate = certified(problem, constants=constants, settings=LOOKING, value=problem.exact_value)
     assert not certificate.assumptions.occupation_holds
     assert certificate.to_dict()["assumptions"]["estimated_sup_occupation"] is None
 

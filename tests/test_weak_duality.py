@@ -21,7 +21,7 @@ from ocp_torch.objectives import Dual, primal, saddle
 from ocp_torch.objectives.primal import ClosedPrimal, NetworkPrimal
 from ocp_torch.problems import Problem, formulas
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import Bounds, resolve_bounds
+from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.problems.samples import Samples
 
 # Eight scramblings: beyond six standard errors no sampling noise is left to blame.
@@ -34,13 +34,13 @@ def sets_of(name: str) -> list[Samples]:
 
 
 @cache
-def bounds_of(name: str) -> Bounds:
-    return resolve_bounds(zoo.build(name))
+def bounds_of(name: str) -> Constants:
+    return resolve_constants(zoo.build(name))
 
 
-def paper_dual(problem: Problem, bounds: Bounds) -> Dual:
+def paper_dual(problem: Problem, constants: Constants) -> Dual:
     """`F_M` alone, without what training may add to it."""
-    return Dual(problem, bounds, residual=0.0)
+    return Dual(problem, constants, residual=0.0)
 
 
 def random_fields(problem: Problem, seed: int, size: float = 1.0) -> Fields:
@@ -107,8 +107,8 @@ def test_no_value_and_density_give_a_closed_loop_bound_below_the_optimum(name, s
     mistake = fields.control_density
     loop = ClosedLoop(problem, lambda x: problem.exact_control(x) + 0.1 * mistake(x))
     sets = [Samples.of(loop, samples.x) for samples in sets_of(name)]
-    bounds = closed_loop_bounds(loop, value, log_mu, sets, ascents=8, controller="value")
-    for bound in (bounds.lagrangian, bounds.J):
+    constants = closed_loop_bounds(loop, value, log_mu, sets, ascents=8, controller="value")
+    for bound in (constants.lagrangian, constants.J):
         assert bound.value >= problem.exact_optimum - ERRORS * bound.se - 1e-9
 
 
@@ -128,20 +128,20 @@ def test_the_lagrangian_bound_at_the_exact_truth_is_the_optimum(problem):
 @given(name=st.sampled_from(zoo.ALL), seed=st.integers(0, 10**6), size=st.sampled_from([0.1, 1.0, 5.0]))
 def test_losses_are_the_numbers_of_the_certificate(name, seed, size):
     problem, sets = zoo.build(name), sets_of(name)[:2]
-    fields, bounds = random_fields(problem, seed, size), bounds_of(name)
+    fields, constants = random_fields(problem, seed, size), bounds_of(name)
     mean = lambda objective, player: Estimate.of([float(objective.losses(fields, s)[player]) for s in sets]).value
     # One set at a time: with several the certificate takes off what plane waves explain of their noise.
-    alone = [lower_side(problem, fields.value, [s], bounds.M, ascents=1).F_M.value for s in sets]
+    alone = [lower_side(problem, fields.value, [s], constants.M, ascents=1).F_M.value for s in sets]
     F_M = Estimate.of(alone).value
-    assert mean(paper_dual(problem, bounds), "value") == pytest.approx(-F_M, rel=1e-9, abs=1e-9)
+    assert mean(paper_dual(problem, constants), "value") == pytest.approx(-F_M, rel=1e-9, abs=1e-9)
     J, G, *_ = upper_side(
-        problem, fields.control_density, occupation_density(NETWORK, problem, fields, bounds), sets, bounds.C_V
+        problem, fields.control_density, occupation_density(NETWORK, problem, fields, constants), sets, constants.C_V
     )
-    assert mean(NetworkPrimal(problem, bounds), "density") == pytest.approx(J.value, rel=1e-9)
+    assert mean(NetworkPrimal(problem, constants), "density") == pytest.approx(J.value, rel=1e-9)
     if problem.driftless:
-        assert mean(ClosedPrimal(problem, bounds), "density") == pytest.approx(G.value, rel=1e-9)
-        closed = occupation_density(CLOSED, problem, fields, bounds)
-        attained, least, *_ = upper_side(problem, fields.control_density, closed, sets, bounds.C_V)
+        assert mean(ClosedPrimal(problem, constants), "density") == pytest.approx(G.value, rel=1e-9)
+        closed = occupation_density(CLOSED, problem, fields, constants)
+        attained, least, *_ = upper_side(problem, fields.control_density, closed, sets, constants.C_V)
         assert attained.value == pytest.approx(least.value, rel=1e-9)
 
 
@@ -155,22 +155,22 @@ def test_the_primal_takes_the_closed_form_exactly_where_there_is_no_drift():
 def test_the_saddle_is_never_below_the_dual_and_meets_it_at_the_best_response(name, seed, size):
     """`inf_w Psi(V, w) = F_M(V)`, attained at `mu = M 1[Q > 0]`, `w = mu grad R*(-B^T grad V / rho)`."""
     problem, sets = zoo.build(name), sets_of(name)
-    fields, bounds = random_fields(problem, seed, size), bounds_of(name)
+    fields, constants = random_fields(problem, seed, size), bounds_of(name)
 
     def best_response(x):
         value, gradient = calculus.value_and_gradient(fields.value, x)
         samples = Samples.of(problem, x, divergences=False)
         slack = formulas.hjb_slack(samples, value, gradient, problem.control_cost, problem.discount)
         u = problem.control_cost.argmax(-formulas.pull_back(samples, gradient) / problem.discount)
-        return torch.where(slack > 0.0, bounds.M, 0.0).unsqueeze(-1) * u
+        return torch.where(slack > 0.0, constants.M, 0.0).unsqueeze(-1) * u
 
     class BestResponse(torch.nn.Module):
         forward = staticmethod(best_response)
 
-    paper_saddle = saddle(problem, bounds, augmentation=0.0)
+    paper_saddle = saddle(problem, constants, augmentation=0.0)
     best = Fields({"value": fields.value, "control_density": BestResponse()})
     for samples in sets[:2]:
-        dual = -float(paper_dual(problem, bounds).losses(fields, samples)["value"])
+        dual = -float(paper_dual(problem, constants).losses(fields, samples)["value"])
         losses = paper_saddle.losses(fields, samples)
         rounding = 1e-9 * (1.0 + abs(dual))
         assert float(losses["density"]) >= dual - rounding
@@ -184,7 +184,7 @@ def test_a_constant_is_worth_its_size_until_every_state_is_penalised(problem):
     samples = Samples.of(problem, zoo.states(problem, 2048))
     network, M = random_fields(problem, seed=1).value, problem.occupation_bound
     slack, mass = slack_function(problem, network)(samples.x), float(samples.mu0.mean())
-    dual = paper_dual(problem, replace(resolve_bounds(problem), M=M))
+    dual = paper_dual(problem, replace(resolve_constants(problem), M=M))
     F_M = lambda c: -float(dual.losses(SimpleNamespace(value=lambda x: network(x) + c), samples)["value"])
     free, penalised = -float(slack.max()), -float(slack.min())
     assert F_M(free) - F_M(free - 1.0) == pytest.approx(mass, abs=1e-9)
@@ -245,13 +245,13 @@ def test_relabelling_the_coordinates_changes_nothing(name):
     problem, sets = zoo.build(name), sets_of(name)[:2]
     order = [2, 0, 1] if problem.dim == 3 else [1, 0]
     other = Relabelled(problem, order)
-    fields, bounds = random_fields(problem, seed=5), bounds_of(name)
-    mu = occupation_density(NETWORK, problem, fields, bounds)
+    fields, constants = random_fields(problem, seed=5), bounds_of(name)
+    mu = occupation_density(NETWORK, problem, fields, constants)
     moved = [Samples.of(other, s.x[:, order]) for s in sets]
     read = lambda field: lambda y: field(y[:, other.inverse])
-    here = lower_side(problem, fields.value, sets, bounds.M, ascents=4)
-    there = lower_side(other, read(fields.value), moved, bounds.M, ascents=4)
+    here = lower_side(problem, fields.value, sets, constants.M, ascents=4)
+    there = lower_side(other, read(fields.value), moved, constants.M, ascents=4)
     assert there.F_M.value == pytest.approx(here.F_M.value, rel=1e-11)
-    J, *_ = upper_side(problem, fields.control_density, mu, sets, bounds.C_V)
-    J_there, *_ = upper_side(other, read(fields.control_density), read(mu), moved, bounds.C_V)
+    J, *_ = upper_side(problem, fields.control_density, mu, sets, constants.C_V)
+    J_there, *_ = upper_side(other, read(fields.control_density), read(mu), moved, constants.C_V)
     assert J_there.value == pytest.approx(J.value, rel=1e-11)

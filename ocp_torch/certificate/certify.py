@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ocp_torch.certificate.certificate import Certificate, Run
-from ocp_torch.certificate.checks.assumptions import Met, check_assumptions
+from ocp_torch.certificate.checks.assumptions import Observed, check_assumptions
 from ocp_torch.certificate.checks.contradictions import examined
 from ocp_torch.certificate.checks.regularity import largest_jump
 from ocp_torch.certificate.checks.tails import notes_on, sharpened
@@ -29,16 +29,16 @@ from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds, closed_loop
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
 from ocp_torch.control.policies import (
     CLOSED,
-    ControlLaw,
+    Policy,
     admissible_density,
-    control_laws,
     occupation_density,
-    zero_law,
+    trained_policies,
+    zero_policy,
 )
 from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.scan import odd_states
@@ -55,7 +55,7 @@ TANGENT_PART = 8
 
 @dataclass(frozen=True)
 class Trained:
-    """What training hands over: the fields, how they give `mu` (see `control_laws`), and the network they are made of."""
+    """What training hands over: the fields, how they give `mu` (see `trained_policies`), and the network they are made of."""
 
     fields: Fields
     occupation: str | None
@@ -75,7 +75,7 @@ def in_float64(fields: Fields) -> Fields:
 def certify_fields(
     problem: Problem,
     trained: Trained,
-    bounds: Bounds,
+    constants: Constants,
     settings: CertificateSettings,
     run: Run,
     progress: Progress = silent,
@@ -87,8 +87,8 @@ def certify_fields(
     """
     require_finite(trained.fields)
     progress("bounds")
-    if not problem.evaluable:
-        return certify_recorded(problem, trained, bounds, settings, run)
+    if not problem.has_simulator:
+        return certify_recorded(problem, trained, constants, settings, run)
     fields, occupation = in_float64(trained.fields), trained.occupation
     seed, count = run.seed, settings.replicates
     has_value, has_density = fields.value is not None, fields.control_density is not None
@@ -99,25 +99,25 @@ def certify_fields(
     if has_value:
         sets = replicated_samples(problem, settings.points, count, seed, divergences=False)
         lower = lower_side(
-            problem, fields.value, sets, bounds.M, settings.ascents, settings.searches(bounds), seed, odd
+            problem, fields.value, sets, constants.M, settings.ascents, settings.searches(constants), seed, odd
         )
     if settings.rigorous:
         progress("proof")
     proved, proof_notes = proved_lower(problem, fields.value, lower) if settings.rigorous and lower else (None, [])
     posed = check_problem(problem, sets if has_value else few)
-    laws = control_laws(occupation, problem, fields, bounds)
+    policies = trained_policies(occupation, problem, fields, constants)
     if settings.trajectories:
         progress("simulation")
-    simulated, zero = simulations(problem, laws, fields, lower, settings, seed)
+    simulated, zero = simulations(problem, policies, fields, lower, settings, seed)
     stage = None
     warnings: list[str] = []
     finite = {name: s for name, s in simulated.items() if s.perf.finite}
-    best = min(finite, key=lambda n: finite[n].perf.above, default=next(iter(laws)))
+    best = min(finite, key=lambda n: finite[n].perf.above, default=next(iter(policies)))
     J = G = hidden = None
     if has_density and problem.gives_divergences:
-        mu = occupation_density(occupation, problem, fields, bounds)
-        w = admissible_density(occupation, problem, fields, bounds)
-        J, G, hidden, _ = sharpened(lambda sets: upper_side(problem, w, mu, sets, bounds.C_V), problem, few, seed)
+        mu = occupation_density(occupation, problem, fields, constants)
+        w = admissible_density(occupation, problem, fields, constants)
+        J, G, hidden, _ = sharpened(lambda sets: upper_side(problem, w, mu, sets, constants.C_V), problem, few, seed)
         with torch.no_grad():
             vanishes = any(bool((mu(samples.x[:4096]) <= 0.0).any()) for samples in few)
         if best == "density" and vanishes:
@@ -126,12 +126,12 @@ def certify_fields(
             )
     if settings.stage.steps:
         progress("closed-loop fit")
-        stage, notes = certification_stage(problem, trained, fields, bounds, settings, few, lower, best, seed, odd)
+        stage, notes = certification_stage(problem, trained, fields, constants, settings, few, lower, best, seed, odd)
         warnings += notes
     progress("assumptions")
-    met = measured(problem, laws[best], finite.get(best), few, posed, settings)
-    assumptions, notes = check_assumptions(problem, bounds, met, uses=(has_value, J is not None))
-    warnings = list(bounds.warnings) + notes + warnings + proof_notes
+    met = measured(problem, policies[best], finite.get(best), few, posed, settings)
+    assumptions, notes = check_assumptions(problem, constants, met, uses=(has_value, J is not None))
+    warnings = list(constants.warnings) + notes + warnings + proof_notes
     # J bounds the performance of w / mu and G that of w over the mu of Lemma 2: of nothing else.
     speaks = {"J": best == "density", "G": best == "density" and occupation == CLOSED and assumptions.value_holds}
     if met.jump.in_problem or not posed.smooth_seam:
@@ -182,15 +182,15 @@ def require_finite(fields: Fields) -> None:
 
 def simulations(
     problem: Problem,
-    laws: dict[str, ControlLaw],
+    policies: dict[str, Policy],
     fields: Fields,
     lower: LowerSide | None,
     settings: CertificateSettings,
     seed: int,
 ) -> tuple[dict[str, Simulated], Estimate | None]:
-    """Performance of each of ``laws``, and of doing nothing.
+    """Performance of each of ``trained_policies``, and of doing nothing.
 
-    A law that is clearly worse than another on a quarter of the trajectories gets no more of them, where that saves time.
+    A policy that is clearly worse than another on a quarter of the trajectories gets no more of them, where that saves time.
     """
     if not settings.trajectories:
         return {}, None
@@ -204,44 +204,46 @@ def simulations(
     )
     few = max(2, settings.trajectories // BASELINE_PART)
     initial = lower.initial if lower else None
-    judge = lambda law, trajectories: simulate(law, trajectories=trajectories, value=fields.value, initial=initial)
-    pays = len(laws) > 1 and settings.trajectories * settings.replicates > CHEAP
-    found = {name: judge(law, few) for name, law in laws.items()} if pays else {}
+    judge = lambda policy, trajectories: simulate(
+        policy, trajectories=trajectories, value=fields.value, initial=initial
+    )
+    pays = len(policies) > 1 and settings.trajectories * settings.replicates > CHEAP
+    found = {name: judge(policy, few) for name, policy in policies.items()} if pays else {}
     best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
-    for name, law in laws.items():
+    for name, policy in policies.items():
         if name not in found or not found[name].perf.below > best:
-            found[name] = judge(law, settings.trajectories)
-    return found, simulate(zero_law(problem), trajectories=few).perf
+            found[name] = judge(policy, settings.trajectories)
+    return found, simulate(zero_policy(problem), trajectories=few).perf
 
 
 def measured(
     problem: Problem,
-    law: ControlLaw,
+    policy: Policy,
     simulated: Simulated | None,
     sets: list[Samples],
     posed: WellPosed,
     settings: CertificateSettings,
-) -> Met:
-    """What the assumptions are held against, under the controller ``law``."""
+) -> Observed:
+    """What the assumptions are held against, under the controller ``policy``."""
     with torch.no_grad():
-        sup_control = max(float(law(samples.x[:4096]).norm(dim=-1).max()) for samples in sets)
+        sup_control = max(float(policy(samples.x[:4096]).norm(dim=-1).max()) for samples in sets)
     states = torch.cat([samples.x[:256] for samples in sets])
     near = states if simulated is None else torch.cat([states, simulated.end_states[:4096]])
-    jump = largest_jump(law, problem.dim, problem=problem, near=near)
+    jump = largest_jump(policy, problem.dim, problem=problem, near=near)
     occupation = a_priori = None
     # Where the problem says that mu* is unbounded there is no M to hold a largest density against.
     if simulated is not None and settings.occupation_states and problem.occupation_bound != math.inf:
-        occupation = estimated_sup_occupation(problem, law, simulated.end_states, settings.occupation_states)
-        a_priori = a_priori_sup_occupation(problem, law, sets[0].x[:4096])
+        occupation = estimated_sup_occupation(problem, policy, simulated.end_states, settings.occupation_states)
+        a_priori = a_priori_sup_occupation(problem, policy, sets[0].x[:4096])
     largest_value = simulated.largest_value if simulated is not None else None
-    return Met(occupation, a_priori, sup_control, largest_value, jump, posed)
+    return Observed(occupation, a_priori, sup_control, largest_value, jump, posed)
 
 
 def certification_stage(
     problem: Problem,
     trained: Trained,
     fields: Fields,
-    bounds: Bounds,
+    constants: Constants,
     settings: CertificateSettings,
     sets: list[Samples],
     lower: LowerSide | None,
@@ -253,13 +255,13 @@ def certification_stage(
     ``fields`` are float64 copies."""
     if not problem.gives_divergences:
         return None, ["no upper bound without simulation: this problem gives no divergences of a and B."]
-    rough = control_laws(trained.occupation, problem, trained.fields, bounds)[kind]
+    rough = trained_policies(trained.occupation, problem, trained.fields, constants)[kind]
     try:
-        fitted = fit_closed_loop(problem, rough, trained.fields, trained.network, bounds, settings.stage, seed)
+        fitted = fit_closed_loop(problem, rough, trained.fields, trained.network, constants, settings.stage, seed)
     except ArithmeticError as error:
         return None, [f"the certification stage failed: {error}"]
     fitted = in_float64(fitted)
-    loop = ClosedLoop(problem, control_laws(trained.occupation, problem, fields, bounds)[kind])
+    loop = ClosedLoop(problem, trained_policies(trained.occupation, problem, fields, constants)[kind])
     value = fields.value if fields.value is not None else fitted.value
     initial = lower.initial if lower is not None else None
     judge = lambda sets: closed_loop_bounds(

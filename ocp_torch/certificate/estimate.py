@@ -13,7 +13,7 @@ from ocp_torch.certificate.student import t_factor
 from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
-from ocp_torch.problems.starts import evaluation_law
+from ocp_torch.problems.starts import evaluation_distribution
 
 # How often an interval covers the truth where nobody asks for another level.
 CONFIDENCE = 0.95
@@ -73,12 +73,12 @@ class Estimate:
 
 @torch.no_grad()
 def replicated_samples(
-    problem: Problem, count: int, replicates: int, seed: int, divergences: bool, law: Mixture | None = None
+    problem: Problem, count: int, replicates: int, seed: int, divergences: bool, policy: Mixture | None = None
 ) -> list[Samples]:
     """``replicates`` independent scrambled Sobol sets of ``count`` states with the problem's data, in float64; weighted, with
-    more states where `mu0` or `f` is large on a small set, or from ``law``."""
-    law = evaluation_law(problem) if law is None else law
-    sets = [law.draw(count, r, seed) for r in range(replicates)]
+    more states where `mu0` or `f` is large on a small set, or from ``policy``."""
+    policy = evaluation_distribution(problem) if policy is None else policy
+    sets = [policy.draw(count, r, seed) for r in range(replicates)]
     return [Samples.of(problem, x, divergences=divergences, weight=weight) for x, weight in sets]
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from ocp_torch.certificate.estimate import CONFIDENCE
 from ocp_torch.certificate.upper.policy_evaluation import StageSettings
 from ocp_torch.errors import require_choice, require_flag, require_integer, require_number
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 
 # However few the states of a certificate, its problem is scanned as if there were so many: a feature that is missed is one
@@ -50,6 +50,6 @@ class CertificateSettings:
         """How many states the data of ``problem`` are scanned at for narrow features."""
         return problem.scan_factor * max(self.points * self.replicates, LEAST_SCANNED)
 
-    def searches(self, bounds: Bounds) -> bool:
-        """Whether the bound without `M` is sought among functions made of `V` too, for a problem of these ``bounds``."""
-        return bounds.needs_no_M if self.mollify is None else self.mollify
+    def searches(self, constants: Constants) -> bool:
+        """Whether the bound without `M` is sought among functions made of `V` too, for a problem of these ``constants``."""
+        return constants.needs_no_M if self.mollify is None else self.mollify

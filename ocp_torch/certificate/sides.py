@@ -115,7 +115,7 @@ def upper_side(
 def _upper_integrands(problem, control_density, occupation, samples: Samples, C_V: float):
     """The integrands of `J` and, without drift, `G`; `div(a mu + B w)` and `a mu + B w`."""
     cost, rho = problem.control_cost, problem.discount
-    w, inflow = formulas.controlled_inflow(samples, control_density, rho)
+    w, inflow = formulas.control_inflow(samples, control_density, rho)
     spread, pushed = rho * (samples.mu0 - inflow), torch.einsum("ndm,nm->nd", samples.B, w)
     if problem.driftless:
         mu = occupation(samples.x)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, control_laws
+from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, trained_policies
 from ocp_torch.errors import InputError, notes
 from ocp_torch.fields import MODELS, Fields
 from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE
@@ -18,7 +18,7 @@ from ocp_torch.files.storage import finite, load_tensors, save_tensors
 from ocp_torch.problems import PROBLEMS, Problem
 from ocp_torch.problems.check import check_once
 from ocp_torch.problems.commands import ForeignProblem, made_by, naming
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 
 SCHEMA = 1
 FIELDS = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION)
@@ -34,7 +34,7 @@ class Controller:
 
     problem: Problem
     fields: Fields
-    bounds: Bounds
+    constants: Constants
     occupation: str | None
     kind: str
     model: dict
@@ -42,7 +42,7 @@ class Controller:
     config: dict
 
     def __post_init__(self) -> None:
-        self._law = control_laws(self.occupation, self.problem, self.fields, self.bounds)[self.kind]
+        self._law = trained_policies(self.occupation, self.problem, self.fields, self.constants)[self.kind]
         self._like = next(self.fields.parameters())
 
     def __call__(self, x: Tensor | np.ndarray) -> Tensor | np.ndarray:
@@ -68,7 +68,7 @@ class Controller:
             "dtype": str(self._like.dtype).removeprefix("torch."),
             "fields": list(self.fields.networks),
             "model": self.model,
-            "bounds": asdict(self.bounds),
+            "bounds": asdict(self.constants),
             "occupation": self.occupation,
             "kind": self.kind,
             "certificate": self.certificate,
@@ -155,11 +155,11 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
         fields = build().to(dtype=getattr(torch, metadata["dtype"]))
     fields.load_state_dict(tensors)
     fields = fields.to(device).requires_grad_(False)
-    bounds = Bounds(**{**metadata["bounds"], "warnings": notes(metadata["bounds"]["warnings"])})
+    constants = Constants(**{**metadata["bounds"], "warnings": notes(metadata["bounds"]["warnings"])})
     return Controller(
         problem=problem,
         fields=fields,
-        bounds=bounds,
+        constants=constants,
         occupation=metadata["occupation"],
         kind=metadata["kind"],
         model=model,

@@ -12,17 +12,17 @@ from ocp_torch.maths import calculus
 from ocp_torch.maths.calculus import Field
 from ocp_torch.objectives.objective import CLOSED, NETWORK, SADDLE
 from ocp_torch.problems import formulas
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# A control law maps states (N, d) to controls (N, m); a density maps them to (N,).
-ControlLaw = Callable[[Tensor], Tensor]
+# A policy maps states (N, d) to controls (N, m); a density maps them to (N,).
+Policy = Callable[[Tensor], Tensor]
 Density = Callable[[Tensor], Tensor]
 
 
-class ValueLaw:
+class ValuePolicy:
     """`u = grad R*(-B^T grad V / rho)` (Proposition 2): optimal when `V = V*`."""
 
     def __init__(self, problem: Problem, value: Field) -> None:
@@ -38,55 +38,57 @@ class ValueLaw:
         return self.problem.control_cost.argmax(-pull / self.problem.discount)
 
 
-def admissible_density(kind: str, problem: Problem, fields: Fields, bounds: Bounds) -> Field:
+def admissible_density(kind: str, problem: Problem, fields: Fields, constants: Constants) -> Field:
     """`w` of trained fields, within what a limit on the control allows: `mu` of Lemma 2 leaves room for any `w` already."""
     w = fields.control_density
     return (
-        w if kind == CLOSED else problem.control_cost.admissible(w, occupation_density(kind, problem, fields, bounds))
+        w
+        if kind == CLOSED
+        else problem.control_cost.admissible(w, occupation_density(kind, problem, fields, constants))
     )
 
 
-def density_law(control_density: Field, occupation: Density, cost: PowerCost) -> ControlLaw:
+def density_policy(control_density: Field, occupation: Density, cost: PowerCost) -> Policy:
     """`u = w / mu`, within the limit of ``cost``; 0 where `mu` is 0 (nobody is there) or infinite (mass stands still)."""
 
-    def law(x: Tensor) -> Tensor:
+    def policy(x: Tensor) -> Tensor:
         mu = occupation(x)
         usable = (mu > 0) & torch.isfinite(mu)
         mu = torch.where(usable, mu, 1.0)
         return torch.where(usable.unsqueeze(-1), cost.within(control_density(x), mu) / mu.unsqueeze(-1), 0.0)
 
-    return law
+    return policy
 
 
-def zero_law(problem: Problem) -> ControlLaw:
+def zero_policy(problem: Problem) -> Policy:
     """`u = 0`, what the certificate calls doing nothing."""
     return lambda x: x.new_zeros(len(x), problem.control_dim)
 
 
-def occupation_density(kind: str, problem: Problem, fields: Fields, bounds: Bounds) -> Density:
+def occupation_density(kind: str, problem: Problem, fields: Fields, constants: Constants) -> Density:
     """`mu(x)` of trained fields: ``closed`` (Lemma 2, no drift), ``saddle`` (Lemma 3) or ``network`` (`exp log mu`)."""
     cost, rho = problem.control_cost, problem.discount
 
     def closed(x: Tensor) -> Tensor:
         samples = Samples.of(problem, x)
-        w, inflow = formulas.controlled_inflow(samples, fields.control_density, rho)
-        return cost.primal_occupation(w, samples.f, bounds.C_V, inflow)
+        w, inflow = formulas.control_inflow(samples, fields.control_density, rho)
+        return cost.primal_occupation(w, samples.f, constants.C_V, inflow)
 
     def saddle(x: Tensor) -> Tensor:
         value, gradient = calculus.value_and_gradient(fields.value, x)
         beta = problem.state_cost(x) - value + (gradient * problem.drift(x)).sum(dim=-1) / rho
-        return cost.saddle_occupation(fields.control_density(x), beta, bounds.M)
+        return cost.saddle_occupation(fields.control_density(x), beta, constants.M)
 
     return {CLOSED: closed, SADDLE: saddle, NETWORK: lambda x: fields.log_occupation(x).exp()}[kind]
 
 
-def control_laws(kind: str | None, problem: Problem, fields: Fields, bounds: Bounds) -> dict[str, ControlLaw]:
+def trained_policies(kind: str | None, problem: Problem, fields: Fields, constants: Constants) -> dict[str, Policy]:
     """The controllers trained fields give: ``value`` if they hold `V`, ``density`` if they hold `w`."""
-    laws = {}
+    policies = {}
     if fields.value is not None:
-        laws["value"] = ValueLaw(problem, fields.value)
+        policies["value"] = ValuePolicy(problem, fields.value)
     # Lemmas 2 and 3 give mu from the cost at the state itself.
-    if fields.control_density is not None and (kind == NETWORK or problem.evaluable):
-        mu = occupation_density(kind, problem, fields, bounds)
-        laws["density"] = density_law(fields.control_density, mu, problem.control_cost)
-    return laws
+    if fields.control_density is not None and (kind == NETWORK or problem.has_simulator):
+        mu = occupation_density(kind, problem, fields, constants)
+        policies["density"] = density_policy(fields.control_density, mu, problem.control_cost)
+    return policies

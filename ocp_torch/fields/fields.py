@@ -87,7 +87,7 @@ def _waves(problem: Problem, count: int) -> Tensor:
 def cost_unit(problem: Problem) -> float:
     """What losses are divided by before they are differentiated: 1 for costs of an ordinary size, else the power of two next
     to their mean, so that no optimiser takes a gradient of 1e-12 for none."""
-    (f,) = problem.survey(1024, 0, "f")
+    (f,) = problem.probe(1024, 0, "f")
     size = float(f.abs().mean())
     ordinary = not math.isfinite(size) or size == 0.0 or 1.0 / ORDINARY <= size <= ORDINARY
     return 1.0 if ordinary else 2.0 ** round(math.log2(size))
@@ -98,7 +98,7 @@ def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:
 
     Raises `InputError` when the state cost is not finite at some sampled state.
     """
-    x, f = problem.survey(1024, 0, "x", "f")
+    x, f = problem.probe(1024, 0, "x", "f")
     if f.shape != (len(x),):
         raise InputError(f"state_cost gave shape {tuple(f.shape)} for states {tuple(x.shape)}; it must give (N,).")
     if not torch.isfinite(f).all():

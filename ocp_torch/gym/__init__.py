@@ -20,7 +20,7 @@ __all__ = ["make", "names", "register"]
 
 def names() -> dict[str, str]:
     """Environment id -> name of the problem, for all that can be simulated."""
-    return {f"ocp_torch/{c.__name__}-v0": name for name, c in PROBLEMS.items() if c.evaluable}
+    return {f"ocp_torch/{c.__name__}-v0": name for name, c in PROBLEMS.items() if c.has_simulator}
 
 
 def make(problem: str | Problem | None = None, **options):

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from ocp_torch.errors import InputError, require_choice, require_number
 from ocp_torch.maths.sampling import derive_seed
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import drawn_starts, starts_narrowly
 
@@ -54,10 +54,10 @@ def make_environment(
     control for ``time_step`` (units of time) with one midpoint step, and the reward is minus the cost of that step.
     Episodes are cut, not ended, after ``horizon``. Raises `InputError` for wrong numbers, and for a data set.
     """
-    if not problem.evaluable:
+    if not problem.has_simulator:
         raise InputError("a data set cannot be simulated, so it is no environment.")
     if control_bound is None:
-        control_bound = resolve_bounds(problem).C_u
+        control_bound = resolve_constants(problem).C_u
     if problem.control_limit is not None:
         control_bound = min(control_bound, problem.control_limit)
     time_step = HELD / problem.discount if time_step is None else time_step

@@ -9,7 +9,7 @@ from ocp_torch.fields.fields import VALUE, Fields
 from ocp_torch.maths import calculus
 from ocp_torch.objectives.objective import Objective
 from ocp_torch.problems import formulas
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -24,15 +24,15 @@ class Dual(Objective):
     `Q = 0` almost everywhere there; unlike the hinge it has a gradient on both sides of the solution. The paper's dual is
     ``residual = 0``.
 
-    Where no `M` is known to be large enough (`Bounds.unbounded`) what is certified is `E[V mu0] - sup Q`. A large
+    Where no `M` is known to be large enough (`Constants.unbounded`) what is certified is `E[V mu0] - sup Q`. A large
     `M` keeps the supremum small; but from the start it ends in subsolutions far below `V*`, which have no gradient. So `M`
     grows along a round: first `V` is too high, and then comes down until it is feasible.
     """
 
     players = {"value": (VALUE,)}
 
-    def __init__(self, problem: Problem, bounds: Bounds, residual: float = 0.3) -> None:
-        super().__init__(problem, bounds)
+    def __init__(self, problem: Problem, constants: Constants, residual: float = 0.3) -> None:
+        super().__init__(problem, constants)
         self.residual = require_number("method.residual", residual, at_least=0.0)
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
@@ -45,8 +45,8 @@ def value_loss(
     objective: Objective, fields: Fields, samples: Samples, value: Tensor, slack: Tensor, residual: float
 ) -> Tensor:
     """What a value player on its own minimises: `E[M max(Q, 0) + (residual / s) Q^2 - V mu0]`."""
-    M = objective.bounds.M
-    if objective.bounds.unbounded:
+    M = objective.constants.M
+    if objective.constants.unbounded:
         M = M * LEAST_WEIGHT ** max(0.0, 1.0 - objective.progress / GROWTH)
     violation = M * slack.clamp_min(0.0)
     if residual > 0.0:

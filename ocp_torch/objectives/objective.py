@@ -11,7 +11,7 @@ from ocp_torch.fields.fields import Fields
 from ocp_torch.maths import calculus
 from ocp_torch.maths.calculus import Field
 from ocp_torch.problems import formulas
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -23,7 +23,7 @@ class Objective(ABC):
     """A one-player objective is minimised; a two-player one is a game in which each player minimises its own loss.
 
     ``players`` maps a player to the fields it moves; ``needs_divergences`` says whether `losses` reads `div a`, `div B`;
-    ``occupation`` says how the fields give `mu` (see `control_laws`), `None` where they do not; ``notes`` is what a user
+    ``occupation`` says how the fields give `mu` (see `trained_policies`), `None` where they do not; ``notes`` is what a user
     should be told of the form that was chosen.
     """
 
@@ -34,8 +34,8 @@ class Objective(ABC):
     resting: dict[str, float] = {}  # player -> the part of the run it rests at the start
     progress: float = 1.0  # the part of the run that is done, kept up to date by the trainer
 
-    def __init__(self, problem: Problem, bounds: Bounds) -> None:
-        self.rho, self.cost, self.bounds = problem.discount, problem.control_cost, bounds
+    def __init__(self, problem: Problem, constants: Constants) -> None:
+        self.rho, self.cost, self.constants = problem.discount, problem.control_cost, constants
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -60,7 +60,7 @@ class Objective(ABC):
             shown |= {"slack_mean_positive": samples.mean(slack), "slack_maximum": slack.max()}
         given = samples.div_a is not None and samples.div_B is not None
         if given and fields.control_density is not None and fields.log_occupation is not None:
-            _, inflow = formulas.controlled_inflow(samples, self.admissible(fields), self.rho)
-            _, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
+            _, inflow = formulas.control_inflow(samples, self.admissible(fields), self.rho)
+            _, loss = formulas.occupation_outflow(samples, fields.log_occupation, self.rho)
             shown["residual_mean_absolute"] = samples.mean((inflow - loss).abs())
         return shown

@@ -10,7 +10,7 @@ from ocp_torch.maths import calculus
 from ocp_torch.objectives.objective import Objective
 from ocp_torch.problems import formulas
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.samples import Samples
 
 
@@ -25,13 +25,13 @@ class PolicyEvaluation(Objective):
 
     needs_divergences = True
 
-    def __init__(self, problem: ClosedLoop, bounds: Bounds, with_value: bool, price: float = 1.0) -> None:
-        super().__init__(problem, bounds)
+    def __init__(self, problem: ClosedLoop, constants: Constants, with_value: bool, price: float = 1.0) -> None:
+        super().__init__(problem, constants)
         self.price = price
         self.players = {"occupation": (LOG_OCCUPATION,)} | ({"value": (VALUE,)} if with_value else {})
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        _, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
+        _, loss = formulas.occupation_outflow(samples, fields.log_occupation, self.rho)
         r = samples.mu0 - loss
         losses = {"occupation": samples.mean(torch.where(r > 0.0, self.price, 1.0) * r.square())}
         if "value" in self.players:

@@ -9,7 +9,7 @@ from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, Fields
 from ocp_torch.objectives.objective import CLOSED, NETWORK, Objective
 from ocp_torch.objectives.saddle import Saddle
 from ocp_torch.problems import formulas
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -22,8 +22,8 @@ class ClosedPrimal(Objective):
     occupation = CLOSED
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        w, inflow = formulas.controlled_inflow(samples, fields.control_density, self.rho)
-        return {"density": samples.mean(self.cost.primal_minimum(w, samples.f, self.bounds.C_V, inflow))}
+        w, inflow = formulas.control_inflow(samples, fields.control_density, self.rho)
+        return {"density": samples.mean(self.cost.primal_minimum(w, samples.f, self.constants.C_V, inflow))}
 
 
 class NetworkPrimal(Objective):
@@ -34,16 +34,16 @@ class NetworkPrimal(Objective):
     occupation = NETWORK
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        w, inflow = formulas.controlled_inflow(samples, self.admissible(fields), self.rho)
-        mu, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
+        w, inflow = formulas.control_inflow(samples, self.admissible(fields), self.rho)
+        mu, loss = formulas.occupation_outflow(samples, fields.log_occupation, self.rho)
         return {
             "density": samples.mean(
-                formulas.primal_integrand(samples, w, mu, inflow - loss, self.cost, self.bounds.C_V)
+                formulas.primal_integrand(samples, w, mu, inflow - loss, self.cost, self.constants.C_V)
             )
         }
 
 
-def primal(problem: Problem, bounds: Bounds, occupation: str = "auto") -> Objective:
+def primal(problem: Problem, constants: Constants, occupation: str = "auto") -> Objective:
     """The primal with `mu` in closed form (only where `a = 0`), by a network, or whichever suits the problem.
 
     Raises `InputError` for ``occupation="closed"`` with drift.
@@ -54,11 +54,11 @@ def primal(problem: Problem, bounds: Bounds, occupation: str = "auto") -> Object
             "method.occupation is 'closed', but this problem has drift, for which mu has no closed form; "
             "use method.occupation=network or auto."
         )
-    if occupation == "closed" and not problem.evaluable:
+    if occupation == "closed" and not problem.has_simulator:
         raise InputError("method.occupation is 'closed', but mu at a new state needs f there, which no data set gives.")
     if not problem.gives_divergences:
-        objective = Saddle(problem, bounds, augmentation=1.0)
+        objective = Saddle(problem, constants, augmentation=1.0)
         objective.notes = ("this problem gives no divergences of a and B: primal falls back to the saddle, without J.",)
         return objective
-    closed = problem.driftless and problem.evaluable and occupation != "network"
-    return (ClosedPrimal if closed else NetworkPrimal)(problem, bounds)
+    closed = problem.driftless and problem.has_simulator and occupation != "network"
+    return (ClosedPrimal if closed else NetworkPrimal)(problem, constants)

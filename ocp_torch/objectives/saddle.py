@@ -13,7 +13,7 @@ from ocp_torch.maths import calculus
 from ocp_torch.objectives.dual import value_loss
 from ocp_torch.objectives.objective import NETWORK, SADDLE, Objective
 from ocp_torch.problems import formulas
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -29,16 +29,16 @@ class Saddle(Objective):
     players = {"value": (VALUE,), "density": (CONTROL_DENSITY,)}
     occupation = SADDLE
 
-    def __init__(self, problem: Problem, bounds: Bounds, augmentation: float = 0.0) -> None:
-        super().__init__(problem, bounds)
+    def __init__(self, problem: Problem, constants: Constants, augmentation: float = 0.0) -> None:
+        super().__init__(problem, constants)
         self.augmentation = augmentation
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         value, gradient = calculus.value_and_gradient(fields.value, samples.x)
-        w = self.cost.within(fields.control_density(samples.x), self.bounds.M)
+        w = self.cost.within(fields.control_density(samples.x), self.constants.M)
         pushed = (formulas.pull_back(samples, gradient) * w).sum(dim=-1) / self.rho
         beta = samples.f - value + formulas.along(samples, gradient) / self.rho
-        psi = samples.mean(value * samples.mu0 + pushed + self.cost.saddle_minimum(w, beta, self.bounds.M))
+        psi = samples.mean(value * samples.mu0 + pushed + self.cost.saddle_minimum(w, beta, self.constants.M))
         if self.augmentation == 0.0:
             return {"value": -psi, "density": psi}
         slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
@@ -76,14 +76,14 @@ class AugmentedSaddle(Objective):
     def __init__(
         self,
         problem: Problem,
-        bounds: Bounds,
+        constants: Constants,
         augmentation: float,
         coupling: float,
         residual: float,
         warm_start: float,
         density_batch: int | None,
     ) -> None:
-        super().__init__(problem, bounds)
+        super().__init__(problem, constants)
         self.augmentation, self.coupling, self.residual = augmentation, coupling, residual
         self.density_batch = density_batch
         self.resting = {"density": warm_start if coupling == 0.0 else 0.0}
@@ -94,7 +94,7 @@ class AugmentedSaddle(Objective):
         return self.progress >= self.resting["density"]
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        k, C_V = self.augmentation, self.bounds.C_V
+        k, C_V = self.augmentation, self.constants.C_V
         value, gradient = calculus.value_and_gradient(fields.value, samples.x)
         slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
         of_value = k * value_loss(self, fields, samples, value, slack, self.residual)
@@ -103,8 +103,8 @@ class AugmentedSaddle(Objective):
         if self.coupling == 0.0:
             samples, rows = samples.take_weighted(self.density_batch)
             value, gradient = value[rows], gradient[rows]
-        w, inflow = formulas.controlled_inflow(samples, self.admissible(fields), self.rho)
-        mu, loss = formulas.drifting_loss(samples, fields.log_occupation, self.rho)
+        w, inflow = formulas.control_inflow(samples, self.admissible(fields), self.rho)
+        mu, loss = formulas.occupation_outflow(samples, fields.log_occupation, self.rho)
         running = samples.f * mu + self.cost.perspective(w, mu)
         hinged = running + C_V * (inflow - loss).clamp_min(0.0)
         # Each player sees the other as data.
@@ -117,7 +117,7 @@ class AugmentedSaddle(Objective):
 
 def saddle(
     problem: Problem,
-    bounds: Bounds,
+    constants: Constants,
     augmentation: float = 0.25,
     coupling: float = 0.0,
     residual: float = 0.3,
@@ -136,9 +136,9 @@ def saddle(
     residual = require_number("method.residual", residual, at_least=0.0)
     warm_start = require_number("method.warm_start", warm_start, at_least=0.0, at_most=1.0)
     if weight == 0.0:
-        return Saddle(problem, bounds)
+        return Saddle(problem, constants)
     if problem.gives_divergences:
-        return AugmentedSaddle(problem, bounds, weight, coupling, residual, warm_start, density_batch)
-    objective = Saddle(problem, bounds, weight)
+        return AugmentedSaddle(problem, constants, weight, coupling, residual, warm_start, density_batch)
+    objective = Saddle(problem, constants, weight)
     objective.notes = ("this problem gives no divergences of a and B: pd trains w alone, with mu in closed form.",)
     return objective

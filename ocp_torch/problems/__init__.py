@@ -5,7 +5,7 @@ from ocp_torch.problems.exact.manufactured import Manufactured
 from ocp_torch.problems.exact.torus import Torus
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.recorded.dataset import Dataset
-from ocp_torch.problems.simulator.simulator import Callable
+from ocp_torch.problems.simulator.simulator import Simulator
 from ocp_torch.problems.systems.arm import Arm
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
@@ -14,7 +14,7 @@ from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.systems.robot import RobotArm
 from ocp_torch.problems.systems.unicycle import Unicycle
 
-# `Callable` is not among them: a file may not name a function to be imported.
+# `Simulator` is not among them: a file may not name a function to be imported.
 PROBLEMS = {
     "circle": Circle,
     "torus": Torus,
@@ -29,4 +29,4 @@ PROBLEMS = {
     "robot": RobotArm,
 }
 
-__all__ = ["Callable", "Problem", "PROBLEMS", *sorted(cls.__name__ for cls in PROBLEMS.values())]
+__all__ = ["Simulator", "Problem", "PROBLEMS", *sorted(cls.__name__ for cls in PROBLEMS.values())]

@@ -50,7 +50,7 @@ def check_once(problem: Problem) -> None:
     The package's own classes are tested instead, and a data set has checks of its own.
     """
     _require_made(problem)
-    if not problem.evaluable:
+    if not problem.has_simulator:
         return
     own = type(problem).__module__.startswith("ocp_torch.")
     simulator = hasattr(problem, "answers")
@@ -88,7 +88,7 @@ def _require_made(problem: Problem) -> None:
 
 def _require_units(problem: Problem) -> None:
     """Units of cost and time in which a state can be followed for the time that counts."""
-    f, a, B = problem.survey(64, 13, "f", "a", "B")
+    f, a, B = problem.probe(64, 13, "f", "a", "B")
     # A control that costs as much as the state cost varies.
     u = (problem.exponent * float(f.std())) ** (1.0 / problem.exponent)
     u = u if problem.control_limit is None else min(u, problem.control_limit)

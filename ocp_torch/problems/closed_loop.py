@@ -18,9 +18,9 @@ class ClosedLoop(Problem):
     the Bellman slack `Q_u`, its Liouville residual that of `u` (problems P(u) and D(u), section 5.4 of the paper).
     """
 
-    def __init__(self, problem: Problem, law: Callable[[Tensor], Tensor]) -> None:
+    def __init__(self, problem: Problem, policy: Callable[[Tensor], Tensor]) -> None:
         super().__init__(dim=problem.dim, control_dim=1, discount=problem.discount, exponent=problem.exponent)
-        self.problem, self.law = problem, law
+        self.problem, self.policy = problem, policy
 
     @property
     def driftless(self) -> bool:
@@ -32,17 +32,17 @@ class ClosedLoop(Problem):
         return [Samples.concatenate(pieces(samples)) for samples in sets]
 
     def state_cost(self, x: Tensor) -> Tensor:
-        return self.problem.state_cost(x) + self.problem.control_cost.cost(self.law(x))
+        return self.problem.state_cost(x) + self.problem.control_cost.cost(self.policy(x))
 
     def drift(self, x: Tensor) -> Tensor:
-        return self.problem.velocity(x, self.law(x))
+        return self.problem.velocity(x, self.policy(x))
 
     def drift_divergence(self, x: Tensor) -> Tensor | None:
         """`div g_u = div a + (div B) . u + sum_k (d u_k along column k of B)`: `m` tangents through the controller."""
         div_a, div_B = self.problem.drift_divergence(x), self.problem.control_divergence(x)
         if div_a is None or div_B is None:
             return None
-        _, flux = calculus.control_flux_divergence(self.law, x, self.problem.control_matrix(x), div_B)
+        _, flux = calculus.control_flux_divergence(self.policy, x, self.problem.control_matrix(x), div_B)
         return div_a + flux
 
     def control_matrix(self, x: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ FROM_CONFIGURATION, FROM_PROBLEM, ESTIMATED = "configuration", "problem", "estim
 
 
 @dataclass(frozen=True)
-class Bounds:
+class Constants:
     """`M >= sup mu*`, `C_V >= sup V*`, `C_u >= sup |u*|` and, per name, its source.
 
     Where ``unbounded``, no `M` is known to be large enough: it is but a weight of training, which then aims at the bound
@@ -58,12 +58,12 @@ class Bounds:
             require_number(name, getattr(self, name), above=0.0)
 
 
-def resolve_bounds(
+def resolve_constants(
     problem: Problem,
     occupation_bound: float | None = None,
     value_bound: float | None = None,
     control_bound: float | None = None,
-) -> Bounds:
+) -> Constants:
     """Each bound from the configuration if it was set there, else from the problem, else estimated with a warning.
 
     `OPT <= J` needs `C_V >= sup V*`, for which `sup f` will do (Proposition 1); `C_u` is that of Proposition 2 where
@@ -99,7 +99,9 @@ def resolve_bounds(
             notes.append(
                 f"method.occupation_bound = {chosen['M']:.4g} is below this problem's sup mu*, which is {true}."
             )
-    return Bounds(**chosen, sources=sources, warnings=tuple(notes), unbounded=is_unbounded(problem, occupation_bound))
+    return Constants(
+        **chosen, sources=sources, warnings=tuple(notes), unbounded=is_unbounded(problem, occupation_bound)
+    )
 
 
 def is_unbounded(problem: Problem, occupation_bound: float | None = None) -> bool:
@@ -107,17 +109,17 @@ def is_unbounded(problem: Problem, occupation_bound: float | None = None) -> boo
     gives one. A data set has no bound without `M` to aim at instead."""
     known = problem.occupation_bound
     if known is None:
-        return occupation_bound is None and problem.evaluable
+        return occupation_bound is None and problem.has_simulator
     return math.isinf(known)
 
 
 def state_cost_supremum(problem: Problem) -> float:
     """`sup f`: the problem's own bound, unless more is met; or a sampled and climbed estimate with head-room."""
     given = problem.state_cost_bound
-    if given is not None and not (problem.evaluable and problem.scan_factor):
+    if given is not None and not (problem.has_simulator and problem.scan_factor):
         return given
-    (x,) = problem.survey(SURVEYED, 1, "x")
-    if problem.evaluable:
+    (x,) = problem.probe(SURVEYED, 1, "x")
+    if problem.has_simulator:
         x = torch.cat([x, odd_states(problem, SCANNED * problem.scan_factor, 0)])
     found = supremum(problem.state_cost, x, differentiable=False)
     if not math.isfinite(found.value):
@@ -134,16 +136,16 @@ def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
     total = 2.0 * conjugate * state_cost_supremum(problem)
     if problem.driftless:
         return total ** (1.0 / q), "Proposition 2 of the paper with a sampled sup f"
-    B, a = problem.survey(SURVEYED // 4, 1, "B", "a")
+    B, a = problem.probe(SURVEYED // 4, 1, "B", "a")
     alpha = torch.linalg.pinv(B) @ a.unsqueeze(-1)
     largest = float(alpha.squeeze(-1).norm(dim=-1).max())
     return (total + 2.0**q * (conjugate - 1.0) * largest) ** (1.0 / q), "Proposition 2 with a least-squares alpha"
 
 
 def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
-    (mu0,) = problem.survey(SURVEYED, 1, "mu0")
+    (mu0,) = problem.probe(SURVEYED, 1, "mu0")
     guess = OCCUPATION_WEIGHT if is_unbounded(problem) else OCCUPATION_GUESS
-    if problem.evaluable and starts_narrowly(problem):
+    if problem.has_simulator and starts_narrowly(problem):
         mu0 = problem.initial_density(drawn_starts(problem, SURVEYED // 32, 1))
     return guess * float(mu0.max()), f"a guess to train with, {guess:g} times sup mu0"
 

@@ -35,14 +35,14 @@ def bellman_slack(samples: Samples, value: Tensor, gradient: Tensor, u: Tensor, 
     return value - samples.f - cost.cost(u) - (along(samples, gradient) + pushed) / rho
 
 
-def controlled_inflow(samples: Samples, control_density: Field, rho: float) -> tuple[Tensor, Tensor]:
+def control_inflow(samples: Samples, control_density: Field, rho: float) -> tuple[Tensor, Tensor]:
     """`w` ``(N, m)`` and `beta = mu0 - div(B w) / rho` ``(N,)``: all of the Liouville residual but `mu` and the drift."""
     _, div_B = samples.require_divergences("the primal objective")
     w, flux = control_flux_divergence(control_density, samples.x, samples.B, div_B)
     return w, samples.mu0 - flux / rho
 
 
-def drifting_loss(samples: Samples, log_occupation: Field, rho: float) -> tuple[Tensor, Tensor]:
+def occupation_outflow(samples: Samples, log_occupation: Field, rho: float) -> tuple[Tensor, Tensor]:
     """`mu` and `mu + div(a mu) / rho`, both ``(N,)``: what the drift takes from the Liouville residual."""
     div_a, _ = samples.require_divergences("the primal objective")
     log_mu, derivative = directional_derivative(log_occupation, samples.x, samples.a)

@@ -39,7 +39,7 @@ class Problem:
     """
 
     # Whether the functions can be called at any state; a data set knows them at its own only (see `samples`).
-    evaluable: bool = True
+    has_simulator: bool = True
     # Whether the control matrix can, which the controller from V needs.
     knows_control_matrix: bool = True
     # Arguments that say where the data come from, not what they are: another run may give others.
@@ -151,7 +151,7 @@ class Problem:
         return Samples.of(self, places, divergences=divergences)
 
     @torch.no_grad()
-    def survey(self, count: int, branch: int, *columns: str) -> tuple[Tensor, ...]:
+    def probe(self, count: int, branch: int, *columns: str) -> tuple[Tensor, ...]:
         """``columns`` of `Samples` (x, f, a, B, mu0 or weight) at states spread over the torus, in float64, at most ``count``
         of them: what sizes and bounds are estimated from."""
         x = scrambled_sobol(count, self.dim, branch, torch.float64)
@@ -166,7 +166,7 @@ class Problem:
         return Samples.of(self, x, divergences=False)
 
     @property
-    def rehearsal(self) -> Problem:
+    def validation_view(self) -> Problem:
         """The problem as looks by which choices are made see it: itself, where fresh states cost nothing."""
         return self
 

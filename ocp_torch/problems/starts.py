@@ -14,7 +14,7 @@ from torch import Tensor
 from ocp_torch.maths.mixtures import SCANNED, Mixture, fitted_mixture
 from ocp_torch.maths.sampling import derive_seed
 from ocp_torch.problems.problem import Problem
-from ocp_torch.problems.simulator.simulator import Callable as BlackBox
+from ocp_torch.problems.simulator.simulator import Simulator
 
 # Parts that stay uniform: of starts, for mass that the search missed; and of the states of bounds, most of whose integrands
 # are large elsewhere too.
@@ -29,7 +29,7 @@ CANDIDATES = 16
 ASKED = 2**12
 
 
-def start_law(problem: Problem) -> Mixture:
+def start_distribution(problem: Problem) -> Mixture:
     """The density starts are drawn from: near `mu0` and spikes of `f`, and uniform where both are broad."""
     density, cost = _fits(problem)
     if density.is_uniform:
@@ -38,11 +38,11 @@ def start_law(problem: Problem) -> Mixture:
     return Mixture.join([density.scaled(1.0 - UNIFORM_STARTS - SPIKE_STARTS * len(spikes)), *spikes])
 
 
-def evaluation_law(problem: Problem) -> Mixture:
+def evaluation_distribution(problem: Problem) -> Mixture:
     """The density states are drawn from at which bounds are evaluated; uniform where neither `mu0` nor `f` is narrow."""
-    laws = [law for law in _fits(problem) if not law.is_uniform]
-    part = (1.0 - UNIFORM_STATES) / max(1, len(laws))
-    return Mixture.uniform(problem.dim) if not laws else Mixture.join([law.scaled(part) for law in laws])
+    distributions = [d for d in _fits(problem) if not d.is_uniform]
+    part = (1.0 - UNIFORM_STATES) / max(1, len(distributions))
+    return Mixture.uniform(problem.dim) if not distributions else Mixture.join([d.scaled(part) for d in distributions])
 
 
 def starts_narrowly(problem: Problem) -> bool:
@@ -54,7 +54,7 @@ def starts_narrowly(problem: Problem) -> bool:
 def initial_points(problem: Problem, count: int, replicate: int, seed: int, extra: int = 0) -> tuple[Tensor, Tensor]:
     """Starts ``(count, d + extra)``, the ``extra`` coordinates uniform, and weights ``(count,)``: `mean(weight g(x))`
     estimates `E[g mu0]`, and the mean weight is the mass of `mu0`. Replicates are independent randomised point sets."""
-    points, weight = start_law(problem).draw(count, replicate, seed, extra)
+    points, weight = start_distribution(problem).draw(count, replicate, seed, extra)
     return points, weight * problem.initial_density(points[:, : problem.dim])
 
 
@@ -72,7 +72,7 @@ def _fits(problem: Problem) -> tuple[Mixture, Mixture]:
     kept = vars(problem)
     if "_fits" not in kept:
         everywhere = getattr(problem.initial_density, "__func__", None) is Problem.initial_density
-        fit = partial(fitted_mixture, dim=problem.dim, scanned=ASKED if isinstance(problem, BlackBox) else SCANNED)
+        fit = partial(fitted_mixture, dim=problem.dim, scanned=ASKED if isinstance(problem, Simulator) else SCANNED)
         density = Mixture.uniform(problem.dim) if everywhere else fit(problem.initial_density)
         kept["_fits"] = density, fit(problem.state_cost, broad=BROAD_COST)
     return kept["_fits"]

@@ -29,7 +29,7 @@ from ocp_torch.objectives import METHODS, Objective
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import in_their_words, origin, words
 from ocp_torch.problems.check import check_once
-from ocp_torch.problems.constants import resolve_bounds
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.problem import MOST_COORDINATES
 from ocp_torch.runs.process import prepare
 from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
@@ -94,8 +94,8 @@ def build_trainer(config: dict) -> Trainer:
     prepare(settings.threads)
     method = require_section("method", config["method"])
     name = require_choice("method.name", method.pop("name", None), METHODS)
-    bounds = resolve_bounds(problem, **{field: method.pop(field, None) for field in BOUND_FIELDS})
-    objective = call(METHODS[name], "method", method, problem=problem, bounds=bounds)
+    constants = resolve_constants(problem, **{field: method.pop(field, None) for field in BOUND_FIELDS})
+    objective = call(METHODS[name], "method", method, problem=problem, constants=constants)
     if settings.target_gap is not None and VALUE not in objective.fields:
         raise InputError(
             f"trainer.target_gap is {settings.target_gap:g}, but {name} gives no lower bound to measure a gap by; "
@@ -111,7 +111,7 @@ def build_trainer(config: dict) -> Trainer:
     sampler_name = require_choice("sampler.name", sampler_section.pop("name", None), SAMPLERS)
     visited = sampler_section.pop("visited", None)
     given = {"dim": problem.dim, "seed": seed, "dtype": settings.torch_dtype}
-    if problem.evaluable:
+    if problem.has_simulator:
         sampler = call(SAMPLERS[sampler_name], "sampler", sampler_section, **given)
     elif settings.target_gap is not None:
         raise InputError("trainer.target_gap is set, but a data set has no simulation to see a gap by.")
@@ -120,7 +120,7 @@ def build_trainer(config: dict) -> Trainer:
     batches = Batches(problem, fields, objective, sampler, settings.batch, seed, visited)
     names = (problem_name(problem), name)
     return Trainer(
-        problem, fields, objective, bounds, stepper, average, batches, settings, network, seed, names, config
+        problem, fields, objective, constants, stepper, average, batches, settings, network, seed, names, config
     )
 
 

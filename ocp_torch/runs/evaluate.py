@@ -9,7 +9,7 @@ from pathlib import Path
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields, table
 from ocp_torch.certificate.certify import in_float64
 from ocp_torch.control.controller import Controller, load_controller
-from ocp_torch.control.policies import ControlLaw, control_laws
+from ocp_torch.control.policies import Policy, trained_policies
 from ocp_torch.errors import InputError, require_integer, require_section
 from ocp_torch.files.limits import require_modest_run
 from ocp_torch.files.reading import FOLDER, kind
@@ -17,7 +17,7 @@ from ocp_torch.runs.build import build_certificate_settings, build_network, buil
 from ocp_torch.runs.metrics import write_metrics
 from ocp_torch.runs.pictures import animate, require_gif
 from ocp_torch.runs.process import prepare
-from ocp_torch.training.health import hopeless
+from ocp_torch.training.health import sanity_warnings
 from ocp_torch.training.settings import MOST_THREADS
 
 log = logging.getLogger(__name__)
@@ -60,23 +60,25 @@ def certify_saved(controller: Controller, settings: CertificateSettings, seed: i
     if seed is not None:
         run = Run(**{**vars(run), "seed": require_integer("seed", seed, 0)})
     trained = Trained(controller.fields, controller.occupation, build_network(controller.model))
-    certificate = certify_fields(controller.problem, trained, controller.bounds, settings, run)
-    found = hopeless(controller.problem, controller.bounds, certificate, run.seed)
+    certificate = certify_fields(controller.problem, trained, controller.constants, settings, run)
+    found = sanity_warnings(controller.problem, controller.constants, certificate, run.seed)
     fresh = [note for note in found if note not in certificate.warnings]
     certificate = replace(certificate, warnings=[*certificate.warnings, *fresh])
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
     if settings.trajectories:
-        write_metrics(controller.problem, law_of(controller), run.seed, None)
+        write_metrics(controller.problem, policy_of(controller), run.seed, None)
     return certificate
 
 
-def law_of(controller: Controller) -> ControlLaw:
-    """The law that ``controller`` follows, in float64."""
-    laws = control_laws(controller.occupation, controller.problem, in_float64(controller.fields), controller.bounds)
-    return laws[controller.kind]
+def policy_of(controller: Controller) -> Policy:
+    """The policy that ``controller`` follows, in float64."""
+    policies = trained_policies(
+        controller.occupation, controller.problem, in_float64(controller.fields), controller.constants
+    )
+    return policies[controller.kind]
 
 
 def animated(controller: Controller, file: object, seed: int | None = None) -> None:
     """Write the motion under ``controller`` as the GIF ``file``. Raises `InputError` for anything else."""
-    animate(controller.problem, law_of(controller), require_gif(controller.problem, file), seed or 0)
+    animate(controller.problem, policy_of(controller), require_gif(controller.problem, file), seed or 0)
     log.info("animated in %s", file)

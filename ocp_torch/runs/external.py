@@ -13,7 +13,7 @@ from ocp_torch.certificate import Certificate, CertificateSettings, Run, certify
 from ocp_torch.certificate.checks.possible import require_possible
 from ocp_torch.certificate.external.black_box import BlackBox, require_limit
 from ocp_torch.control.controller import Controller, problem_name
-from ocp_torch.control.policies import ControlLaw, control_laws
+from ocp_torch.control.policies import Policy, trained_policies
 from ocp_torch.errors import InputError, require_flag, require_integer
 from ocp_torch.fields import Fields
 from ocp_torch.fields.fields import VALUE, cost_unit
@@ -22,10 +22,10 @@ from ocp_torch.maths.sampling import SAMPLERS, derive_seed, scrambled_sobol
 from ocp_torch.maths.supremum import batched
 from ocp_torch.objectives import Dual
 from ocp_torch.problems import Problem
-from ocp_torch.problems.constants import Bounds, resolve_bounds
+from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.runs import figures
 from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem
-from ocp_torch.runs.loading import load_law, load_saved
+from ocp_torch.runs.loading import load_policy, load_saved
 from ocp_torch.runs.process import prepare
 from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training.batches import Batches
@@ -56,29 +56,29 @@ def certify(
     there is no lower bound). Raises `InputError` where the controller or the value fails.
     """
     require_integer("seed", seed, 0)
-    if not problem.evaluable:
+    if not problem.has_simulator:
         raise InputError(
             "problem is a data set, on which no given controller can be certified: nothing can be simulated."
         )
     defaults = fill({"model": dict(MODEL), "trainer": {}, "optimizer": {}, "certificate": {}}, problem)
     settings = settings or build_certificate_settings(defaults)
-    bounds = resolve_bounds(problem)
+    constants = resolve_constants(problem)
     network = build_network(defaults["model"])
-    law = law_of(controller, problem)
+    policy = policy_of(controller, problem)
     steps = defaults["trainer"]["steps"] if train_steps is None else require_integer("train_steps", train_steps, 0)
     run = Run(problem_name(problem), "given", seed)
     if value is None and steps:
         batch, lr, sampler = defaults["trainer"]["batch"], defaults["optimizer"]["lr"], defaults["sampler"]["name"]
-        value = in_float64(train_value(problem, bounds, network, steps, batch, lr, sampler, seed)).value
+        value = in_float64(train_value(problem, constants, network, steps, batch, lr, sampler, seed)).value
         run = Run(problem_name(problem), "given", seed, steps, steps * batch)
     elif value is not None:
         value = value_of(value, problem)
-    return certify_policy(problem, law, value, network, bounds, settings, run)
+    return certify_policy(problem, policy, value, network, constants, settings, run)
 
 
 def train_value(
     problem: Problem,
-    bounds: Bounds,
+    constants: Constants,
     network: Callable[..., nn.Module],
     steps: int,
     batch: int,
@@ -88,7 +88,7 @@ def train_value(
 ) -> Fields:
     """A `V` by the dual, with the defaults of a run."""
     fields = Fields.build(problem, (VALUE,), network, derive_seed(seed, JUDGE_STREAM, 0))
-    objective = Dual(problem, bounds)
+    objective = Dual(problem, constants)
     states = SAMPLERS[sampler](problem.dim, derive_seed(seed, JUDGE_STREAM, 1), torch.float32)
     batches = Batches(problem, fields, objective, states, batch, derive_seed(seed, JUDGE_STREAM, 2))
     makers = {player: optimizer_maker("soap", lr, betas=(0.95, 0.95)) for player in objective.players}
@@ -100,8 +100,8 @@ def train_value(
     return average.module
 
 
-def law_of(controller: Callable | Controller, problem: Problem) -> ControlLaw:
-    """A law in float64: the networks of a `Controller` of ours, or a `BlackBox` around anything else."""
+def policy_of(controller: Callable | Controller, problem: Problem) -> Policy:
+    """A policy in float64: the networks of a `Controller` of ours, or a `BlackBox` around anything else."""
     if not isinstance(controller, Controller):
         return BlackBox(controller, problem)
     if (controller.problem.dim, controller.problem.control_dim) != (problem.dim, problem.control_dim):
@@ -110,12 +110,12 @@ def law_of(controller: Callable | Controller, problem: Problem) -> ControlLaw:
             f"but the problem has d = {problem.dim} and m = {problem.control_dim}."
         )
     fields = in_float64(controller.fields)
-    law = control_laws(controller.occupation, controller.problem, fields, controller.bounds)[controller.kind]
+    policy = trained_policies(controller.occupation, controller.problem, fields, controller.constants)[controller.kind]
     if controller.problem.control_limit != problem.control_limit:  # its own limit it obeys by itself
         x = scrambled_sobol(LIMIT_PROBES, problem.dim, 0, torch.float64)
         with torch.no_grad():
-            require_limit(batched(law, x), x, problem.control_limit)
-    return law
+            require_limit(batched(policy, x), x, problem.control_limit)
+    return policy
 
 
 def value_of(value: Field | Controller, problem: Problem) -> Field:
@@ -146,8 +146,8 @@ def read(config: dict) -> dict:
         require_integer("steps", config["steps"], 1)
     settings = build_certificate_settings(filled)
     require_possible(problem, settings, trains_value=False)  # a given controller's bounds are not proved
-    controller = load_law(config["controller"], problem)
-    law_of(controller, problem)
+    controller = load_policy(config["controller"], problem)
+    policy_of(controller, problem)
     value = None if config["value"] is None else load_saved(Path(str(config["value"])), problem)
     return {
         "problem": problem,

@@ -14,14 +14,14 @@ from ocp_torch.certificate.certificate import LONGEST_NAME
 from ocp_torch.certificate.certify import in_float64
 from ocp_torch.certificate.lower.shifted import slack_function
 from ocp_torch.certificate.simulated.simulation import rate_at
-from ocp_torch.control.policies import NETWORK, control_laws, occupation_density
+from ocp_torch.control.policies import NETWORK, occupation_density, trained_policies
 from ocp_torch.errors import visible
 from ocp_torch.fields import Fields
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.maths.sampling import derive_seed
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems import Problem
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.starts import initial_points
 
 LINE_POINTS, MAP_POINTS = 400, 80
@@ -36,38 +36,38 @@ TITLES = {
 }
 
 
-def quantities(problem: Problem, fields: Fields, bounds: Bounds, occupation: str | None) -> dict[str, tuple]:
+def quantities(problem: Problem, fields: Fields, constants: Constants, occupation: str | None) -> dict[str, tuple]:
     """Name -> (learned function, exact function or None), for what the fields give."""
     fields = in_float64(fields)
-    laws = control_laws(occupation, problem, fields, bounds)
+    policies = trained_policies(occupation, problem, fields, constants)
     drawn: dict[str, tuple] = {}
     if fields.value is not None:
         drawn["value"] = (fields.value, problem.exact_value)
-        if problem.evaluable:
+        if problem.has_simulator:
             drawn["slack"] = (slack_function(problem, fields.value), None)
-    for kind, law in laws.items():
+    for kind, policy in policies.items():
         if kind != "value" or problem.knows_control_matrix:
-            drawn[f"control_{kind}"] = (law, problem.exact_control)
-    if occupation is not None and (problem.evaluable or occupation == NETWORK):
-        drawn["occupation"] = (occupation_density(occupation, problem, fields, bounds), problem.exact_occupation)
-    if problem.dim in BINS and problem.evaluable:
+            drawn[f"control_{kind}"] = (policy, problem.exact_control)
+    if occupation is not None and (problem.has_simulator or occupation == NETWORK):
+        drawn["occupation"] = (occupation_density(occupation, problem, fields, constants), problem.exact_occupation)
+    if problem.dim in BINS and problem.has_simulator:
         learned, exact = drawn.get("occupation", (None, problem.exact_occupation))
-        drawn["occupation"] = (learned, exact, simulated_occupation(problem, next(iter(laws.values()))))
+        drawn["occupation"] = (learned, exact, simulated_occupation(problem, next(iter(policies.values()))))
     return drawn
 
 
 @torch.no_grad()
 def simulated_occupation(
-    problem: Problem, law: Callable[[Tensor], Tensor], seed: int = 0
+    problem: Problem, policy: Callable[[Tensor], Tensor], seed: int = 0
 ) -> Callable[[Tensor], Tensor]:
-    """A histogram of `mu^u`, for one or two coordinates: where the closed loop of ``law`` is at a time `T ~ Exp(rho)`.
+    """A histogram of `mu^u`, for one or two coordinates: where the closed loop of ``policy`` is at a time `T ~ Exp(rho)`.
 
     Starts weigh `mu0`; their number and the bins are few enough for a fraction of a second.
     """
     bins = BINS[problem.dim]
     points, start_mass = initial_points(problem, STARTS, 0, derive_seed(seed, FIGURE_STREAM), extra=1)
     x0, times = points[:, :-1], -torch.log1p(-points[:, -1]) / problem.discount
-    _, end = rate_at(lambda x: (problem.velocity(x, law(x)), x[:, 0]), x0, problem.discount, times, FIGURE_STEPS)
+    _, end = rate_at(lambda x: (problem.velocity(x, policy(x)), x[:, 0]), x0, problem.discount, times, FIGURE_STEPS)
     cell = lambda x: ((x * bins).long().clamp(0, bins - 1) * bins ** torch.arange(problem.dim)).sum(dim=-1)
     mass = torch.zeros(bins**problem.dim, dtype=torch.float64)
     mass.index_add_(0, cell(end), start_mass)
@@ -75,10 +75,10 @@ def simulated_occupation(
     return lambda x: density[cell(x.remainder(1.0))]
 
 
-def draw(problem: Problem, fields: Fields, bounds: Bounds, occupation: str | None) -> dict[str, Figure]:
+def draw(problem: Problem, fields: Fields, constants: Constants, occupation: str | None) -> dict[str, Figure]:
     """A figure per quantity; in three and more dimensions a cut along the first two coordinates through 1/2."""
     plot = _curve if problem.dim == 1 else _map
-    drawn = quantities(problem, fields, bounds, occupation)
+    drawn = quantities(problem, fields, constants, occupation)
     return {name: plot(problem.dim, TITLES[name], *functions) for name, functions in drawn.items()}
 
 

@@ -18,7 +18,7 @@ from ocp_torch.problems import PROBLEMS, Problem
 log = logging.getLogger(__name__)
 
 
-def load_law(source: str, problem: Problem) -> Callable | Controller:
+def load_policy(source: str, problem: Problem) -> Callable | Controller:
     """The controller the command line names: FILE.py:function, a run's folder or a file of ours, .onnx, or TorchScript.
 
     A .py file is code, and so is TorchScript: it can write files by itself. Only what is trusted is named here; an .onnx

@@ -21,9 +21,9 @@ METRICS = "metrics.json"
 STREAM = 8
 
 
-def write_metrics(problem: Problem, law: Law, seed: int, folder: Path | None) -> dict | None:
-    """Print the numbers of ``law`` and write them as `metrics.json` in ``folder``, where the problem has any."""
-    found = metrics(problem, law, derive_seed(seed, STREAM))
+def write_metrics(problem: Problem, policy: Law, seed: int, folder: Path | None) -> dict | None:
+    """Print the numbers of ``policy`` and write them as `metrics.json` in ``folder``, where the problem has any."""
+    found = metrics(problem, policy, derive_seed(seed, STREAM))
     if found is None:
         return None
     log.info("\n%s", metrics_table(found))
@@ -33,7 +33,7 @@ def write_metrics(problem: Problem, law: Law, seed: int, folder: Path | None) ->
     return found
 
 
-def practical_figures(problem: Problem, law: Law, seed: int) -> dict[str, Figure]:
+def practical_figures(problem: Problem, policy: Law, seed: int) -> dict[str, Figure]:
     """`motion`, for problems that have a scene."""
-    figure = motion(problem, law, seed)
+    figure = motion(problem, policy, seed)
     return {} if figure is None else {"motion": figure}

@@ -69,7 +69,7 @@ class Recorder:
 def prepare(config: dict) -> Recorder:
     """Check every field. Raises `InputError` for a wrong one."""
     problem = build_problem(config["problem"])
-    if not problem.evaluable:
+    if not problem.has_simulator:
         raise InputError("problem is a data set already; there is nothing to record from it.")
     out = Path(str(config["out"]))
     if out.suffix not in recording.SUFFIXES:

@@ -13,7 +13,7 @@ from pathlib import Path
 from ocp_torch.certificate import Certificate, CertificateSettings, table
 from ocp_torch.certificate.certify import in_float64
 from ocp_torch.control.controller import Controller
-from ocp_torch.control.policies import control_laws
+from ocp_torch.control.policies import trained_policies
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.fields import Fields
 from ocp_torch.files.storage import sweep_temporaries, write_atomically
@@ -24,7 +24,7 @@ from ocp_torch.steppers import NonFiniteError
 from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM
 from ocp_torch.training.checkpoint import LAST
 from ocp_torch.training.generators import seed_generators
-from ocp_torch.training.health import hopeless
+from ocp_torch.training.health import sanity_warnings
 from ocp_torch.training.monitor import Monitor
 from ocp_torch.training.signals import Signals
 from ocp_torch.training.trainer import FAILED, NOT_FINITE, TARGET_GAP, Trainer
@@ -60,14 +60,16 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, fol
                 certificate, fields = _salvage(trainer, certificate_settings, failure, monitor)
             closing.begin(folder)
             kind = _hand_out(trainer, certificate, fields, folder)
-            law = control_laws(trainer.objective.occupation, trainer.problem, in_float64(fields), trainer.bounds)[kind]
+            policy = trained_policies(
+                trainer.objective.occupation, trainer.problem, in_float64(fields), trainer.constants
+            )[kind]
             drawn = {}
             if trainer.settings.figures:
                 monitor.stages("figures")
                 drawn = {"certificate": figures.interval(certificate.to_dict())}
                 with _unless(failure, trainer):
-                    drawn |= figures.draw(trainer.problem, fields, trainer.bounds, trainer.objective.occupation)
-                    drawn |= practical_figures(trainer.problem, law, trainer.seed)
+                    drawn |= figures.draw(trainer.problem, fields, trainer.constants, trainer.objective.occupation)
+                    drawn |= practical_figures(trainer.problem, policy, trainer.seed)
                 figures.save(drawn, folder / "figures")
             monitor.finish(certificate, drawn, flatten(trainer.config), trainer.step)
     except OSError as error:
@@ -75,11 +77,11 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, fol
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
     if certificate_settings.trajectories:
         with _unless(failure, trainer):
-            write_metrics(trainer.problem, law, trainer.seed, folder)
+            write_metrics(trainer.problem, policy, trainer.seed, folder)
     closing.complete(folder)
     log.info("controller from %s, %.0f s in all, in %s", kind, time.perf_counter() - started, folder)
     if failure is not None:
-        which = "the best look before" if trainer.watch.best else f"step {trainer.step}, without any look"
+        which = "the best look before" if trainer.health.best else f"step {trainer.step}, without any look"
         raise InputError(f"{failure.rstrip('.')}; the controller in {folder} is that of {which}.")
     return certificate
 
@@ -109,7 +111,7 @@ def _failure(trainer: Trainer, error: BaseException) -> str | None:
     if isinstance(error, NonFiniteError):
         trainer.stopped = NOT_FINITE
         failure = f"Training stopped at step {trainer.step}, before the update: {error}"
-        if trainer.watch.best is None and BROKEN_PROBLEM not in failure:
+        if trainer.health.best is None and BROKEN_PROBLEM not in failure:
             raise InputError(failure) from None  # nobody knows how long it has diverged
         return failure
     told = blamed(error, type(trainer.problem))
@@ -137,7 +139,7 @@ def _salvage(
 ) -> tuple[Certificate, Fields]:
     """What a run that cannot go on still gives: the certificate of its best look made anew, or, where the problem fails there
     as well, as it was seen then; without any look that of the fields as they are. `InputError` when nothing."""
-    best, seen = trainer.watch.best, trainer.watch.certificate
+    best, seen = trainer.health.best, trainer.health.certificate
     if best is None and trainer.step == 0:
         raise InputError(failure)
     fields = trainer.averaged_fields if best is None else trainer.best_fields()
@@ -152,18 +154,18 @@ def _salvage(
         f"the numbers are those of the quick look at step {step}: the problem failed again when they were refined."
     )
     certificate = replace(seen, run=replace(trainer.run, step=step))
-    return replace(certificate, warnings=[*seen.warnings, *trainer.watch.notes, *notes]), fields
+    return replace(certificate, warnings=[*seen.warnings, *trainer.health.notes, *notes]), fields
 
 
 def with_warnings(trainer: Trainer, certificate: Certificate, notes: list[str]) -> Certificate:
     """``certificate`` with what else a user should know of the run."""
-    found = hopeless(trainer.problem, trainer.bounds, certificate, trainer.seed)
-    fresh = [note for note in (*notes, *trainer.watch.notes, *found) if note not in certificate.warnings]
+    found = sanity_warnings(trainer.problem, trainer.constants, certificate, trainer.seed)
+    fresh = [note for note in (*notes, *trainer.health.notes, *found) if note not in certificate.warnings]
     return replace(certificate, warnings=[*certificate.warnings, *fresh])
 
 
 def _hand_out(trainer: Trainer, certificate: Certificate, fields: Fields, folder: Path) -> str:
-    """Write `controller.safetensors` and `certificate.json`; the law that the controller follows."""
+    """Write `controller.safetensors` and `certificate.json`; the policy that the controller follows."""
     if certificate.controller is not None:
         kind = certificate.controller
     elif certificate.subject is not None:
@@ -176,11 +178,11 @@ def _hand_out(trainer: Trainer, certificate: Certificate, fields: Fields, folder
 
 
 def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields: Fields) -> Controller:
-    """The controller of law ``kind`` that ``trainer`` hands out, from its averaged ``fields``."""
+    """The controller of policy ``kind`` that ``trainer`` hands out, from its averaged ``fields``."""
     return Controller(
         problem=trainer.problem,
         fields=fields,
-        bounds=trainer.bounds,
+        constants=trainer.constants,
         occupation=trainer.objective.occupation,
         kind=kind,
         model=trainer.config["model"],
@@ -191,17 +193,17 @@ def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields:
 
 def summary(trainer: Trainer) -> str:
     """What is about to be trained, in a few lines."""
-    problem, settings, bounds = trainer.problem, trainer.settings, trainer.bounds
+    problem, settings, constants = trainer.problem, trainer.settings, trainer.constants
     weights = sum(p.numel() for p in trainer.fields.parameters())
     name, method = trainer.names
-    used = ", ".join(f"{k} = {getattr(bounds, k):.4g} ({bounds.sources[k]})" for k in ("M", "C_V", "C_u"))
+    used = ", ".join(f"{k} = {getattr(constants, k):.4g} ({constants.sources[k]})" for k in ("M", "C_V", "C_u"))
     lines = [
         f"{name}: d = {problem.dim}, m = {problem.control_dim}, rho = {problem.discount:g}, q = {problem.exponent:g}",
         f"{method}: {', '.join(trainer.objective.fields)}, {weights:,} weights, {settings.dtype} on {settings.torch_device}",
         f"{settings.steps:,} steps of {settings.batch} states, seed {trainer.seed}",
         *([f"going on from step {trainer.step:,}"] if trainer.step else []),
         f"bounds: {used}",
-        *(f"warning: {warning}" for warning in (*bounds.warnings, *trainer.objective.notes)),
+        *(f"warning: {warning}" for warning in (*constants.warnings, *trainer.objective.notes)),
     ]
     width = shutil.get_terminal_size().columns
     return "\n".join(["", *(line if len(line) <= 2 * width else line[: 2 * width] for line in lines)])

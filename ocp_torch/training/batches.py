@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ocp_torch.control.policies import ValueLaw
+from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.errors import InputError, require_number
 from ocp_torch.fields import VALUE, Fields
 from ocp_torch.maths.sampling import derive_seed
@@ -33,7 +33,7 @@ class Batches:
     wherever the measure that weighs the slack dominates `mu*` (proof of Proposition 3), which no multiple of the uniform
     one then does. And in many dimensions a goal is so small that uniform states never meet it.
 
-    ``visited`` null takes a quarter where `Bounds.unbounded`, and none elsewhere. Raises `InputError` where it is not in
+    ``visited`` null takes a quarter where `Constants.unbounded`, and none elsewhere. Raises `InputError` where it is not in
     [0, 0.9], or above 0 for a method without `V` or a problem that has data only where it was recorded.
     """
 
@@ -51,10 +51,12 @@ class Batches:
         self.visited = (
             None if visited is None else require_number("sampler.visited", visited, at_least=0.0, at_most=MOST)
         )
-        self._possible = VALUE in objective.fields and problem.evaluable
+        self._possible = VALUE in objective.fields and problem.has_simulator
         if self.visited and not self._possible:
             lacks = (
-                "a data set has no data at other states" if not problem.evaluable else "this method has no V to follow"
+                "a data set has no data at other states"
+                if not problem.has_simulator
+                else "this method has no V to follow"
             )
             raise InputError(f"sampler.visited is {visited:g}, but {lacks}; leave it out.")
         self.generator = torch.Generator().manual_seed(derive_seed(seed, VISITS_STREAM))
@@ -66,14 +68,14 @@ class Batches:
         count = self._count()
         places = self.sampler.draw(self.size - count).to(like.device)
         drawn = self.problem.samples(places, divergences=self.objective.needs_divergences)
-        if not self.problem.evaluable:
+        if not self.problem.has_simulator:
             return drawn.to(like)
         return self._with_visited(drawn, count, like) if count else drawn
 
     def _count(self) -> int:
         part = self.visited
         if part is None:
-            part = VISITED if self._possible and self.objective.bounds.unbounded else 0.0
+            part = VISITED if self._possible and self.objective.constants.unbounded else 0.0
         return min(int(part * self.size), self.size - 1)
 
     def _with_visited(self, drawn: Samples, count: int, like: Tensor) -> Samples:
@@ -89,8 +91,8 @@ class Batches:
 
     def _move(self, at: Samples) -> Tensor:
         """Along the closed loop for a short time, or back to a uniform state; the part of `MOVE` it took, ``(k,)``."""
-        law, rho = ValueLaw(self.problem, self.fields.value), self.problem.discount
-        u = law(at.x).detach()
+        policy, rho = ValuePolicy(self.problem, self.fields.value), self.problem.discount
+        u = policy(at.x).detach()
         velocity = at.a + torch.einsum("ndm,nm->nd", at.B, u)
         time = (STRIDE / velocity.norm(dim=-1).clamp_min(1e-12)).clamp_max(MOVE / rho)
         moved = (at.x + time.unsqueeze(-1) * velocity).remainder(1.0)

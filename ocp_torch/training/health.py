@@ -12,7 +12,7 @@ from ocp_torch.certificate import Certificate
 from ocp_torch.errors import notes
 from ocp_torch.maths.sampling import derive_seed
 from ocp_torch.problems import Problem
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 
 # A run whose weights or losses have grown by so much since it began is not coming back.
 GROWN_WEIGHTS, GROWN_LOSS = 100.0, 1e4
@@ -24,7 +24,7 @@ ROUNDING = 1e-4
 
 
 @dataclass(frozen=True)
-class Look:
+class Evaluation:
     """What the bounds were at ``step``; ``noise`` is half of the intervals of both sides, in the units of ``gap``.
 
     Where bounds contradict each other nothing counts: such a look has neither a gap nor a performance.
@@ -38,7 +38,7 @@ class Look:
     noise: float
 
     @classmethod
-    def at(cls, step: int, certificate: Certificate) -> Look:
+    def at(cls, step: int, certificate: Certificate) -> Evaluation:
         lower, perf = certificate.best_lower, certificate.best_perf
         errors = certificate.lower[lower[0]].half_width(certificate.confidence) if lower else 0.0
         errors += certificate.perf[perf[0]].half_width(certificate.confidence) if perf else 0.0
@@ -46,7 +46,7 @@ class Look:
         unit = lower[1] if gap is not None else perf[1] if perf else 1.0
         return cls(step, gap, perf[1] if perf else None, errors / abs(unit) if unit else 0.0)
 
-    def better_than(self, other: Look | None, sure: bool = False) -> bool:
+    def better_than(self, other: Evaluation | None, sure: bool = False) -> bool:
         """By the gap, or by the performance where neither has one; with ``sure``, by more than the noise of both."""
         if other is None:
             return self.gap is not None or self.perf is not None
@@ -60,20 +60,20 @@ class Look:
         return self.gap + margin < other.gap
 
 
-class Watch:
-    """Follows a run. ``best`` is the best `Look` so far, ``fields`` the averaged fields it was of and ``certificate`` what it
-    said (not kept in checkpoints); ``notes`` are what a user should be told of the run's health; ``unit`` is the size of the
-    problem's costs."""
+class Health:
+    """Follows a run. ``best`` is the best `Evaluation` so far, ``fields`` the averaged fields it was of and ``certificate``
+    what it said (not kept in checkpoints); ``notes`` are what a user should be told of the run's health; ``unit`` is the
+    size of the problem's costs."""
 
     def __init__(self, unit: float) -> None:
-        self.best: Look | None = None
+        self.best: Evaluation | None = None
         self.fields: dict | None = None
         self.certificate: Certificate | None = None
         self.notes: list[str] = []
         self.warned = False  # that a look was hopeless
         self._unit, self._start = unit, {}
 
-    def looked(self, look: Look, fields: torch.nn.Module, certificate: Certificate | None = None) -> bool:
+    def looked(self, look: Evaluation, fields: torch.nn.Module, certificate: Certificate | None = None) -> bool:
         """Take note of a look at ``fields``; whether it is the best so far."""
         if not look.better_than(self.best):
             return False
@@ -111,18 +111,18 @@ class Watch:
         return {"best": best, "fields": self.fields, "start": dict(self._start), **told}
 
     def load_state_dict(self, state: dict) -> None:
-        self.best, self.certificate = Look(**state["best"]) if state["best"] else None, None
+        self.best, self.certificate = Evaluation(**state["best"]) if state["best"] else None, None
         self.fields = copy.deepcopy(state["fields"])
         self.notes, self.warned = list(notes(state["notes"])), bool(state["warned"])
         self._start = dict(state["start"])
 
 
-def hopeless(problem: Problem, bounds: Bounds, certificate: Certificate, seed: int) -> list[str]:
+def sanity_warnings(problem: Problem, constants: Constants, certificate: Certificate, seed: int) -> list[str]:
     """What ``certificate`` shows to be no better than not having trained."""
     notes = []
     lower, zero, perf = certificate.best_lower, certificate.baseline.get("zero"), certificate.best_perf
     trained = [e for e in certificate.lower.values() if e is not None]
-    constant = best_constant(problem, bounds, seed) if trained else None
+    constant = best_constant(problem, constants, seed) if trained else None
     if constant is not None and certificate.counts("F_M"):
         estimate = certificate.lower[lower[0]] if lower else None
         if estimate is None or estimate.above < constant - ROUNDING * abs(constant):
@@ -134,8 +134,8 @@ def hopeless(problem: Problem, bounds: Bounds, certificate: Certificate, seed: i
 
 
 @torch.no_grad()
-def best_constant(problem: Problem, bounds: Bounds, seed: int) -> float:
+def best_constant(problem: Problem, constants: Constants, seed: int) -> float:
     """`max_c F_M(c) = max_c c - M E[(c - f)_+]` over constants `c`, reached at the `1 / M` quantile of `f`."""
-    f, weight = problem.survey(CONSTANT_STATES, derive_seed(seed, CONSTANT_STREAM), "f", "weight")
-    c = torch.quantile(f, min(1.0, 1.0 / bounds.M))  # any c gives a lower bound: that of unweighted states will do
-    return float(c - bounds.M * (weight * (c - f).clamp_min(0.0)).mean())
+    f, weight = problem.probe(CONSTANT_STATES, derive_seed(seed, CONSTANT_STREAM), "f", "weight")
+    c = torch.quantile(f, min(1.0, 1.0 / constants.M))  # any c gives a lower bound: that of unweighted states will do
+    return float(c - constants.M * (weight * (c - f).clamp_min(0.0)).mean())

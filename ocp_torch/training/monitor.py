@@ -30,11 +30,11 @@ def liouville_residual(trainer, batch: Samples) -> dict[str, Tensor]:
     """`mean |mu0 - mu - div(a mu + B w) / rho|` on ``batch``, whatever gives `mu`: also where the loss needs no divergences
     (a player that rests, the plain saddle) or `mu` is in closed form. Nothing where the problem gives no divergences."""
     problem, fields, rho = trainer.problem, trainer.fields, trainer.problem.discount
-    samples = Samples.of(problem, batch.x) if problem.evaluable else batch
+    samples = Samples.of(problem, batch.x) if problem.has_simulator else batch
     if samples.div_a is None or samples.div_B is None:
         return {}
-    form = (trainer.objective.occupation, problem, fields, trainer.bounds)
-    _, inflow = formulas.controlled_inflow(samples, admissible_density(*form), rho)
+    form = (trainer.objective.occupation, problem, fields, trainer.constants)
+    _, inflow = formulas.control_inflow(samples, admissible_density(*form), rho)
     density = occupation_density(*form)
     if problem.driftless:
         loss = density(samples.x)
@@ -122,7 +122,7 @@ class Monitor(Silent):
 
     def extended(self, trainer) -> None:
         self.bar.total = trainer.end
-        log.info("not good yet: training goes on to step %d, with M = %.4g", trainer.end, trainer.bounds.M)
+        log.info("not good yet: training goes on to step %d, with M = %.4g", trainer.end, trainer.constants.M)
 
     def stopped(self, trainer, why: str, settings: CertificateSettings) -> None:
         """Training stopped, and the certificate is about to be made; says why, and about how long that takes."""

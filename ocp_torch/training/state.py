@@ -28,9 +28,9 @@ def gather(trainer: Trainer) -> dict:
         "step": trainer.step,
         "round": trainer.round,
         "bounds": {
-            "M": trainer.bounds.M,
-            "warnings": list(trainer.bounds.warnings),
-            "unbounded": trainer.bounds.unbounded,
+            "M": trainer.constants.M,
+            "warnings": list(trainer.constants.warnings),
+            "unbounded": trainer.constants.unbounded,
         },
         "samples": trainer.samples,
         "seconds": trainer.seconds,
@@ -42,7 +42,7 @@ def gather(trainer: Trainer) -> dict:
         "average": trainer.average.state_dict(),
         "stepper": trainer.stepper.state_dict(),
         "batches": trainer.batches.state_dict(),
-        "watch": trainer.watch.state_dict(),
+        "watch": trainer.health.state_dict(),
         "generators": generator_states(),
     }
 
@@ -65,9 +65,9 @@ def restore(trainer: Trainer, state: dict) -> None:
     for name in ("seconds", "elapsed"):
         setattr(trainer, name, require_number(f"{name} of the checkpoint", state[name], at_least=0.0))
     trainer.pending, trainer.retry = bool(state["pending"]), int(state["retry"])
-    bounds = state["bounds"]
-    warnings, unbounded = notes(bounds["warnings"]), bool(bounds["unbounded"])
-    trainer.use(replace(trainer.bounds, M=bounds["M"], warnings=warnings, unbounded=unbounded))
+    constants = state["bounds"]
+    warnings, unbounded = notes(constants["warnings"]), bool(constants["unbounded"])
+    trainer.use(replace(trainer.constants, M=constants["M"], warnings=warnings, unbounded=unbounded))
     best = state["watch"]["fields"]
     for module, weights in ((trainer.fields, state["fields"]), (trainer.average, state["average"])):
         _require_weights(module, weights)
@@ -80,7 +80,7 @@ def restore(trainer: Trainer, state: dict) -> None:
     else:
         trainer.stepper.load_state_dict(state["stepper"])
     trainer.batches.load_state_dict(state["batches"])
-    trainer.watch.load_state_dict(state["watch"])
+    trainer.health.load_state_dict(state["watch"])
     restore_generators(state["generators"])
 
 

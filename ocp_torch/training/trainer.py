@@ -27,11 +27,11 @@ from ocp_torch.maths.sampling import derive_seed
 from ocp_torch.objectives import Objective
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import blamed
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.steppers import NonFiniteError, Stepper
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.checkpoint import BEST, load_checkpoint, save_checkpoint
-from ocp_torch.training.health import Look, Watch, hopeless
+from ocp_torch.training.health import Evaluation, Health, sanity_warnings
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.signals import Signals
 from ocp_torch.training.state import gather, restore
@@ -65,7 +65,7 @@ class Trainer:
         problem: Problem,
         fields: Fields,
         objective: Objective,
-        bounds: Bounds,
+        constants: Constants,
         stepper: Stepper,
         average,
         batches: Batches,
@@ -75,7 +75,7 @@ class Trainer:
         names: tuple[str, str],
         config: dict,
     ) -> None:
-        self.problem, self.fields, self.objective, self.bounds = problem, fields, objective, bounds
+        self.problem, self.fields, self.objective, self.constants = problem, fields, objective, constants
         self.stepper, self.average, self.batches, self.settings = stepper, average, batches, settings
         self.network, self.seed, self.names, self.config = network, seed, names, config
         self.step, self.round, self.samples = 0, 0, 0
@@ -83,10 +83,10 @@ class Trainer:
         self.pending, self.retry = False, 0  # a certificate may have reached the target gap; not tried before this step
         self.stopped, self.ended = STEPS, False
         (mean, spread), _ = typical_sizes(problem)
-        self.watch = Watch(unit=abs(mean) + spread)
+        self.health = Health(unit=abs(mean) + spread)
         self.tell: Progress = silent  # who wants to know of the stages of a certificate
         self.look_seconds: float | None = None  # how long the last look took
-        self._seen: tuple[int, Bounds, Certificate] | None = None  # the last look, and what it was of
+        self._seen: tuple[int, Constants, Certificate] | None = None  # the last look, and what it was of
 
     @property
     def averaged_fields(self) -> Fields:
@@ -170,7 +170,7 @@ class Trainer:
         due = lambda every: every > 0 and self.step % every == 0
         last = self.step == self.end
         if due(settings.log_every) or last:
-            for sentence in self.watch.stepped(self.step, report.losses, self.stepper.parameters):
+            for sentence in self.health.stepped(self.step, report.losses, self.stepper.parameters):
                 monitor.noticed(sentence)
         monitor.stepped(self, report, log=due(settings.log_every) or last)
         if due(settings.evaluate_every) and not last:
@@ -184,13 +184,13 @@ class Trainer:
         self._require_finite()
         certificate = self.look()
         monitor.evaluated(self, certificate)
-        best = self.watch.looked(Look.at(self.step, certificate), self.averaged_fields, certificate)
+        best = self.health.looked(Evaluation.at(self.step, certificate), self.averaged_fields, certificate)
         if certificate.contradiction is not None:
-            for sentence in self.watch.contradicted(self.step, certificate.contradiction):
+            for sentence in self.health.contradicted(self.step, certificate.contradiction):
                 monitor.noticed(sentence)
-        if 2 * self.step >= self.settings.steps and not self.watch.warned:
-            for sentence in hopeless(self.problem, self.bounds, certificate, self.seed):
-                self.watch.warned = True
+        if 2 * self.step >= self.settings.steps and not self.health.warned:
+            for sentence in sanity_warnings(self.problem, self.constants, certificate, self.seed):
+                self.health.warned = True
                 monitor.noticed(f"step {self.step}: {sentence}")
         target, gap = self.settings.target_gap, certificate.plain_gap
         self.pending = target is not None and gap is not None and gap <= target and self.step >= self.retry
@@ -212,26 +212,26 @@ class Trainer:
 
     def _wants_another_round(self) -> bool:
         """Whether rounds are left and the gap is not good yet; never without a lower bound to measure it by."""
-        if self.round + 1 >= self.settings.rounds or self.fields.value is None or not self.problem.evaluable:
+        if self.round + 1 >= self.settings.rounds or self.fields.value is None or not self.problem.has_simulator:
             return False  # without a simulation there is no gap to go by
         gap = self.look().plain_gap
         return gap is None or gap > self.settings.good_gap
 
-    def use(self, bounds: Bounds) -> None:
-        """Train and certify with ``bounds`` from now on."""
-        self.bounds = self.objective.bounds = bounds
+    def use(self, constants: Constants) -> None:
+        """Train and certify with ``constants`` from now on."""
+        self.constants = self.objective.constants = constants
 
     def look(self) -> Certificate:
         """A quick certificate of the averaged fields, on states that neither training nor `certify` uses."""
-        if self._seen is None or self._seen[:2] != (self.step, self.bounds):
+        if self._seen is None or self._seen[:2] != (self.step, self.constants):
             started = time.perf_counter()
-            self._seen = (self.step, self.bounds, self._quick(QUICK))
+            self._seen = (self.step, self.constants, self._quick(QUICK))
             self.look_seconds = time.perf_counter() - started
         return self._seen[2]
 
     def _quick(self, settings: CertificateSettings, fields: Fields | None = None) -> Certificate:
         run = replace(self.run, seed=derive_seed(self.seed, LOOK_STREAM))
-        return self.certify(settings, fields, run=run, problem=self.problem.rehearsal)
+        return self.certify(settings, fields, run=run, problem=self.problem.validation_view)
 
     def certify(
         self,
@@ -243,22 +243,22 @@ class Trainer:
         """The certificate of ``fields``, or of the averaged ones as they stand."""
         trained = Trained(fields or self.averaged_fields, self.objective.occupation, self.network)
         tell = self.tell if run is None else silent  # looks are too many to be told of
-        return certify_fields(problem or self.problem, trained, self.bounds, settings, run or self.run, tell)
+        return certify_fields(problem or self.problem, trained, self.constants, settings, run or self.run, tell)
 
     def choose(self) -> tuple[Fields, str | None]:
         """The fields to hand out: the averaged ones, or those of the best look where they are clearly worse than that; and
         a sentence that says so."""
-        best = self.watch.best
+        best = self.health.best
         if best is None or best.step == self.step:
             return self.averaged_fields, None
         seen = self.look()
         if seen.contradiction is not None:
             return self.averaged_fields, None  # an earlier look would but hide it
-        fields, final = self.best_fields(), Look.at(self.step, seen)
-        if best.better_than(final, sure=True) and SEARCHED.searches(self.bounds):
+        fields, final = self.best_fields(), Evaluation.at(self.step, seen)
+        if best.better_than(final, sure=True) and SEARCHED.searches(self.constants):
             # Spikes of the slack come and go from look to look; the certificate's averages of V know nothing of them.
-            best = Look.at(best.step, self._quick(SEARCHED, fields))
-            final = Look.at(self.step, self._quick(SEARCHED))
+            best = Evaluation.at(best.step, self._quick(SEARCHED, fields))
+            final = Evaluation.at(self.step, self._quick(SEARCHED))
         if not best.better_than(final, sure=True):
             return self.averaged_fields, None
         return fields, (
@@ -269,7 +269,7 @@ class Trainer:
     def best_fields(self) -> Fields:
         """The averaged fields of the best look."""
         fields = copy.deepcopy(self.averaged_fields)
-        fields.load_state_dict(self.watch.fields)
+        fields.load_state_dict(self.health.fields)
         return fields
 
     def state_dict(self) -> dict:
@@ -304,7 +304,7 @@ class Trainer:
             pass  # the run itself will say so
 
 
-def _words(look: Look) -> str:
+def _words(look: Evaluation) -> str:
     return (
         f"a gap of {100 * look.gap:.3g} %"
         if look.gap is not None

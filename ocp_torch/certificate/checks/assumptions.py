@@ -10,11 +10,11 @@ import torch
 from ocp_torch.certificate.checks.regularity import Jump
 from ocp_torch.certificate.checks.wellposed import WellPosed
 from ocp_torch.certificate.simulated.occupation import estimated_sup_occupation, occupation_along_flow
-from ocp_torch.problems.constants import FROM_PROBLEM, Bounds
+from ocp_torch.problems.constants import FROM_PROBLEM, Constants
 from ocp_torch.problems.needs import GIVEN, GUESSED, SEARCHED, Need
 from ocp_torch.problems.problem import Problem
 
-__all__ = ["Assumptions", "Met", "check_assumptions", "estimated_sup_occupation", "occupation_along_flow"]
+__all__ = ["Assumptions", "Observed", "check_assumptions", "estimated_sup_occupation", "occupation_along_flow"]
 
 # An estimated supremum may exceed a bound by so much before it contradicts it.
 TOLERANCE = 0.02
@@ -26,7 +26,7 @@ DECLARED = 1.25
 
 
 @dataclass(frozen=True)
-class Met:
+class Observed:
     """What the checks met; `None` where it was not looked for."""
 
     sup_occupation: float | None = None
@@ -102,24 +102,24 @@ class Assumptions:
 
 
 def check_assumptions(
-    problem: Problem, bounds: Bounds, met: Met, uses: tuple[bool, bool]
+    problem: Problem, constants: Constants, met: Observed, uses: tuple[bool, bool]
 ) -> tuple[Assumptions, list[str]]:
-    """Hold what was ``met`` against ``bounds``; ``uses`` says whether a lower and an upper side are in the certificate."""
+    """Hold what was ``met`` against ``constants``; ``uses`` says whether a lower and an upper side are in the certificate."""
     uses_M, uses_C_V = uses
     warnings = list(met.problem.warnings) if met.problem else []
-    M_holds, why = occupation_holds(problem, bounds, met)
+    M_holds, why = occupation_holds(problem, constants, met)
     if uses_M and not M_holds:
         warnings.append(f"F_M is not used: {why}.")
-    elif uses_M and bounds.basis("M") == GUESSED:
-        warnings.append(f"F_M is a bound only if sup mu* <= {bounds.M:.4g}, a guess: no gap uses it.")
-    value_holds = met.largest_value is None or met.largest_value <= bounds.C_V * (1.0 + 1e-3)
+    elif uses_M and constants.basis("M") == GUESSED:
+        warnings.append(f"F_M is a bound only if sup mu* <= {constants.M:.4g}, a guess: no gap uses it.")
+    value_holds = met.largest_value is None or met.largest_value <= constants.C_V * (1.0 + 1e-3)
     if uses_C_V and not value_holds:
         warnings.append(
-            f"J with C_V = {bounds.C_V:.4g} and G are not used: the controller's value reaches {met.largest_value:.4g}."
+            f"J with C_V = {constants.C_V:.4g} and G are not used: the controller's value reaches {met.largest_value:.4g}."
         )
-    control_holds = met.sup_control is None or met.sup_control <= bounds.C_u * (1.0 + TOLERANCE)
+    control_holds = met.sup_control is None or met.sup_control <= constants.C_u * (1.0 + TOLERANCE)
     if not control_holds:
-        warnings.append(f"the control reaches {met.sup_control:.4g}, beyond C_u = {bounds.C_u:.4g}.")
+        warnings.append(f"the control reaches {met.sup_control:.4g}, beyond C_u = {constants.C_u:.4g}.")
     jumps = met.jump is not None and met.jump.size > 0.0
     if jumps:
         at = [round(c, 4) for c in met.jump.x[:6].tolist()] + (["..."] if len(met.jump.x) > 6 else [])
@@ -128,9 +128,9 @@ def check_assumptions(
             f"x = {at} for one, and they need all to be without jumps."
         )
     assumptions = Assumptions(
-        bounds.M if uses_M else None,
-        bounds.C_V if uses_C_V else None,
-        bounds.C_u,
+        constants.M if uses_M else None,
+        constants.C_V if uses_C_V else None,
+        constants.C_u,
         met.sup_occupation,
         met.sup_control,
         occupation_holds=M_holds or not uses_M,
@@ -144,36 +144,36 @@ def check_assumptions(
         largest_jump=met.jump.size if met.jump else None,
         smallest_state_cost=met.problem.smallest_cost if met.problem else None,
         initial_mass=met.problem.mass if met.problem else None,
-        basis={"M": bounds.basis("M"), "C_V": bounds.basis("C_V")},
+        basis={"M": constants.basis("M"), "C_V": constants.basis("C_V")},
     )
     return assumptions, warnings
 
 
-def occupation_holds(problem: Problem, bounds: Bounds, met: Met) -> tuple[bool, str]:
+def occupation_holds(problem: Problem, constants: Constants, met: Observed) -> tuple[bool, str]:
     """Whether nothing speaks against `M >= sup mu*`, and what does. An `M` that was given must have been held against the
     density under the controller, unless the problem knows `mu*` exactly; a guess stays one whatever it was held against."""
     true, estimate = problem.occupation_bound, met.sup_occupation
     if true is not None and math.isinf(true):
         return False, "mu* is unbounded for this problem, so no M is large enough"
     point = torch.full((1, problem.dim), 0.5, dtype=torch.float64)
-    if true is not None and bounds.M >= true and problem.exact_occupation(point) is not None:
+    if true is not None and constants.M >= true and problem.exact_occupation(point) is not None:
         return True, ""
     mean = 1.0 if met.problem is None else met.problem.mass
-    if bounds.M < mean * (1.0 - 1e-6):
-        return False, f"M = {bounds.M:.4g} is below the mean of every occupation density, {mean:.4g}"
-    if bounds.sources["M"] != FROM_PROBLEM and true is not None and bounds.M < true * (1.0 - TOLERANCE):
-        return False, f"M = {bounds.M:.4g} is below this problem's sup mu*, {true:.4g}"
+    if constants.M < mean * (1.0 - 1e-6):
+        return False, f"M = {constants.M:.4g} is below the mean of every occupation density, {mean:.4g}"
+    if constants.sources["M"] != FROM_PROBLEM and true is not None and constants.M < true * (1.0 - TOLERANCE):
+        return False, f"M = {constants.M:.4g} is below this problem's sup mu*, {true:.4g}"
     if estimate is None:
         blind = "was held against no occupation density: certificate.occupation_states is 0, or nothing was simulated"
-        return bounds.basis("M") == GUESSED, f"M = {bounds.M:.4g} {blind}"
+        return constants.basis("M") == GUESSED, f"M = {constants.M:.4g} {blind}"
     reached = f"the occupation density under the controller reaches about {estimate:.4g}"
     if not math.isfinite(estimate):
         return False, "the occupation density under the controller grows beyond all bounds, so no M can be believed"
-    if true is not None and bounds.M >= true:
-        return estimate <= DECLARED * bounds.M, f"M = {bounds.M:.4g}, as the problem declares, but {reached}"
+    if true is not None and constants.M >= true:
+        return estimate <= DECLARED * constants.M, f"M = {constants.M:.4g}, as the problem declares, but {reached}"
     return (
-        estimate * CLEARANCE <= bounds.M,
-        f"M = {bounds.M:.4g}, but {reached}, and must stay clearly below M to say that M did not shape it",
+        estimate * CLEARANCE <= constants.M,
+        f"M = {constants.M:.4g}, but {reached}, and must stay clearly below M to say that M did not shape it",
     )
 
 

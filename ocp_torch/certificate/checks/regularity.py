@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ocp_torch.control.policies import ControlLaw
+from ocp_torch.control.policies import Policy
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
 
@@ -48,7 +48,7 @@ class Jump:
 
 @torch.no_grad()
 def largest_jump(
-    law: ControlLaw, dim: int, seed: int = 0, problem: Problem | None = None, near: Tensor | None = None
+    policy: Policy, dim: int, seed: int = 0, problem: Problem | None = None, near: Tensor | None = None
 ) -> Jump:
     """Follow, on segments of all lengths, the half across which the control changes more; with ``problem`` also its drift,
     control matrix and closed loop, and layers of them too steep for sampled states to resolve.
@@ -57,9 +57,9 @@ def largest_jump(
     change most and most unlike their neighbours are followed. For a Lipschitz function the change halves with the length; a
     jump that is followed stays. One much smaller than what changes nearby anyway, or on a tiny set, can be missed.
     """
-    functions: dict[str, Callable[[Tensor], Tensor]] = {CONTROLLER: law}
+    functions: dict[str, Callable[[Tensor], Tensor]] = {CONTROLLER: policy}
     if problem is not None:
-        functions[LOOP] = lambda x: problem.velocity(x, law(x))
+        functions[LOOP] = lambda x: problem.velocity(x, policy(x))
         functions[MATRIX] = lambda x: problem.control_matrix(x).flatten(1)
         if not problem.driftless:
             functions[DRIFT] = problem.drift

@@ -20,7 +20,7 @@ from ocp_torch.maths.mixtures import Mixture, concentrated
 from ocp_torch.maths.sampling import derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
-from ocp_torch.problems.starts import UNIFORM_STATES, evaluation_law
+from ocp_torch.problems.starts import UNIFORM_STATES, evaluation_distribution
 
 # Below so many states behind the scatter a mean is carried by a few; smaller kurtoses than that say nothing.
 FEW, KURTOSIS = 30.0, 30.0
@@ -79,14 +79,14 @@ def sharpened(evaluate: Callable[[list[Samples]], R], problem: Problem, sets: li
             break
         away = sum((torch.cat(c) - torch.cat(c).mean()).abs() for c in rare)
         x, weight = (torch.cat([getattr(s, name) for s in sets]) for name in ("x", "weight"))
-        law = concentrated(x, away, 1.0 / weight)
-        known = evaluation_law(problem)
-        laws = [law for law in (law, known) if not law.is_uniform]
-        if not laws:
+        policy = concentrated(x, away, 1.0 / weight)
+        known = evaluation_distribution(problem)
+        policies = [policy for policy in (policy, known) if not policy.is_uniform]
+        if not policies:
             break
-        law = Mixture.join([law.scaled((1.0 - UNIFORM_STATES) / len(laws)) for law in laws])
+        policy = Mixture.join([policy.scaled((1.0 - UNIFORM_STATES) / len(policies)) for policy in policies])
         divergences = sets[0].div_a is not None
         fresh = derive_seed(seed, STREAM, k)
-        sets = replicated_samples(problem, len(sets[0]), len(sets), fresh, divergences, law)
+        sets = replicated_samples(problem, len(sets[0]), len(sets), fresh, divergences, policy)
         found = evaluate(sets)
     return found

@@ -1,4 +1,4 @@
-"""A controller somebody brings, as a control law: checked, wrapped to the torus, with derivatives by differences."""
+"""A controller somebody brings, as a policy: checked, wrapped to the torus, with derivatives by differences."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BEYOND = 1e-5
 
 
 class BlackBox:
-    """``function`` of states ``(N, d)`` to controls ``(N, m)``, a tensor or an array, as a law in float64.
+    """``function`` of states ``(N, d)`` to controls ``(N, m)``, a tensor or an array, as a policy in float64.
 
     It is asked on `[0, 1)^d` only. Central differences stand in for its derivatives, so that it may be NumPy, a runtime's
     session or anything else; ``precision`` is what it computes in. Raises `InputError` where it fails, gives another

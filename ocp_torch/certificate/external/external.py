@@ -27,10 +27,10 @@ from ocp_torch.certificate.sides import lower_side
 from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
-from ocp_torch.control.policies import ControlLaw, ValueLaw, zero_law
+from ocp_torch.control.policies import Policy, ValuePolicy, zero_policy
 from ocp_torch.maths.calculus import Field
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.scan import odd_states
@@ -41,18 +41,18 @@ GIVEN = "given"
 
 def certify_policy(
     problem: Problem,
-    law: ControlLaw,
+    policy: Policy,
     value: Field | None,
     network: Callable[..., nn.Module],
-    bounds: Bounds,
+    constants: Constants,
     settings: CertificateSettings,
     run: Run,
     progress: Progress = silent,
 ) -> Certificate:
-    """The certificate of ``law``; with ``value`` (float64), any `V`, also how far from optimal it is at most.
+    """The certificate of ``policy``; with ``value`` (float64), any `V`, also how far from optimal it is at most.
 
     ``network`` makes the networks for `V^u` and `mu^u`; each stage's name is given to ``progress`` as it begins. Raises
-    `InputError` where the law fails.
+    `InputError` where the policy fails.
     """
     count, seed, ascents = settings.replicates, run.seed, settings.ascents
     part = max(TANGENT_PART, problem.dim // 2)
@@ -63,37 +63,37 @@ def certify_policy(
     warnings: list[str] = []
     if settings.stage.steps:
         progress("closed-loop fit")
-    evaluated, own = evaluate_policy(problem, law, network, bounds, settings, few, wide, seed, odd)
+    evaluated, own = evaluate_policy(problem, policy, network, constants, settings, few, wide, seed, odd)
     if settings.stage.steps and evaluated is None:
         warnings.append("no bound on Perf without simulation: this problem gives no divergences of a and B.")
-    simulate = lambda law, number, value=None, initial=None: simulate_performance(
-        problem, law, number, count, seed, value, initial, settings.horizon, settings.tolerance
+    simulate = lambda policy, number, value=None, initial=None: simulate_performance(
+        problem, policy, number, count, seed, value, initial, settings.horizon, settings.tolerance
     )
     number, perf, zero, given, best = settings.trajectories, {}, None, None, None
     lower = None
     if value is not None:
         progress("bounds")
-        lower = lower_side(problem, value, wide, bounds.M, ascents, settings.searches(bounds), seed, odd)
+        lower = lower_side(problem, value, wide, constants.M, ascents, settings.searches(constants), seed, odd)
     if number:
         progress("simulation")
         initial = [integral(s, own(s.x) * s.mu0) for s in wide] if own is not None else None
-        given = simulate(law, number, own, initial)
+        given = simulate(policy, number, own, initial)
         perf[GIVEN] = given.perf
-        zero = simulate(zero_law(problem), max(2, number // BASELINE_PART)).perf
+        zero = simulate(zero_policy(problem), max(2, number // BASELINE_PART)).perf
         if value is not None:
-            best = simulate(ValueLaw(problem, value), number, value, lower.initial)
+            best = simulate(ValuePolicy(problem, value), number, value, lower.initial)
             perf["value"] = best.perf
     progress("assumptions")
-    met = measured(problem, law, given, few, posed, replace(settings, occupation_states=0))
+    met = measured(problem, policy, given, few, posed, replace(settings, occupation_states=0))
     if best is not None:
         # M is about the optimal controller, which the one from V is nearer to than anybody's.
-        near = measured(problem, ValueLaw(problem, value), best, few, posed, settings)
+        near = measured(problem, ValuePolicy(problem, value), best, few, posed, settings)
         met = replace(met, sup_occupation=near.sup_occupation, a_priori_occupation=near.a_priori_occupation)
-    assumptions, notes = check_assumptions(problem, bounds, met, uses=(value is not None, False))
+    assumptions, notes = check_assumptions(problem, constants, met, uses=(value is not None, False))
     if evaluated is not None and evaluated.hidden is not None:
         notes.append(f"J and the Lagrangian bound are not used: {evaluated.hidden.sentence}.")
         assumptions = replace(assumptions, regular_holds=False)
-    coarse = isinstance(law, BlackBox) and law.precision is torch.float32
+    coarse = isinstance(policy, BlackBox) and policy.precision is torch.float32
     if evaluated is not None:
         assumptions = assumptions.with_value_bound(evaluated.C_V)
         if coarse:
@@ -116,7 +116,7 @@ def certify_policy(
         perf=perf,
         baseline={"zero": zero},
         assumptions=assumptions,
-        warnings=[*bounds.warnings, *notes, *warnings],
+        warnings=[*constants.warnings, *notes, *warnings],
         searches=searches_of(lower, evaluated),
         confidence=settings.confidence,
         subject=GIVEN,
@@ -130,21 +130,21 @@ def certify_policy(
 
 def evaluate_policy(
     problem: Problem,
-    law: ControlLaw,
+    policy: Policy,
     network: Callable[..., nn.Module],
-    bounds: Bounds,
+    constants: Constants,
     settings: CertificateSettings,
     few: list[Samples],
     wide: list[Samples],
     seed: int,
     odd: Tensor,
 ) -> tuple[ClosedLoopBounds | None, Field | None]:
-    """Bounds on `Perf(u)` from fields fitted to the closed loop of ``law``, their suprema sought at the states ``odd`` too,
-    and the fitted `V^u`; `None` without a fit."""
+    """Bounds on `Perf(u)` from fields fitted to the closed loop of ``policy``, their suprema sought at the states ``odd``
+    too, and the fitted `V^u`; `None` without a fit."""
     if not (settings.stage.steps and problem.gives_divergences):
         return None, None
-    fitted = in_float64(fit_closed_loop(problem, law, None, network, bounds, settings.stage, seed))
-    loop = ClosedLoop(problem, law)
+    fitted = in_float64(fit_closed_loop(problem, policy, None, network, constants, settings.stage, seed))
+    loop = ClosedLoop(problem, policy)
     with torch.no_grad():
         initial = [integral(s, fitted.value(s.x) * s.mu0) for s in wide]
     judge = lambda sets: closed_loop_bounds(

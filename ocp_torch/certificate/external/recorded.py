@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.certificate import Certificate, Run
-from ocp_torch.certificate.checks.assumptions import Met, check_assumptions
+from ocp_torch.certificate.checks.assumptions import Observed, check_assumptions
 from ocp_torch.certificate.checks.contradictions import examined
 from ocp_torch.certificate.checks.hidden import Flux, Hidden, hidden_divergence
 from ocp_torch.certificate.checks.regularity import largest_jump
@@ -26,13 +26,13 @@ from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.upper.lagrangian import Terms, best_multiples
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
-from ocp_torch.control.policies import NETWORK, ControlLaw, control_laws
+from ocp_torch.control.policies import NETWORK, Policy, trained_policies
 from ocp_torch.fields.fields import Fields
 from ocp_torch.maths import calculus
 from ocp_torch.maths.calculus import CHUNK, chunked_gradient
 from ocp_torch.maths.sampling import derive_seed
 from ocp_torch.problems import formulas
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.needs import SEARCHED
 from ocp_torch.problems.problem import MARGIN
@@ -48,18 +48,20 @@ TOP = 10
 STREAM = 3
 
 
-def certify_recorded(problem: Dataset, trained, bounds: Bounds, settings: CertificateSettings, run: Run) -> Certificate:
+def certify_recorded(
+    problem: Dataset, trained, constants: Constants, settings: CertificateSettings, run: Run
+) -> Certificate:
     """The certificate of ``trained`` (`certify.Trained`) fields on the held-out samples of ``problem``."""
     fields = trained.in_float64()
     sets = groups(problem.held_out)
     kind = handed_out(problem, trained)
     warnings = [
         f"from {sum(map(len, sets)):,} held-out samples, taken for independent draws from "
-        f"{'the density given with them' if weighted(problem) else 'the uniform law'}; nothing was simulated.",
+        f"{'the density given with them' if weighted(problem) else 'the uniform policy'}; nothing was simulated.",
         *problem.recording.notes,
     ]
-    law = control_laws(trained.occupation, problem, fields, bounds)[kind] if kind else None
-    J, sup_occupation, C_V = None, None, bounds.C_V
+    policy = trained_policies(trained.occupation, problem, fields, constants)[kind] if kind else None
+    J, sup_occupation, C_V = None, None, constants.C_V
     if kind is None:
         warnings.append(
             "no controller: B varies over the samples, so that from V is known at them only; use method=pd."
@@ -69,27 +71,27 @@ def certify_recorded(problem: Dataset, trained, bounds: Bounds, settings: Certif
     elif settings.stage.steps:
         try:
             J, C_V, sup_occupation, hidden = closed_loop_J(
-                problem, trained, fields, law, kind, bounds, settings, sets, run.seed
+                problem, trained, fields, policy, kind, constants, settings, sets, run.seed
             )
             if hidden is not None:
                 J = None
                 warnings.append(f"J is not used: {hidden.sentence}.")
         except ArithmeticError as error:
             warnings.append(f"the certification stage failed: {error}")
-    met = Met(
+    met = Observed(
         sup_occupation=sup_occupation,
-        sup_control=None if law is None else largest_control(law, sets),
-        jump=None if law is None else largest_jump(law, problem.dim),
+        sup_control=None if policy is None else largest_control(policy, sets),
+        jump=None if policy is None else largest_jump(policy, problem.dim),
         problem=posed(problem),
     )
-    F_M = None if fields.value is None else penalised(problem, fields, bounds.M, sets)
+    F_M = None if fields.value is None else penalised(problem, fields, constants.M, sets)
     if J is not None:
         warnings.append(
             f"J is above the controller's performance if C_V = {C_V:.4g}, by the samples met, bounds its value."
         )
     if settings.rigorous:
         warnings.append("no rigorous lower bound: samples say nothing about the states between them.")
-    assumptions, notes = check_assumptions(problem, bounds, met, uses=(F_M is not None, J is not None))
+    assumptions, notes = check_assumptions(problem, constants, met, uses=(F_M is not None, J is not None))
     certificate = Certificate(
         run=run,
         exact=None,
@@ -100,7 +102,7 @@ def certify_recorded(problem: Dataset, trained, bounds: Bounds, settings: Certif
         assumptions=replace(
             assumptions, C_V=C_V if J is not None else None, basis=assumptions.basis | {"C_V": SEARCHED}
         ),
-        warnings=[*bounds.warnings, *notes, *warnings],
+        warnings=[*constants.warnings, *notes, *warnings],
         confidence=settings.confidence,
         subject=kind,
     )
@@ -108,9 +110,9 @@ def certify_recorded(problem: Dataset, trained, bounds: Bounds, settings: Certif
 
 
 @torch.no_grad()
-def largest_control(law: ControlLaw, sets: list[Samples]) -> float:
+def largest_control(policy: Policy, sets: list[Samples]) -> float:
     """`sup |u|` over the samples."""
-    return max(float(law(s.x).norm(dim=-1).max()) for s in sets)
+    return max(float(policy(s.x).norm(dim=-1).max()) for s in sets)
 
 
 def groups(samples: Samples) -> list[Samples]:
@@ -142,12 +144,12 @@ def penalised(problem: Dataset, fields: Fields, M: float, sets: list[Samples]) -
 
 
 @torch.no_grad()
-def closed_loop_samples(samples: Samples, law: ControlLaw, cost: PowerCost) -> Samples:
-    """What `ClosedLoop` of ``law`` would give at the states of ``samples``."""
+def closed_loop_samples(samples: Samples, policy: Policy, cost: PowerCost) -> Samples:
+    """What `ClosedLoop` of ``policy`` would give at the states of ``samples``."""
     pieces = []
     for part in samples.split(CHUNK):
         div_a, div_B = part.require_divergences("the closed loop")
-        u, flux = calculus.control_flux_divergence(law, part.x, part.B, div_B)
+        u, flux = calculus.control_flux_divergence(policy, part.x, part.B, div_B)
         pushed = torch.einsum("ndm,nm->nd", part.B, u)
         none = torch.zeros_like(part.x)
         pieces.append(
@@ -185,34 +187,34 @@ def closed_loop_J(
     problem: Dataset,
     trained,
     fields: Fields,
-    law: ControlLaw,
+    policy: Policy,
     kind: str,
-    bounds: Bounds,
+    constants: Constants,
     settings: CertificateSettings,
     sets: list[Samples],
     seed: int,
 ) -> tuple[Estimate, float, float, Hidden | None]:
-    """`J(mu u, mu)` of ``law`` on ``sets`` with `log mu` fitted on the training samples; its `C_V`, the largest `mu` met, and
-    what the divergences of the samples do not see.
+    """`J(mu u, mu)` of ``policy`` on ``sets`` with `log mu` fitted on the training samples; its `C_V`, the largest `mu` met,
+    and what the divergences of the samples do not see.
 
     By parts `E[(f + R(u)) mu] = E[V mu0 - mu Q_u - V r]`, the same number with less scatter. `C_V` is the largest of the
     bound at hand and of `V - min(Q_u, 0)`, which bounds `V^u` where it is largest, at all samples met, with head-room.
     """
     cost, rho = problem.control_cost, problem.discount
-    rough = control_laws(trained.occupation, problem, trained.fields, bounds)[kind]
+    rough = trained_policies(trained.occupation, problem, trained.fields, constants)[kind]
     like = next(trained.fields.parameters())
     training = closed_loop_samples(problem.training.to(like), rough, cost)
     pool = Drawn(training, derive_seed(seed, STREAM, 2))
-    fitted = fit_closed_loop(problem, rough, trained.fields, trained.network, bounds, settings.stage, seed, pool)
+    fitted = fit_closed_loop(problem, rough, trained.fields, trained.network, constants, settings.stage, seed, pool)
     fitted = replace(trained, fields=fitted).in_float64()
     value = fields.value if fields.value is not None else fitted.value
     terms, densities, spreads, fluxes, largest, deepest = [], [], [], [], 0.0, 0.0
     for samples in sets:
-        loop = closed_loop_samples(samples, law, cost)
+        loop = closed_loop_samples(samples, policy, cost)
         v, gradient = chunked_gradient(value, loop.x)
         slack = formulas.hjb_slack(loop, v, gradient, cost, rho)
         with torch.no_grad():
-            mu, spent = formulas.drifting_loss(loop, fitted.log_occupation, rho)
+            mu, spent = formulas.occupation_outflow(loop, fitted.log_occupation, rho)
         terms.append(Terms(loop, v, mu * slack, loop.mu0 - spent))
         largest, deepest = max(largest, float(v.max())), max(deepest, float(-slack.min()))
         densities.append(mu)
@@ -223,7 +225,7 @@ def closed_loop_J(
         v, gradient = calculus.value_and_gradient(value, loop.x)
         slack = formulas.hjb_slack(loop, v, gradient, cost, rho)
     largest, deepest = max(largest, float(v.max())), max(deepest, float(-slack.min()))
-    C_V = max(bounds.C_V, MARGIN * (largest + deepest))
+    C_V = max(constants.C_V, MARGIN * (largest + deepest))
     excess = best_multiples(terms, lambda t, s: t.J(s, C_V))
     J = [integral(t.samples, t.v * t.samples.mu0) + e for t, e in zip(terms, excess, strict=True)]
     found = Estimate.of(J, controller=kind)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.simulated.simulation import Dynamics, discounted_integral
-from ocp_torch.control.policies import ControlLaw
+from ocp_torch.control.policies import Policy
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.problem import Problem
@@ -33,9 +33,9 @@ def velocity_and_divergence(velocity: Callable[[Tensor], Tensor], x: Tensor) -> 
     return here, sum((g[:, i] - here[:, i]) / DIFFERENCE for i, g in enumerate(moved))
 
 
-def _backward(problem: Problem, law: ControlLaw) -> Dynamics:
+def _backward(problem: Problem, policy: Policy) -> Dynamics:
     """The flow back in time with the logarithm of the density's growth as one more coordinate."""
-    velocity = lambda y: problem.velocity(y, law(y))
+    velocity = lambda y: problem.velocity(y, policy(y))
 
     def backward(state: Tensor) -> tuple[Tensor, Tensor]:
         y, log_factor = state[:, :-1], state[:, -1]
@@ -46,27 +46,27 @@ def _backward(problem: Problem, law: ControlLaw) -> Dynamics:
     return backward
 
 
-def occupation_along_flow(problem: Problem, law: ControlLaw, x: Tensor, horizon: float, steps: int) -> Tensor:
+def occupation_along_flow(problem: Problem, policy: Policy, x: Tensor, horizon: float, steps: int) -> Tensor:
     r"""`mu^u(x) = rho int e^{-rho t} mu0(y_t) exp(-int_0^t div g(y_s) ds) dt` along `dy/dt = -g(y)`, `y_0 = x`; ``(N,)``.
 
     The density of a flow changes by its divergence (the representation behind Proposition 8 of the paper); valid for a
     Lipschitz closed loop `g = a + B u`. The logarithm of the second factor is carried as one more coordinate.
     """
     start = torch.cat([x, x.new_zeros(len(x), 1)], dim=-1)
-    density, _ = discounted_integral(_backward(problem, law), start, problem.discount, horizon, steps)
+    density, _ = discounted_integral(_backward(problem, policy), start, problem.discount, horizon, steps)
     return density
 
 
-def settled_occupation(problem: Problem, law: ControlLaw, x: Tensor) -> Tensor:
+def settled_occupation(problem: Problem, policy: Policy, x: Tensor) -> Tensor:
     """`mu^u` ``(N,)`` as `occupation_along_flow`, as far back as it takes; infinite where the past adds ever more.
 
     Where the flow contracts nearly as fast as the discount forgets, the integral settles slowly, and geometrically: what
     is left is extrapolated from the last pieces.
     """
-    rho, dynamics = problem.discount, _backward(problem, law)
+    rho, dynamics = problem.discount, _backward(problem, policy)
     horizon = PIECE / rho
     with torch.no_grad():
-        speed = float(problem.velocity(x, law(x)).norm(dim=-1).max())
+        speed = float(problem.velocity(x, policy(x)).norm(dim=-1).max())
     steps = int(min(150, max(20, math.ceil(horizon * max(rho / 0.25, speed / 0.1)))))
     state = torch.cat([x, x.new_zeros(len(x), 1)], dim=-1)
     pieces: list[Tensor] = []
@@ -83,7 +83,7 @@ def settled_occupation(problem: Problem, law: ControlLaw, x: Tensor) -> Tensor:
     return sum(pieces) + torch.where(last > SETTLED * sum(pieces), rest, 0.0)
 
 
-def estimated_sup_occupation(problem: Problem, law: ControlLaw, end_states: Tensor, states: int) -> float:
+def estimated_sup_occupation(problem: Problem, policy: Policy, end_states: Tensor, states: int) -> float:
     """The largest `mu^u` met: at the ends of trajectories, where mass accumulates, at uniform states, and then near the
     highest of them."""
     count = max(1, 2 * states // 3)
@@ -91,7 +91,7 @@ def estimated_sup_occupation(problem: Problem, law: ControlLaw, end_states: Tens
     generator = torch.Generator().manual_seed(0)
     uniform = torch.rand(states - len(picked), problem.dim, dtype=picked.dtype, generator=generator)
     x = torch.cat([picked, uniform])
-    met = lambda x: settled_occupation(problem, law, x).nan_to_num(nan=math.inf, posinf=math.inf)
+    met = lambda x: settled_occupation(problem, policy, x).nan_to_num(nan=math.inf, posinf=math.inf)
     density = met(x)
     if not bool(torch.isfinite(density).all()):
         return math.inf
@@ -99,18 +99,18 @@ def estimated_sup_occupation(problem: Problem, law: ControlLaw, end_states: Tens
     around = top[torch.arange(NEARBY) % len(top)]
     steps = torch.randn(around.shape, dtype=x.dtype, generator=generator) / math.sqrt(problem.dim)
     sizes = 10.0 ** (-1.0 - 2.0 * torch.rand(NEARBY, 1, dtype=x.dtype, generator=generator))
-    nearby = settled_occupation(problem, law, (around + sizes * steps).remainder(1.0)).nan_to_num(
+    nearby = settled_occupation(problem, policy, (around + sizes * steps).remainder(1.0)).nan_to_num(
         nan=math.inf, posinf=math.inf
     )
     return max(float(density.max()), float(nearby.max()))
 
 
-def a_priori_sup_occupation(problem: Problem, law: ControlLaw, points: Tensor) -> float | None:
+def a_priori_sup_occupation(problem: Problem, policy: Policy, points: Tensor) -> float | None:
     r"""`sup mu^u <= rho sup mu0 / (rho - sup(-div g))` where that is positive, else `None`; both suprema as met at
     ``points`` and climbed. For a Lipschitz closed loop only: contraction on a jump has no divergence to show it."""
     if not problem.gives_divergences:
         return None
-    loop = ClosedLoop(problem, law)
+    loop = ClosedLoop(problem, policy)
     largest = lambda function: supremum(function, points, ascents=16, steps=20, differentiable=False).value
     excess = problem.discount - max(0.0, largest(lambda x: -loop.drift_divergence(x)))
     return problem.discount * largest(problem.initial_density) / excess if excess > 0.0 else None

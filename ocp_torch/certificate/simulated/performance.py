@@ -24,7 +24,7 @@ from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
 from ocp_torch.certificate.simulated.simulation import Dynamics, Integrate, discounted_integral, rate_at, refined
-from ocp_torch.control.policies import ControlLaw, ValueLaw
+from ocp_torch.control.policies import Policy, ValuePolicy
 from ocp_torch.maths import calculus
 from ocp_torch.maths.calculus import Field
 from ocp_torch.maths.sampling import derive_seed
@@ -59,20 +59,20 @@ class Simulated:
     end_states: Tensor
 
 
-def _dynamics(problem: Problem, law: ControlLaw, value: Field | None) -> Dynamics:
+def _dynamics(problem: Problem, policy: Policy, value: Field | None) -> Dynamics:
     """The closed loop and what it costs; with ``value`` its slack `-Q_u`, and as one more coordinate `z`, the sum of
     `grad V . g` from `V` at the start on, with `z - V` as a second rate."""
     cost, rho = problem.control_cost, problem.discount
 
     def dynamics(state: Tensor) -> tuple[Tensor, Tensor]:
         if value is None:
-            u = law(state)
+            u = policy(state)
             return problem.velocity(state, u), problem.state_cost(state) + cost.cost(u)
         x, summed = state[:, :-1], state[:, -1]
         samples = Samples.of(problem, x, divergences=False)
         v, gradient = calculus.value_and_gradient(value, x)
-        own = isinstance(law, ValueLaw) and law.value is value
-        u = law.control(samples.B, gradient) if own else law(x)
+        own = isinstance(policy, ValuePolicy) and policy.value is value
+        u = policy.control(samples.B, gradient) if own else policy(x)
         velocity = samples.a + torch.einsum("ndm,nm->nd", samples.B, u)
         slack = formulas.bellman_slack(samples, v, gradient, u, cost, rho)
         change = (gradient * velocity).sum(dim=-1, keepdim=True)
@@ -130,7 +130,7 @@ def unseen_cost(problem: Problem, x0: Tensor, mass: Tensor, seed: int) -> float:
 
 def simulate_performance(
     problem: Problem,
-    law: ControlLaw,
+    policy: Policy,
     trajectories: int,
     replicates: int,
     seed: int,
@@ -139,7 +139,7 @@ def simulate_performance(
     horizon: str = TRUNCATED,
     tolerance: float = CertificateSettings.tolerance,
 ) -> Simulated:
-    """Perf of ``law`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts, near `mu0`.
+    """Perf of ``policy`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts, near `mu0`.
 
     With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is
     added. Steps are halved until a trajectory changes by less than ``tolerance``, relative to the answer, or all of them by
@@ -150,7 +150,7 @@ def simulate_performance(
     random = horizon == RANDOM
     points, mass = starting_points(problem, trajectories, replicates, seed, extra=int(random))
     x0 = points[:, :dim]
-    dynamics = _dynamics(problem, law, value)
+    dynamics = _dynamics(problem, policy, value)
     with torch.no_grad():
         base = value(x0) if value is not None else torch.zeros_like(x0[:, 0])
         state = x0 if value is None else torch.cat([x0, base.unsqueeze(-1)], dim=-1)

@@ -169,7 +169,7 @@ def _integrands(loop: ClosedLoop, value: Field, log_occupation: Field, samples: 
     """`V`, `mu Q_u`, `r` and `Q_u` at the states of ``samples``, and the flux `mu g_u`."""
     v, gradient = chunked_gradient(value, samples.x)
     slack = formulas.hjb_slack(samples, v, gradient, loop.control_cost, loop.discount)
-    pairs = [formulas.drifting_loss(part, log_occupation, loop.discount) for part in samples.split(CHUNK)]
+    pairs = [formulas.occupation_outflow(part, log_occupation, loop.discount) for part in samples.split(CHUNK)]
     mu, spent = torch.cat([m for m, _ in pairs]), torch.cat([s for _, s in pairs])
     flux = Flux(samples.x, samples.weight, spent - mu, mu.unsqueeze(-1) * samples.a / loop.discount)
     return v, mu * slack, samples.mu0 - spent, slack, flux

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from ocp_torch.certificate.upper.lagrangian import MULTIPLES, Terms
-from ocp_torch.control.policies import ControlLaw
+from ocp_torch.control.policies import Policy
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
 from ocp_torch.maths import calculus
@@ -19,7 +19,7 @@ from ocp_torch.maths.supremum import minimiser
 from ocp_torch.objectives.policy_evaluation import PolicyEvaluation
 from ocp_torch.problems import formulas
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
@@ -59,22 +59,22 @@ class StageSettings:
 
 def fit_closed_loop(
     problem: Problem,
-    law: ControlLaw,
+    policy: Policy,
     fields: Fields | None,
     network: Callable[..., torch.nn.Module],
-    bounds: Bounds,
+    constants: Constants,
     settings: StageSettings,
     seed: int,
     pool: Pool | None = None,
 ) -> Fields:
-    """Fields with `log mu^u`, and with `V^u` where ``fields`` hold no `V`, of the closed loop of ``law``.
+    """Fields with `log mu^u`, and with `V^u` where ``fields`` hold no `V`, of the closed loop of ``policy``.
 
-    ``fields`` are the trained ones, ``law`` one of theirs in their precision; their `log mu`, if any, is the start. With no
-    ``fields`` the law is somebody's own, in float64, and both `mu` and `V` are fitted in float32. ``pool``
+    ``fields`` are the trained ones, ``policy`` one of theirs in their precision; their `log mu`, if any, is the start. With
+    no ``fields`` the policy is somebody's own, in float64, and both `mu` and `V` are fitted in float32. ``pool``
     is where samples of the closed loop come from, by default from evaluations at Sobol points.
     """
     like = torch.zeros(()) if fields is None else next(fields.parameters())
-    loop = ClosedLoop(problem, law)
+    loop = ClosedLoop(problem, policy)
     with_value = fields is None or fields.value is None
     names = (LOG_OCCUPATION, VALUE) if with_value else (LOG_OCCUPATION,)
     fitted = Fields.build(problem, names, network, derive_seed(seed, STAGE_STREAM, 0)).to(like)
@@ -84,7 +84,7 @@ def fit_closed_loop(
     draw = lambda: pool.draw(settings.batch)
     pool.grow(min(POOL, settings.steps * settings.batch))
     price = 1.0 if with_value else missing_price(loop, fields.value, pool.samples.take(slice(EXCESS_STATES)))
-    objective = PolicyEvaluation(loop, bounds, with_value, price)
+    objective = PolicyEvaluation(loop, constants, with_value, price)
     optimizer = optimizer_maker("soap", settings.lr, betas=(0.95, 0.95))
     makers = {player: optimizer for player in objective.players}
     stepper = Simultaneous(fitted, objective, makers, schedule_maker("cosine", settings.steps))
@@ -143,7 +143,7 @@ def relative_excess(loop: ClosedLoop, value: Field, log_occupation: Field, sampl
     `E[V mu0 - mu Q_u]`, for the best multiple of `mu`."""
     v, gradient = calculus.value_and_gradient(value, samples.x)
     slack = formulas.hjb_slack(samples, v, gradient, loop.control_cost, loop.discount)
-    mu, spent = formulas.drifting_loss(samples, log_occupation, loop.discount)
+    mu, spent = formulas.occupation_outflow(samples, log_occupation, loop.discount)
     terms = Terms(samples, v, mu * slack, samples.mu0 - spent)
     hi, lo = float((-slack).max().clamp_min(0.0)), float(slack.max().clamp_min(0.0))
     least = terms.lagrangian(minimiser(lambda s: terms.lagrangian(s, hi, lo), *MULTIPLES), hi, lo)

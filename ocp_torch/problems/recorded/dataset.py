@@ -31,7 +31,7 @@ class Dataset(Problem):
     asked for: a saved controller needs no data. Raises `InputError` for whatever is wrong with the file.
     """
 
-    evaluable = False
+    has_simulator = False
 
     def __init__(
         self,
@@ -137,7 +137,7 @@ class Dataset(Problem):
         return self._part("held_out")
 
     @property
-    def rehearsal(self) -> Dataset:
+    def validation_view(self) -> Dataset:
         """The same problem with other held-out samples, for looks by which choices are made."""
         other = copy.copy(self)
         other._recording, other._parts = self.recording, {**self._parts, "held_out": self._part("looks")}
@@ -147,7 +147,7 @@ class Dataset(Problem):
         """The training samples of the rows ``places``; a recording gives its divergences for nothing."""
         return self.training.take(places.to("cpu"))
 
-    def survey(self, count: int, branch: int, *columns: str) -> tuple[Tensor, ...]:
+    def probe(self, count: int, branch: int, *columns: str) -> tuple[Tensor, ...]:
         return tuple(getattr(self.training, name)[:count] for name in columns)
 
     def independent_samples(self, count: int) -> Samples:

@@ -160,7 +160,7 @@ def _checked(path: Path, arrays: dict[str, np.ndarray], numbers: dict[str, float
         div_a=tensors.get("div_a"),
         div_B=tensors.get("div_B"),
     )
-    _require_law(path, samples, "density" in tensors)
+    _require_policy(path, samples, "density" in tensors)
     digest = hashlib.sha256()
     for name in sorted(arrays):
         digest.update(name.encode())
@@ -168,7 +168,7 @@ def _checked(path: Path, arrays: dict[str, np.ndarray], numbers: dict[str, float
     return Recording(samples, numbers, digest.hexdigest(), _notes(path, samples))
 
 
-def _require_law(path: Path, samples: Samples, given: bool) -> None:
+def _require_policy(path: Path, samples: Samples, given: bool) -> None:
     """The weighted means of what integrates to a known number: 1, `mu0`, and waves along each coordinate."""
     count = len(samples)
     weigh = "mean of 1 / density" if given else "mean of 1"
@@ -189,9 +189,9 @@ def _require_law(path: Path, samples: Samples, given: bool) -> None:
         for k in FREQUENCIES:
             angle = 2.0 * torch.pi * k * samples.x[:, i]
             if max(off(angle.cos(), 0.0), off(angle.sin(), 0.0)) > SURE:
-                law = "the density it comes with" if given else "the uniform law"
+                source = "the density it comes with" if given else "the uniform law"
                 raise InputError(
-                    f"{path}: coordinate {i} of x does not follow {law}; "
+                    f"{path}: coordinate {i} of x does not follow {source}; "
                     + ("give the density of the law it was drawn from." if not given else "density must be that of x.")
                 )
 

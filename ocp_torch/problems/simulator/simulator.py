@@ -15,7 +15,7 @@ from ocp_torch.problems.simulator.oracle import Oracle
 STEPS = {"float64": 1e-5, "float32": 2e-3}
 
 
-class Callable(Problem):
+class Simulator(Problem):
     """``target`` maps states, arrays ``(N, d)`` in `[0, 1)`, to `f` ``(N,)``, `a` ``(N, d)`` (or `None` for no drift) and `B`
     ``(N, d, m)``, as NumPy arrays, and, if it likes, to the initial density `mu0` ``(N,)`` as well; or one state ``(d,)`` to
     a number, ``(d,)`` and ``(d, m)``: which of the two is found out by asking.
@@ -101,7 +101,7 @@ class _Ask(torch.autograd.Function):
     """One part of the oracle's answer: values by calling, derivatives by central differences; stacks flattened."""
 
     @staticmethod
-    def forward(x: Tensor, problem: Callable, name: str) -> Tensor:
+    def forward(x: Tensor, problem: Simulator, name: str) -> Tensor:
         return problem.answers(x.detach().cpu().double().remainder(1.0))[name].to(x)
 
     @staticmethod
@@ -125,14 +125,14 @@ class _Ask(torch.autograd.Function):
         return torch.stack([s.reshape(len(x), -1).sum(dim=-1) for s in slopes], dim=-1), None, None
 
     @staticmethod
-    def vmap(info, in_dims, x: Tensor, problem: Callable, name: str):
+    def vmap(info, in_dims, x: Tensor, problem: Simulator, name: str):
         if in_dims[0] is None:
             return _Ask.apply(x, problem, name), None
         x = x.movedim(in_dims[0], 0)
         return _Ask.apply(x.flatten(0, 1), problem, name).unflatten(0, x.shape[:2]), 0
 
 
-def _difference(problem: Callable, name: str, x: Tensor, direction: Tensor) -> Tensor:
+def _difference(problem: Simulator, name: str, x: Tensor, direction: Tensor) -> Tensor:
     step, x64, along = problem._step, x.double(), direction.double()
     ahead, behind = (_Ask.apply(x64 + s * step * along, problem, name) for s in (1.0, -1.0))
     return ((ahead - behind) / (2.0 * step)).to(direction)

@@ -24,12 +24,12 @@ def require_gif(problem: Problem, path: object) -> FilePath:
     return FilePath(str(path))
 
 
-def animate(problem: Problem, law: Law, path: str | FilePath, seed: int = 0) -> FilePath:
-    """Write the motion of ``problem`` under ``law`` as ``path``, a `.gif`.
+def animate(problem: Problem, policy: Law, path: str | FilePath, seed: int = 0) -> FilePath:
+    """Write the motion of ``problem`` under ``policy`` as ``path``, a `.gif`.
 
     Raises `InputError` for another suffix or a problem without a scene, `StorageError` for a file that cannot be written.
     """
-    path, shown = require_gif(problem, path), moving(problem, law, seed)
+    path, shown = require_gif(problem, path), moving(problem, policy, seed)
     figure, writer = shown.figure(), PillowWriter(fps=FRAMES_PER_SECOND)
     figure.set_layout_engine("none")  # the same axes in every frame, and not found anew for each
     try:

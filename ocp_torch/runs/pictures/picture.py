@@ -8,7 +8,7 @@ from functools import singledispatch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ocp_torch.control.policies import zero_law
+from ocp_torch.control.policies import zero_policy
 from ocp_torch.maths.sampling import derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.linkage import Linkage
@@ -63,8 +63,8 @@ def _(problem) -> tuple[int, bool]:
     return 6, False
 
 
-def moving(problem: Problem, law: Law, seed: int = 0) -> Moving | None:
-    """``problem`` under ``law`` from random admissible starts; beside it, where they share a panel, without control."""
+def moving(problem: Problem, policy: Law, seed: int = 0) -> Moving | None:
+    """``problem`` under ``policy`` from random admissible starts; beside it, where they share a panel, without control."""
     draw = scene(problem)
     if draw is None:
         return None
@@ -72,16 +72,16 @@ def moving(problem: Problem, law: Law, seed: int = 0) -> Moving | None:
     x0 = random_starts(problem, count, derive_seed(seed, STREAM))
     duration = DURATION / problem.discount
     if apart:
-        paths = [simulate(problem, law, x0[i : i + 1], duration, FRAMES) for i in range(count)]
+        paths = [simulate(problem, policy, x0[i : i + 1], duration, FRAMES) for i in range(count)]
         return Moving([("", draw, path) for path in paths], projection(problem))
-    titles = {"controlled": law, "no control": zero_law(problem)}
+    titles = {"controlled": policy, "no control": zero_policy(problem)}
     panels = [(t, draw, simulate(problem, each, x0, duration, FRAMES)) for t, each in titles.items()]
     return Moving(panels, projection(problem))
 
 
-def motion(problem: Problem, law: Law, seed: int = 0) -> Figure | None:
+def motion(problem: Problem, policy: Law, seed: int = 0) -> Figure | None:
     """The whole motion in one figure; `None` for problems without a scene."""
-    shown = moving(problem, law, seed)
+    shown = moving(problem, policy, seed)
     if shown is None:
         return None
     figure = shown.figure()

@@ -25,23 +25,23 @@ PUMP, BALANCE, CATCH = 0.2, (20.0, 5.0), 0.5
 
 
 @singledispatch
-def classical_law(problem: Problem) -> Law | None:
+def classical_policy(problem: Problem) -> Law | None:
     """The classical controller of ``problem``, or `None` where nobody has named one."""
     return None
 
 
-@classical_law.register
+@classical_policy.register
 def resolved_rate(problem: Linkage) -> Law:
     r"""`dtheta/dt = k J^+ (target - p)`, `J^+` the damped pseudo-inverse (Whitney, 1969; Nakamura and Hanafusa, 1986)."""
     damping = (DAMPING * problem.length) ** 2 or 1.0  # a tip on the last of its joints does not move: J = 0
 
-    def law(x: Tensor) -> Tensor:
+    def policy(x: Tensor) -> Tensor:
         J, way = problem.jacobian(x), problem.to_target(x)
         square = J @ J.mT + damping * torch.eye(way.shape[1]).to(x)
         rate = REACH * (J.mT @ torch.linalg.solve(square, way.unsqueeze(-1))).squeeze(-1)
         return rate / (TURN * problem.speed)
 
-    return law
+    return policy
 
 
 def _bearing(problem: Unicycle | Dubins, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -50,48 +50,48 @@ def _bearing(problem: Unicycle | Dubins, x: Tensor) -> tuple[Tensor, Tensor]:
     return (way * ahead).sum(dim=-1), ahead[:, 0] * way[:, 1] - ahead[:, 1] * way[:, 0]
 
 
-@classical_law.register
+@classical_policy.register
 def go_to_goal(problem: Unicycle) -> Law:
     """Speed in proportion to the way ahead, turn rate to the bearing of the nearer end, front or back."""
 
-    def law(x: Tensor) -> Tensor:
+    def policy(x: Tensor) -> Tensor:
         along, across = _bearing(problem, x)
         bearing = torch.atan2(across, along.abs()) * torch.where(along < 0.0, -1.0, 1.0)
         return torch.stack([DRIVE * along / problem.speed, STEER * bearing / (TURN * problem.turn_rate)], dim=-1)
 
-    return law
+    return policy
 
 
-@classical_law.register
+@classical_policy.register
 def pursue(problem: Dubins) -> Law:
     """Turn rate in proportion to the bearing of the target."""
 
-    def law(x: Tensor) -> Tensor:
+    def policy(x: Tensor) -> Tensor:
         along, across = _bearing(problem, x)
         return (STEER * torch.atan2(across, along) / (TURN * problem.turn_rate)).unsqueeze(-1)
 
-    return law
+    return policy
 
 
-@classical_law.register(Kuramoto)
-@classical_law.register(PhaseNeurons)
+@classical_policy.register(Kuramoto)
+@classical_policy.register(PhaseNeurons)
 def descend(problem: Problem) -> Law:
     r"""`u = -k B' grad f`: proportional feedback on how the stimulus changes the synchrony (for Kuramoto, the mean field)."""
 
-    def law(x: Tensor) -> Tensor:
+    def policy(x: Tensor) -> Tensor:
         with torch.enable_grad():
             at = x.detach().requires_grad_(True)
             (slope,) = torch.autograd.grad(problem.state_cost(at).sum(), at)
         return -DESCENT / problem.discount * torch.einsum("ndm,nd->nm", problem.control_matrix(x), slope)
 
-    return law
+    return policy
 
 
-@classical_law.register
+@classical_policy.register
 def energy_pump(problem: Pendulum) -> Law:
     """Pump energy, then balance by proportional and derivative feedback (Astrom and Furuta, 2000); `|u| <= 1`."""
 
-    def law(x: Tensor) -> Tensor:
+    def policy(x: Tensor) -> Tensor:
         angle, velocity = problem.from_torus(x).unbind(dim=-1)
         pull = 1.5 * problem.gravity / problem.length
         missing = pull * (1.0 - angle.cos()) - 0.5 * velocity.square()
@@ -100,4 +100,4 @@ def energy_pump(problem: Pendulum) -> Law:
         near = (angle.abs() < CATCH) & (velocity.abs() < 2.0)
         return (torch.where(near, balance, pump) / problem.max_torque).clamp(-1.0, 1.0).unsqueeze(-1)
 
-    return law
+    return policy

@@ -7,7 +7,7 @@ from functools import singledispatch
 import torch
 from torch import Tensor
 
-from ocp_torch.control.policies import zero_law
+from ocp_torch.control.policies import zero_policy
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import drawn_starts, starts_narrowly
 from ocp_torch.problems.systems.dubins import Dubins
@@ -16,7 +16,7 @@ from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.systems.planar import PlanarVehicle
-from ocp_torch.runs.practice.classical import classical_law
+from ocp_torch.runs.practice.classical import classical_policy
 from ocp_torch.runs.practice.paths import Law, Path, simulate
 
 STARTS, STEPS = 512, 240
@@ -91,7 +91,7 @@ def has_metrics(problem: Problem) -> bool:
     return measure.dispatch(type(problem)) is not measure.dispatch(Problem)
 
 
-def metrics(problem: Problem, law: Law, seed: int = 0, starts: int = STARTS) -> dict | None:
+def metrics(problem: Problem, policy: Law, seed: int = 0, starts: int = STARTS) -> dict | None:
     """``controller``, ``zero`` and ``classical`` (where there is one), each with its numbers and mean discounted ``cost``.
 
     All from the same ``starts`` (`random_starts`), for ``duration`` in the problem's unit of time; `None` for a problem
@@ -101,9 +101,9 @@ def metrics(problem: Problem, law: Law, seed: int = 0, starts: int = STARTS) -> 
         return None
     x0 = random_starts(problem, starts, seed)
     duration = TRIAL / problem.discount
-    laws = {"controller": law, "zero": zero_law(problem), "classical": classical_law(problem)}
+    policies = {"controller": policy, "zero": zero_policy(problem), "classical": classical_policy(problem)}
     found = {}
-    for name, each in laws.items():
+    for name, each in policies.items():
         if each is None:
             continue
         path = simulate(problem, _within_limit(problem, each), x0, duration, STEPS)
@@ -111,9 +111,9 @@ def metrics(problem: Problem, law: Law, seed: int = 0, starts: int = STARTS) -> 
     return {"starts": starts, "seed": seed, "duration": duration, **found}
 
 
-def _within_limit(problem: Problem, law: Law) -> Law:
-    """``law``, shrunk to the problem's control limit where it has one: a classical law knows none, and others round."""
-    return lambda x: problem.control_cost.within(law(x), torch.ones_like(x[:, 0]))
+def _within_limit(problem: Problem, policy: Law) -> Law:
+    """``policy``, shrunk to the problem's control limit where it has one: a classical policy knows none, and others round."""
+    return lambda x: problem.control_cost.within(policy(x), torch.ones_like(x[:, 0]))
 
 
 def random_starts(problem: Problem, count: int, seed: int) -> Tensor:

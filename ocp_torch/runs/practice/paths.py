@@ -33,14 +33,14 @@ class Path:
 
 
 @torch.no_grad()
-def simulate(problem: Problem, law: Law, x0: Tensor, duration: float, steps: int) -> Path:
+def simulate(problem: Problem, policy: Law, x0: Tensor, duration: float, steps: int) -> Path:
     r"""From ``x0`` ``(N, d)`` for ``duration``, by RK4 with a control recomputed at each stage.
 
     The cost is `int_0^T rho e^{-rho t} (f + R(u)) dt` by the trapezoidal rule: good to a few digits, where the certificate's
     performance has an error bound.
     """
     h, rho = duration / steps, problem.discount
-    velocity = lambda x: problem.velocity(x, law(x))
+    velocity = lambda x: problem.velocity(x, policy(x))
     rate = lambda x, u: problem.state_cost(x) + problem.control_cost.cost(u)
     times = h * torch.arange(steps + 1, dtype=x0.dtype)
     weight = rho * h * (-rho * times).exp()
@@ -48,7 +48,7 @@ def simulate(problem: Problem, law: Law, x0: Tensor, duration: float, steps: int
     x, states = x0, [x0.remainder(1.0)]
     cost = torch.zeros_like(x0[:, 0])
     for k in range(steps):
-        u = law(x)
+        u = policy(x)
         cost = cost + weight[k] * rate(x, u)
         v1 = problem.velocity(x, u)
         v2 = velocity(x + 0.5 * h * v1)
@@ -56,4 +56,4 @@ def simulate(problem: Problem, law: Law, x0: Tensor, duration: float, steps: int
         v4 = velocity(x + h * v3)
         x = (x + h / 6.0 * (v1 + 2.0 * v2 + 2.0 * v3 + v4)).remainder(1.0)
         states.append(x)
-    return Path(times, torch.stack(states), cost + weight[-1] * rate(x, law(x)))
+    return Path(times, torch.stack(states), cost + weight[-1] * rate(x, policy(x)))

@@ -14,7 +14,7 @@ from ocp_torch.certificate import CertificateSettings
 from ocp_torch.certificate.checks.possible import require_possible
 from ocp_torch.errors import InputError, call, require_choice, require_integer, require_number, require_section
 from ocp_torch.problems import Problem
-from ocp_torch.problems.constants import Bounds, resolve_bounds
+from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.runs.build import build_certificate_settings, build_problem, build_trainer
 from ocp_torch.studies.benchmark.curve import Curve
 from ocp_torch.studies.benchmark.kernels import KernelContender
@@ -35,13 +35,13 @@ EVERYONE = tuple(f"{kind}_{m}" for kind in ("kernel", "network") for m in METHOD
 UNHURRIED = 30.0
 
 
-def contender(name: str, config: dict, problem: Problem, bounds: Bounds):
+def contender(name: str, config: dict, problem: Problem, constants: Constants):
     """The contender ``name``, one of `EVERYONE`. Raises `InputError` for a wrong field or what the problem cannot have."""
     kind, _, method = require_choice("contenders", name, EVERYONE).partition("_")
     if kind == "kernel":
         options = require_section("kernel", config["kernel"])
         steps = require_section("kernel.step", options.pop("step", None))
-        given = dict(method=method, problem=problem, bounds=bounds, step=steps.get(method))
+        given = dict(method=method, problem=problem, constants=constants, step=steps.get(method))
         return call(KernelContender, "kernel", options, **given)
     if kind == "network":
         methods = require_section("methods", config["methods"])
@@ -52,7 +52,7 @@ def contender(name: str, config: dict, problem: Problem, bounds: Bounds):
     require_rl()
     options = require_section("rl", config["rl"])
     steps = require_section("rl.steps", options.pop("steps", None))
-    bound = problem.control_bound if problem.control_bound is not None else bounds.C_u
+    bound = problem.control_bound if problem.control_bound is not None else constants.C_u
     reach = min(1.2 * bound, problem.control_limit or math.inf)
     given = dict(
         algorithm=name,
@@ -63,11 +63,11 @@ def contender(name: str, config: dict, problem: Problem, bounds: Bounds):
     return call(RLContender, "rl", options, **given)
 
 
-def build(config: dict) -> tuple[Problem, Bounds, list, list[int], CertificateSettings | None]:
+def build(config: dict) -> tuple[Problem, Constants, list, list[int], CertificateSettings | None]:
     """Everything a contest needs; kernel methods and judge use the bounds a run with null bounds would."""
     problem = build_problem(config["problem"])
     torch.set_num_threads(1)
-    bounds = resolve_bounds(problem)
+    constants = resolve_constants(problem)
     names, seeds = config["contenders"], config["seeds"]
     if not isinstance(names, list) or not names:
         raise InputError(f"contenders is {names!r}, but must be a list of {', '.join(EVERYONE)}.")
@@ -78,11 +78,11 @@ def build(config: dict) -> tuple[Problem, Bounds, list, list[int], CertificateSe
         log.info("kernel_primal is left out: Lemma 2 needs a problem without drift.")
         names = [name for name in names if name != "kernel_primal"]
     _require_numbers(config)
-    made = [contender(name, config, problem, bounds) for name in names]
+    made = [contender(name, config, problem, constants) for name in names]
     training = {group: config[group] for group in TRAINING}
     certificate = build_certificate_settings(fill(training, problem))
     require_possible(problem, certificate)
-    return problem, bounds, made, seeds, certificate
+    return problem, constants, made, seeds, certificate
 
 
 def _require_numbers(config: dict) -> None:
@@ -101,8 +101,8 @@ def contest(config: dict, folder: Path, say: Callable[[str], None] = log.info) -
 
     A kernel method without a time of its own gets that of the longest run before it: they are compared at equal time.
     """
-    problem, bounds, contenders, seeds, certificate = build(config)
-    judge = Judge(problem, bounds)
+    problem, constants, contenders, seeds, certificate = build(config)
+    judge = Judge(problem, constants)
     curves: list[Curve] = []
     with tqdm(total=len(contenders) * len(seeds), unit="run", disable=None) as bar:
         for made in contenders:

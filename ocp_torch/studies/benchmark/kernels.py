@@ -7,18 +7,18 @@ import time
 from dataclasses import dataclass, replace
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields
-from ocp_torch.control import policies as control_laws
+from ocp_torch.control import policies
 from ocp_torch.errors import InputError, require_integer, require_number
 from ocp_torch.fields import PeriodicMLP
 from ocp_torch.fields.sobolev import SobolevFeatures
 from ocp_torch.files.memory import require_memory
 from ocp_torch.problems import Problem
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.studies.benchmark.curve import Curve, Point, due
 from ocp_torch.studies.benchmark.measure import Judge
 from ocp_torch.studies.kernel import Iteration, step_sizes
 
-OCCUPATION = {"dual": None, "primal": control_laws.CLOSED, "pd": control_laws.SADDLE}
+OCCUPATION = {"dual": None, "primal": policies.CLOSED, "pd": policies.SADDLE}
 # The paper's: constant for one player, 25 % less every 20,000 steps for two.
 SCHEDULE = {"dual": "constant", "primal": "constant", "pd": "decay"}
 
@@ -32,7 +32,7 @@ class KernelContender:
 
     method: str
     problem: Problem
-    bounds: Bounds
+    constants: Constants
     step: float
     seconds: float | None = None
     regularity: float = 2.0
@@ -61,7 +61,7 @@ class KernelContender:
     def run(self, seed: int, judge: Judge, certificate: CertificateSettings | None) -> Curve:
         """Train, look at the bounds at growing counts outside the clock, and certify the end."""
         features = SobolevFeatures(self.problem.dim, self.regularity, modes=self.modes)
-        iteration = Iteration(self.problem, self.method, self.bounds, (seed,), features=features)
+        iteration = Iteration(self.problem, self.method, self.constants, (seed,), features=features)
         sizes = step_sizes(self.step, self.longest, SCHEDULE[self.method])
         points, spent, most = [], 0.0, math.inf if self.seconds is None else self.seconds
         for count in due(500):
@@ -85,4 +85,4 @@ class KernelContender:
         network = lambda **form: PeriodicMLP(modes=6, **form)
         trained = Trained(fields, OCCUPATION[self.method], network)
         run = Run(type(self.problem).__name__.lower(), self.method, seed, iteration.n, iteration.samples)
-        return certify_fields(self.problem, trained, self.bounds, settings, run)
+        return certify_fields(self.problem, trained, self.constants, settings, run)

@@ -52,7 +52,7 @@ class NetworkContender:
         trainer = build_trainer({**self.config, "seed": seed})
         recorder = Recorder()
         trainer.fit(recorder)
-        judge = Judge(trainer.problem, trainer.bounds, judge.seed, judge.effort)
+        judge = Judge(trainer.problem, trainer.constants, judge.seed, judge.effort)
         occupation = trainer.objective.occupation
         points = [Point(samples, seconds, judge(fields, occupation)) for samples, seconds, fields in recorder.kept]
         if certificate is None:

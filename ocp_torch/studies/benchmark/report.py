@@ -23,8 +23,8 @@ def reference(curves: list[Curve], exact: float | None) -> tuple[float, str]:
     """What sub-optimality is relative to: `OPT`, or where it is unknown the best lower bound any run certified."""
     if exact is not None:
         return exact, "OPT"
-    bounds = [p.numbers[n] for c in curves for p in c.points for n in ("F_M", "shifted") if n in p.numbers]
-    return max(bounds, default=math.nan), "the best lower bound found"
+    constants = [p.numbers[n] for c in curves for p in c.points for n in ("F_M", "shifted") if n in p.numbers]
+    return max(constants, default=math.nan), "the best lower bound found"
 
 
 def by_contender(curves: list[Curve]) -> dict[str, list[Curve]]:

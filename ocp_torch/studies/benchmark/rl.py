@@ -48,14 +48,14 @@ class RLContender:
             started = time.process_time()
             model.learn(min(count, self.steps) - model.num_timesteps, reset_num_timesteps=False)
             spent += time.process_time() - started
-            perf = judge.performance(self.law(model))
+            perf = judge.performance(self.policy(model))
             points.append(Point(model.num_timesteps, spent, {"policy": perf}))
             if model.num_timesteps >= self.steps:
                 break
         return Curve(self.name, seed, points)
 
-    def law(self, model):
-        """The deterministic policy as a control law ``(N, d) -> (N, m)``."""
+    def policy(self, model):
+        """The deterministic policy as a policy ``(N, d) -> (N, m)``."""
 
         def control(x: torch.Tensor) -> torch.Tensor:
             observations = np.atleast_2d(observe(x))

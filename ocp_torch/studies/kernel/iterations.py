@@ -10,7 +10,7 @@ import torch
 from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import CONTROL_DENSITY, VALUE, Fields
 from ocp_torch.fields.sobolev import SobolevFeatures
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
 from ocp_torch.studies.kernel.expansions import FeatureExpansion, KernelExpansion
@@ -30,7 +30,7 @@ class Iteration:
         self,
         problem: Problem,
         method: str,
-        bounds: Bounds,
+        constants: Constants,
         seeds: Iterable[int],
         features: SobolevFeatures | None = None,
         kernel: BernoulliKernel | None = None,
@@ -43,7 +43,7 @@ class Iteration:
             raise InputError("an iteration needs either features or a kernel.")
         seeds = tuple(seeds)
         self.method, self.n, self.samples = method, 0, 0
-        self.rule = RULES[method](problem, bounds)
+        self.rule = RULES[method](problem, constants)
         features = None if features is None else features.double()
         self.stream = Stream(problem, seeds, features, self.rule.needs_divergences)
         outputs = {VALUE: 1, CONTROL_DENSITY: problem.control_dim}

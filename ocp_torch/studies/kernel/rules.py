@@ -14,7 +14,7 @@ import numpy as np
 
 from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import CONTROL_DENSITY, VALUE
-from ocp_torch.problems.constants import Bounds
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.studies.kernel.stream import Datum
 
@@ -27,12 +27,12 @@ class Rule(ABC):
     fields: tuple[str, ...]
     needs_divergences = False
 
-    def __init__(self, problem: Problem, bounds: Bounds) -> None:
+    def __init__(self, problem: Problem, constants: Constants) -> None:
         if problem.control_limit is not None:
             raise InputError(
                 f"problem.control_limit is {problem.control_limit:g}, but the kernel methods know no limit; use networks."
             )
-        self.rho, self.M, self.C_V, self.q = problem.discount, bounds.M, bounds.C_V, problem.exponent
+        self.rho, self.M, self.C_V, self.q = problem.discount, constants.M, constants.C_V, problem.exponent
         self.conjugate = self.q / (self.q - 1.0)
 
     @abstractmethod

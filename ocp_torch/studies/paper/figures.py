@@ -7,7 +7,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ocp_torch.control.policies import control_laws, occupation_density
+from ocp_torch.control.policies import occupation_density, trained_policies
 from ocp_torch.problems import Circle
 from ocp_torch.studies.benchmark.kernels import OCCUPATION
 from ocp_torch.studies.paper.runs import Comparison, History, circle
@@ -70,7 +70,7 @@ def evolution(history: History) -> Figure:
 @torch.no_grad()
 def iterates(history: History) -> Figure:
     """What a method learns, for growing `n`, with the exact functions: `V` or `w` and the controller; all four for pd."""
-    problem, bounds = circle()
+    problem, constants = circle()
     kind, x = OCCUPATION[history.recipe.method], _grid()
     exact = {
         "$\\bar w_n$": problem.exact_control(x)[:, 0] * problem.exact_occupation(x),
@@ -81,18 +81,18 @@ def iterates(history: History) -> Figure:
     }
 
     def learned(fields) -> dict[str, torch.Tensor]:
-        laws = control_laws(kind, problem, fields, bounds)
+        policies = trained_policies(kind, problem, fields, constants)
         drawn = {}
         if fields.control_density is not None:
             drawn["$\\bar w_n$"] = fields.control_density(x)
         if fields.value is not None:
             drawn["$\\bar V_n$"] = fields.value(x)
         if history.recipe.method == "pd":
-            drawn["$\\mu_n$"] = occupation_density(kind, problem, fields, bounds)(x)
-        if "density" in laws:
-            drawn["controller $\\bar w_n / \\mu_n$"] = laws["density"](x)
+            drawn["$\\mu_n$"] = occupation_density(kind, problem, fields, constants)(x)
+        if "density" in policies:
+            drawn["controller $\\bar w_n / \\mu_n$"] = policies["density"](x)
         else:
-            drawn["controller from $\\bar V_n$"] = laws["value"](x)
+            drawn["controller from $\\bar V_n$"] = policies["value"](x)
         return drawn
 
     curves = {n: learned(fields) for n, fields in history.fields.items()}

@@ -12,7 +12,7 @@ import torch
 from ocp_torch.fields import Fields
 from ocp_torch.fields.sobolev import SobolevFeatures
 from ocp_torch.problems import Circle
-from ocp_torch.problems.constants import Bounds, resolve_bounds
+from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.studies.benchmark.kernels import OCCUPATION
 from ocp_torch.studies.benchmark.measure import Judge, relative
 from ocp_torch.studies.kernel import Iteration
@@ -25,10 +25,10 @@ Tick = Callable[[int], None]
 PARTS = 5
 
 
-def circle() -> tuple[Circle, Bounds]:
+def circle() -> tuple[Circle, Constants]:
     """The paper's example and its constants."""
     problem = Circle(DISCOUNT)
-    return problem, resolve_bounds(problem, occupation_bound=OCCUPATION_BOUND, value_bound=VALUE_BOUND)
+    return problem, resolve_constants(problem, occupation_bound=OCCUPATION_BOUND, value_bound=VALUE_BOUND)
 
 
 @dataclass
@@ -44,9 +44,9 @@ class History:
 
 def carry_out(recipe: Recipe, seeds: tuple[int, ...], modes: int, tick: Tick = lambda steps: None) -> History:
     """All ``seeds`` of one recipe at once, with truncated features. ``tick`` is told the steps made."""
-    problem, bounds = circle()
-    iteration = Iteration(problem, recipe.method, bounds, seeds, features=SobolevFeatures(1, modes=modes))
-    judge, history, sizes = Judge(problem, bounds), History(recipe), recipe.sizes
+    problem, constants = circle()
+    iteration = Iteration(problem, recipe.method, constants, seeds, features=SobolevFeatures(1, modes=modes))
+    judge, history, sizes = Judge(problem, constants), History(recipe), recipe.sizes
     for look in recipe.looks:
         started = time.process_time()
         while iteration.n < look:
@@ -81,8 +81,8 @@ def compare_with_exact(
     recipe: Recipe, steps: int, modes: int, seed: int, windows: int = 10, tick: Tick = lambda steps: None
 ) -> Comparison:
     """The first ``steps`` of a recipe in both forms, timed over consecutive ``windows``."""
-    problem, bounds = circle()
-    make = lambda **form: Iteration(problem, recipe.method, bounds, (seed,), **form)
+    problem, constants = circle()
+    make = lambda **form: Iteration(problem, recipe.method, constants, (seed,), **form)
     exact = make(kernel=BernoulliKernel(2), capacity=2 * steps)
     truncated = make(features=SobolevFeatures(1, modes=modes))
     forms = {"exact": exact, "truncated": truncated}

@@ -11,7 +11,7 @@ from torch import Tensor
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.supremum import batched, supremum
 from ocp_torch.problems.problem import Problem
-from ocp_torch.problems.starts import start_law
+from ocp_torch.problems.starts import start_distribution
 from ocp_torch.studies.reference.grid import Grid
 
 # States looked at for each node, and at least and at most; in pieces that a stencil of 64 nodes fits.
@@ -40,7 +40,7 @@ def look_between(problem: Problem, grid: Grid) -> Between:
     """Compare `f`, `a` and `B` with what the nodes of ``grid`` around give, at many states between and on ascents from there,
     and the mass of `mu0` at the nodes with 1."""
     x = scrambled_sobol(min(max(PER_NODE * grid.count, FEWEST), MOST), problem.dim, STREAM, torch.float64)
-    x = torch.cat([x, start_law(problem).draw(NEAR_STARTS, 0, STREAM)[0]])
+    x = torch.cat([x, start_distribution(problem).draw(NEAR_STARTS, 0, STREAM)[0]])
     cost = lambda x: problem.state_cost(x).unsqueeze(-1)
     found = [
         _unseen("the state cost falls", grid, cost, x, -1.0),
