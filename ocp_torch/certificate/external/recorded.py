@@ -57,7 +57,7 @@ def certify_recorded(
     kind = handed_out(problem, trained)
     warnings = [
         f"from {sum(map(len, sets)):,} held-out samples, taken for independent draws from "
-        f"{'the density given with them' if weighted(problem) else 'the uniform policy'}; nothing was simulated.",
+        f"{'the density given with them' if weighted(problem) else 'the uniform law'}; nothing was simulated.",
         *problem.recording.notes,
     ]
     policy = trained_policies(trained.occupation, problem, fields, constants)[kind] if kind else None
