@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.sampling import derive_seed, scrambled_sobol
+from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import derive_seed, fixed_generator
 
 Density = Callable[[Tensor], Tensor]
 
@@ -85,7 +86,7 @@ def _peaks(density: Density, x: Tensor, share: Tensor) -> tuple[Tensor, Tensor, 
     and how many states that took."""
     at = x[share.topk(PEAKS).indices].clone()
     height, step = density(at), torch.full((PEAKS, 1), 0.05, dtype=torch.float64)
-    generator = torch.Generator().manual_seed(0)
+    generator = fixed_generator()
     for _ in range(CLIMB):
         there = (at + step * torch.randn(at.shape, dtype=torch.float64, generator=generator)).remainder(1.0)
         reached = density(there)

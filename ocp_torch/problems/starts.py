@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.maths.mixtures import SCANNED, Mixture, fitted_mixture
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.simulator import Simulator
 
