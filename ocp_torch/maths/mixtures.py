@@ -97,14 +97,14 @@ class Mixture:
         if self.is_uniform:
             points = evaluation_points(count, self.dim + extra, replicate, seed)
             return points, torch.ones_like(points[:, 0])
-        generator = torch.Generator().manual_seed(derive_seed(seed, Branch.MIXTURES, replicate))
+        generator = torch.Generator().manual_seed(derive_seed(seed, Branch.MIXTURE_SIZES, replicate))
         ends = (self.shares.cumsum(0) * count + torch.rand((), generator=generator)).floor().clamp_max(count).long()
         sizes = ends.diff(prepend=torch.zeros(1, dtype=torch.long))
         rest = count - int(ends[-1])
         pieces = [evaluation_points(rest, self.dim + extra, replicate, seed)] if rest else []
         for k in sizes.nonzero().squeeze(-1).tolist():
             points = evaluation_points(
-                int(sizes[k]), self.dim + extra, replicate, derive_seed(seed, Branch.MIXTURES, k)
+                int(sizes[k]), self.dim + extra, replicate, derive_seed(seed, Branch.MIXTURE_POINTS, k)
             )
             normal = torch.special.ndtri(points[:, : self.dim].clamp(2.0**-53, 1.0 - 2.0**-53))
             points[:, : self.dim] = (self.centres[k] + self.widths[k] * normal).remainder(1.0)
@@ -148,7 +148,7 @@ def fitted_mixture(
                 break
             mixture = _maximised(x, weights, density)
         if k or missed:
-            points, weight = mixture.draw(ROUND, k, 0)
+            points, weight = mixture.draw(ROUND, k, derive_seed(0, Branch.MIXTURE_FIT))
             x, density, level = points, 1.0 / weight, log(points)
     return _with_tails(mixture)
 

@@ -6,35 +6,40 @@ of one kind changes no other, and no set of states is used twice without that be
 
 from __future__ import annotations
 
-from enum import IntEnum
+from enum import IntEnum, unique
 
 import numpy as np
 import torch
 
 
+@unique
 class Branch(IntEnum):
-    """What draws from each branch of the tree. Numbers are never reused: a run of an older version goes on as it began."""
+    """What draws from each branch of the tree. A number keeps its meaning for ever, so that old runs can be repeated."""
 
     TRAINING = 0  # states of training batches; rows of a recording
-    EVALUATION = 1  # states at which bounds are evaluated, and starts of simulated trajectories, by replicate
-    WEIGHTS = 2  # the first weights of the networks of a run
-    POLICY_EVALUATION = 3  # weights and states of the fit to a closed loop
-    RECORDED_POLICY_EVALUATION = 3  # rows of a recording for that fit
-    GLOBAL_GENERATORS = 4  # the process's own generators, for problems that draw from them
-    EXTERNAL_VALUE = 4  # weights, states and visits of the V trained for a given controller
-    EPISODES = 4  # starts of Gymnasium episodes
-    VALIDATION = 5  # all of the quick certificates during training
-    FIGURES = 5  # starts for the density plots
+    EVALUATION = 1  # states at which bounds are evaluated and trajectories start; below, the replicate
+    WEIGHTS = 2  # the first weights of a run's networks
+    POLICY_EVALUATION = 3  # the fit to a closed loop; below, 0 for weights, 1 for states, 2 for rows of a recording
+    EXTERNAL_VALUE = 4  # the V trained for a given controller; below, 0 for weights, 1 for states, 2 for visits
+    VALIDATION = 5  # all that the quick certificates during training draw
     DATASET_SPLIT = 6  # which rows of a recording are held out
-    TAILS = 6  # fresh states where few carry a bound
-    BEST_CONSTANT = 7  # states for the best constant V
-    PICTURES = 7  # starts of pictured trajectories
+    BEST_CONSTANT = 7  # states on which the best constant V is computed
     RECORDING = 8  # states of a recording that is made
-    METRICS = 8  # starts for the practitioner's numbers
     VISITS = 9  # training states that follow the closed loop
     SCAN = 10  # states scanned for narrow features of the data
     RECOMBINATION = 11  # states on which the last layer of V is chosen anew
-    MIXTURES = 12  # sizes and points of the components of a mixture
+    MIXTURE_POINTS = 12  # points of a mixture; below, the component
+    EPISODES = 13  # starts of Gymnasium episodes
+    GLOBAL_GENERATORS = 14  # the process's own generators, for problems that draw from them
+    FIGURES = 15  # starts for the figures of the density
+    TAILS = 16  # fresh states where few carry a bound; below, the round
+    PICTURES = 17  # starts of pictured trajectories
+    METRICS = 18  # starts for the practitioner's numbers
+    MIXTURE_SIZES = 19  # how many points each component of a mixture gets; below, the replicate
+    MIXTURE_FIT = 20  # states on which mixtures are fitted, the same in every run
+    DRAWN_STARTS = 21  # which weighted starts are kept; below, how many
+    MASS = 22  # states for the mass of a density, the same in every run
+    REFERENCE = 23  # states between the nodes of a reference grid, the same in every run
     AUDIT = 1000  # which trajectories are simulated again with finer steps
 
 

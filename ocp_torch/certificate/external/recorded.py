@@ -202,7 +202,7 @@ def closed_loop_J(
     rough = trained_policies(trained.occupation, problem, trained.fields, constants)[kind]
     like = next(trained.fields.parameters())
     training = closed_loop_samples(problem.training.to(like), rough, cost)
-    pool = Drawn(training, derive_seed(seed, Branch.RECORDED_POLICY_EVALUATION, 2))
+    pool = Drawn(training, derive_seed(seed, Branch.POLICY_EVALUATION, 2))
     fitted = fit_closed_loop(problem, rough, trained.fields, trained.network, constants, settings.stage, seed, pool)
     fitted = replace(trained, fields=fitted).in_float64()
     value = fields.value if fields.value is not None else fitted.value
