@@ -13,6 +13,7 @@ import math
 import torch
 from torch import Tensor
 
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.samples import Samples
 
 # States the coefficients are estimated from, and random mixtures that stand for all entries of `a` and of `B`.
@@ -90,7 +91,7 @@ def candidate_parts(dim: int) -> tuple[Tensor, Tensor]:
 
 def _channels(samples: Samples) -> list[Tensor]:
     """The data as scalar functions ``(N,)`` of mean 0 and variance 1; what is constant is left out."""
-    generator = torch.Generator().manual_seed(0)
+    generator = fixed_generator()
     raw = [samples.f, samples.mu0]
     for entries in (samples.a, samples.B.flatten(1)):
         spread = entries.float().std(dim=0)

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.sampling import derive_seed, evaluation_points, scrambled_sobol
+from ocp_torch.maths.sampling import evaluation_points, scrambled_sobol
+from ocp_torch.maths.seeds import Branch, derive_seed, fixed_generator
 from ocp_torch.maths.supremum import batched, supremum
 
 # Images of a normal density on each side, from a width where the nearest is not all, to one as good as uniform.
@@ -96,13 +97,15 @@ class Mixture:
         if self.is_uniform:
             points = evaluation_points(count, self.dim + extra, replicate, seed)
             return points, torch.ones_like(points[:, 0])
-        generator = torch.Generator().manual_seed(derive_seed(seed, COMPONENTS, replicate))
+        generator = torch.Generator().manual_seed(derive_seed(seed, Branch.MIXTURE_SIZES, replicate))
         ends = (self.shares.cumsum(0) * count + torch.rand((), generator=generator)).floor().clamp_max(count).long()
         sizes = ends.diff(prepend=torch.zeros(1, dtype=torch.long))
         rest = count - int(ends[-1])
         pieces = [evaluation_points(rest, self.dim + extra, replicate, seed)] if rest else []
         for k in sizes.nonzero().squeeze(-1).tolist():
-            points = evaluation_points(int(sizes[k]), self.dim + extra, replicate, derive_seed(seed, COMPONENTS, k))
+            points = evaluation_points(
+                int(sizes[k]), self.dim + extra, replicate, derive_seed(seed, Branch.MIXTURE_POINTS, k)
+            )
             normal = torch.special.ndtri(points[:, : self.dim].clamp(2.0**-53, 1.0 - 2.0**-53))
             points[:, : self.dim] = (self.centres[k] + self.widths[k] * normal).remainder(1.0)
             pieces.append(points)
@@ -145,7 +148,7 @@ def fitted_mixture(
                 break
             mixture = _maximised(x, weights, density)
         if k or missed:
-            points, weight = mixture.draw(ROUND, k, 0)
+            points, weight = mixture.draw(ROUND, k, derive_seed(0, Branch.MIXTURE_FIT))
             x, density, level = points, 1.0 / weight, log(points)
     return _with_tails(mixture)
 
@@ -188,7 +191,7 @@ def _maximised(x: Tensor, weights: Tensor, density: Tensor) -> Mixture:
     used = weights.topk(min(MOST, len(weights))).indices
     used = used[weights[used] > 1e-12 * weights.max()]
     x, weights, spacing = x[used], weights[used] / weights[used].sum(), spacing[used]
-    generator = torch.Generator().manual_seed(0)
+    generator = fixed_generator()
     start = torch.multinomial(weights, COMPONENTS, replacement=True, generator=generator)
     centres = x[start].unique(dim=0)
     away = _displacement(x, centres)

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ocp_torch.maths.seeds import fixed_generator
+
 # How often `minimiser` narrows its interval: (2/3)^30 of it is left.
 NARROWINGS = 30
 
@@ -63,7 +65,7 @@ def climb(
     """Where local ascents from ``x`` ``(N, d)``, with values ``best`` ``(N,)``, end, and the values there; they stop at the
     first NaN that any of them meets, which is then the value of its row."""
     step = torch.full_like(best, start_step)
-    generator = torch.Generator(device="cpu").manual_seed(0)
+    generator = fixed_generator()
     for _ in range(steps):
         direction = _gradient(function, x) if differentiable else torch.randn(x.shape, generator=generator).to(x)
         direction = direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-30)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError, ProblemError, require_integer, require_number
 from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.blame import failing_state, named, origin, place, words
 from ocp_torch.problems.control_limit import control_cost
@@ -265,7 +266,7 @@ class _Check:
 
     def _periodic(self) -> None:
         x = self._odd(min(256, self.count), 5)
-        whole = torch.randint(-2, 4, x.shape, generator=torch.Generator().manual_seed(0)).to(x)
+        whole = torch.randint(-2, 4, x.shape, generator=fixed_generator()).to(x)
         for name in DATA:
             here, there = self.ask(name, x), self.ask(name, x + whole)
             change = (here - there).abs().reshape(len(x), -1).amax(dim=-1)

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.sampling import derive_seed, scrambled_sobol
+from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import Branch, derive_seed, fixed_generator
 
 Density = Callable[[Tensor], Tensor]
 
@@ -22,7 +23,6 @@ TOLERANCE, SETTLED = 1e-4, 0.5
 LOOKS, PEAKS, CLIMB, EVEN = 4, 8, 120, 0.3
 # Half-widths of a peak that are told apart: 2^-1 to 2^-NARROWEST.
 NARROWEST = 30
-MASS_STREAM = 12
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Mass:
 def sampled_mass(density: Density, dim: int, count: int) -> Mass:
     """The integral of ``density`` ``(N, d) -> (N,)`` over the torus, from ``REPLICATES * count`` evenly spread states, and
     from as many near its peaks, again and again, where these do not settle it."""
-    sets = [scrambled_sobol(count, dim, derive_seed(MASS_STREAM, r), torch.float64) for r in range(REPLICATES)]
+    sets = [scrambled_sobol(count, dim, derive_seed(0, Branch.MASS, r), torch.float64) for r in range(REPLICATES)]
     x = torch.cat(sets)
     share = density(x)  # of the mass, times the number of states
     found, states = _mass(share, count), len(x)
@@ -66,7 +66,7 @@ def sampled_mass(density: Density, dim: int, count: int) -> Mass:
         top, top_widths, top_heights, used = _peaks(density, x, share)
         peaks, widths, heights = (torch.cat(p) for p in ((peaks, top), (widths, top_widths), (heights, top_heights)))
         peaks, widths, heights = _distinct(peaks, widths, heights)
-        generator = torch.Generator().manual_seed(derive_seed(MASS_STREAM, look, REPLICATES))
+        generator = torch.Generator().manual_seed(derive_seed(0, Branch.MASS, REPLICATES, look))
         x = _drawn(peaks, widths, REPLICATES * count, generator)
         share = density(x) / _density(x, peaks, widths)
         states += used + len(x)
@@ -85,7 +85,7 @@ def _peaks(density: Density, x: Tensor, share: Tensor) -> tuple[Tensor, Tensor, 
     and how many states that took."""
     at = x[share.topk(PEAKS).indices].clone()
     height, step = density(at), torch.full((PEAKS, 1), 0.05, dtype=torch.float64)
-    generator = torch.Generator().manual_seed(0)
+    generator = fixed_generator()
     for _ in range(CLIMB):
         there = (at + step * torch.randn(at.shape, dtype=torch.float64, generator=generator)).remainder(1.0)
         reached = density(there)

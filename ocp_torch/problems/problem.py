@@ -15,6 +15,7 @@ from ocp_torch.errors import InputError, require_integer, require_number
 from ocp_torch.maths import calculus
 from ocp_torch.maths.enclosure import Enclosure, Lipschitz, lipschitz_enclosure
 from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.taylor import Box
 from ocp_torch.problems.control_limit import control_cost
 from ocp_torch.problems.samples import Samples
@@ -162,7 +163,7 @@ class Problem:
     def independent_samples(self, count: int) -> Samples:
         """Data at independent draws of states, at most ``count``, the same ones always: evenly spread states show waves
         that are not there."""
-        x = torch.rand(count, self.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        x = torch.rand(count, self.dim, dtype=torch.float64, generator=fixed_generator())
         return Samples.of(self, x, divergences=False)
 
     @property

@@ -11,6 +11,7 @@ from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.errors import ProblemError
 from ocp_torch.maths.mixtures import worth
 from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.blame import place
 from ocp_torch.problems.problem import Problem
@@ -105,7 +106,7 @@ def _differences(problem: Problem, x: Tensor, y: Tensor, tolerance: float, sizes
 
 def _periods(problem: Problem, sizes: dict[str, float]) -> dict[str, float]:
     x = scrambled_sobol(PROBES, problem.dim, 2, torch.float64)
-    whole = torch.randint(-2, 4, x.shape, generator=torch.Generator().manual_seed(0)).to(x)
+    whole = torch.randint(-2, 4, x.shape, generator=fixed_generator()).to(x)
     return _differences(problem, x, x + whole, ROUNDING, sizes)
 
 

@@ -30,7 +30,7 @@ from ocp_torch.control.policies import NETWORK, Policy, trained_policies
 from ocp_torch.fields.fields import Fields
 from ocp_torch.maths import calculus
 from ocp_torch.maths.calculus import CHUNK, chunked_gradient
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import formulas
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.control_cost import PowerCost
@@ -44,8 +44,6 @@ from ocp_torch.problems.samples import Samples
 GROUPS, FEWEST = 64, 8
 # The samples with most mass, at which the contraction of the flow is looked at.
 TOP = 10
-# Branch of the seed tree for the draws of the fit, as in `stage`.
-STREAM = 3
 
 
 def certify_recorded(
@@ -204,7 +202,7 @@ def closed_loop_J(
     rough = trained_policies(trained.occupation, problem, trained.fields, constants)[kind]
     like = next(trained.fields.parameters())
     training = closed_loop_samples(problem.training.to(like), rough, cost)
-    pool = Drawn(training, derive_seed(seed, STREAM, 2))
+    pool = Drawn(training, derive_seed(seed, Branch.POLICY_EVALUATION, 2))
     fitted = fit_closed_loop(problem, rough, trained.fields, trained.network, constants, settings.stage, seed, pool)
     fitted = replace(trained, fields=fitted).in_float64()
     value = fields.value if fields.value is not None else fitted.value

@@ -18,6 +18,7 @@ from torch import Tensor
 from ocp_torch.certificate.lower.shifted import Shift, SlackParts, slack_parts
 from ocp_torch.maths import calculus
 from ocp_torch.maths.calculus import Field
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -36,7 +37,7 @@ class Mollified:
     def __init__(self, value: Field, dim: int, radius: float) -> None:
         axes = torch.eye(dim, dtype=torch.float64)
         if dim > DIRECTIONS:
-            generator = torch.Generator().manual_seed(0)
+            generator = fixed_generator()
             mixed = torch.randn(dim, DIRECTIONS, generator=generator, dtype=torch.float64)
             axes = torch.linalg.qr(mixed).Q.T
         self.value, self.radius = value, radius

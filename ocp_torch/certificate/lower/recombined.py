@@ -16,13 +16,12 @@ from torch import Tensor
 
 from ocp_torch.certificate.lower.shifted import SlackParts, slack_function
 from ocp_torch.maths.calculus import CHUNK, Field, chunked_gradient
-from ocp_torch.maths.sampling import derive_seed, scrambled_sobol
+from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import climb
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# Branch of the seed tree for the states that the weights are chosen on, beside those of the certificate.
-STREAM = 11
 # States at most, and numbers kept for them at most (128 MiB of float64).
 STATES, NUMBERS = 8192, 2**24
 # Rounds, L-BFGS iterations in each, ascents between them, and how much less the maximum is smoothed each time: in two
@@ -83,7 +82,7 @@ def recombined(problem: Problem, value: Field, seed: int) -> Field | None:
         return None
     width = value.features(torch.zeros(1, problem.dim, dtype=torch.float64)).shape[1]
     count = min(STATES, NUMBERS // (width * (problem.control_dim + 2)))
-    x = scrambled_sobol(count, problem.dim, derive_seed(seed, STREAM), torch.float64)
+    x = scrambled_sobol(count, problem.dim, derive_seed(seed, Branch.RECOMBINATION), torch.float64)
     program = Program(problem, value, x)
     c = torch.zeros(program.basis.shape[1], dtype=torch.float64)
     slack = program.slack(c)

@@ -29,6 +29,7 @@ from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.mlp import Gated, PeriodicMLP
 from ocp_torch.maths.enclosure import contradiction
 from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.maths.taylor import ROUNDING, Box, TaylorModel, upward
 from ocp_torch.problems.problem import Problem
@@ -91,7 +92,7 @@ def obstacle(problem: Problem, value: nn.Module) -> str | None:
         problem.control_cost, "conjugate_model", ("conjugate",)
     ):
         return "the problem's class changes its data, but not the enclosure it inherits"
-    generator = torch.Generator().manual_seed(0)
+    generator = fixed_generator()
     box = _cells(problem.dim, 16, DEGREE[problem.dim])
     enclosure = problem.enclosure(box)
     if enclosure is None:

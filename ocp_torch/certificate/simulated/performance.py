@@ -27,7 +27,7 @@ from ocp_torch.certificate.simulated.simulation import Dynamics, Integrate, disc
 from ocp_torch.control.policies import Policy, ValuePolicy
 from ocp_torch.maths import calculus
 from ocp_torch.maths.calculus import Field
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import formulas
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
@@ -174,7 +174,7 @@ def simulate_performance(
         integrate = Sliding(integrate, len(x0), tolerance * size)
     speed = float(velocity.norm(dim=-1).max())
     steps = max(8, 2 * math.ceil(0.5 * longest * max(rho / 0.4, speed / 0.2)))
-    generator = torch.Generator().manual_seed(derive_seed(seed, SIMULATION_REPLICATE))
+    generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT))
     means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
     noise = lambda results: Estimate.of(means(results).tolist()).se
     result, end, bias = refined(integrate, mass, steps, tolerance * size, generator, noise)

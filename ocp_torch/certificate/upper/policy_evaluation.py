@@ -14,7 +14,8 @@ from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
 from ocp_torch.maths import calculus
 from ocp_torch.maths.calculus import CHUNK, Field
-from ocp_torch.maths.sampling import SobolSampler, derive_seed
+from ocp_torch.maths.sampling import SobolSampler
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import minimiser
 from ocp_torch.objectives.policy_evaluation import PolicyEvaluation
 from ocp_torch.problems import formulas
@@ -25,8 +26,6 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
 from ocp_torch.steppers.optimizers import LARGEST_RATE
 
-# Branch of the seed tree for the stage's states and weights, beside those of training and evaluation.
-STAGE_STREAM = 3
 # The closed loop's data are computed once on so many states at most: their divergences cost more than a step.
 POOL = 2**16
 # Beyond that ratio of the two suprema of the slack the residual is not weighed any more lopsidedly.
@@ -77,10 +76,10 @@ def fit_closed_loop(
     loop = ClosedLoop(problem, policy)
     with_value = fields is None or fields.value is None
     names = (LOG_OCCUPATION, VALUE) if with_value else (LOG_OCCUPATION,)
-    fitted = Fields.build(problem, names, network, derive_seed(seed, STAGE_STREAM, 0)).to(like)
+    fitted = Fields.build(problem, names, network, derive_seed(seed, Branch.POLICY_EVALUATION, 0)).to(like)
     if fields is not None and fields.log_occupation is not None:
         fitted.log_occupation.load_state_dict(fields.log_occupation.state_dict())
-    pool = pool or Pool(loop, derive_seed(seed, STAGE_STREAM, 1), like, double=fields is None)
+    pool = pool or Pool(loop, derive_seed(seed, Branch.POLICY_EVALUATION, 1), like, double=fields is None)
     draw = lambda: pool.draw(settings.batch)
     pool.grow(min(POOL, settings.steps * settings.batch))
     price = 1.0 if with_value else missing_price(loop, fields.value, pool.samples.take(slice(EXCESS_STATES)))
