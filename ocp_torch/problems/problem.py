@@ -13,11 +13,14 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError, require_integer, require_number
 from ocp_torch.maths import calculus
-from ocp_torch.maths.enclosure import Enclosure, Lipschitz, lipschitz_enclosure
 from ocp_torch.maths.sampling import scrambled_sobol
+<<<<<<< HEAD
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.taylor import Box
+=======
+>>>>>>> wt-prob
 from ocp_torch.problems.control_limit import control_cost
+from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.samples import Samples
 
 # Beyond this, B alone would fill the memory.
@@ -125,14 +128,6 @@ class Problem:
         """Whether `div a` and `div B` are to be had."""
         x = torch.full((1, self.dim), 0.5, dtype=torch.float64)
         return self.drift_divergence(x) is not None and self.control_divergence(x) is not None
-
-    def enclosure(self, box: Box) -> Enclosure | None:
-        """What `f`, `a`, `B` and `mu0` can be over a batch of cells, for rigorous bounds; `None` where nobody knows.
-
-        Here from ``lipschitz`` constants alone. Taylor models, as in `Torus`, converge faster; a class that overrides the
-        data must override this too.
-        """
-        return lipschitz_enclosure(self, Problem, box)
 
     # Exact truth, where known: `None` otherwise.
     def exact_value(self, x: Tensor) -> Tensor | None:

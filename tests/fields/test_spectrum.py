@@ -77,7 +77,7 @@ class Flat(Problem):
 @pytest.mark.nightly
 def test_what_the_drift_and_the_controls_couple_counts_as_well():
     problem = Manufactured(dim=6, interaction=5, seed=3)
-    assert {tuple(k) for k in problem._V0.waves.tolist()} <= found_in(problem, 64)
+    assert {tuple(k) for k in problem.V0.waves.tolist()} <= found_in(problem, 64)
     assert (0.0, 1.0, 1.0) in found_in(Torus(3))
 
 

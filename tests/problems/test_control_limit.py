@@ -11,14 +11,16 @@ from hypothesis import strategies as st
 from ocp_torch.certificate import CertificateSettings, StageSettings
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.external.black_box import BlackBox
-from ocp_torch.certificate.proof.rigorous import obstacle, rigorous_lower_bound
+from ocp_torch.certificate.proof.box import Box
+from ocp_torch.certificate.proof.enclosures import conjugate_model
+from ocp_torch.certificate.proof.obstacle import obstacle
+from ocp_torch.certificate.proof.rigorous import rigorous_lower_bound
 from ocp_torch.certificate.sides import lower_side, upper_side
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.controller import load_controller
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, admissible_density, occupation_density, trained_policies
 from ocp_torch.errors import InputError
 from ocp_torch.maths import calculus
-from ocp_torch.maths.taylor import Box
 from ocp_torch.objectives.primal import ClosedPrimal, NetworkPrimal
 from ocp_torch.objectives.saddle import Saddle
 from ocp_torch.problems import Circle, Manufactured, Torus, formulas
@@ -170,7 +172,7 @@ def test_taylor_models_hold_the_conjugate_below_across_and_beyond_the_limit(q, d
     for half in (0.2, 0.02, 1e-3):
         centre = 2.0 * torch.rand(300, dim, generator=generator, dtype=torch.float64)
         box = Box(centre, torch.full_like(centre, half), 4)
-        model = cost.conjugate_model(box.coordinates())
+        model = conjugate_model(cost, box.coordinates())
         low, high = model.bounds()
         inner = 2.0 * torch.rand(20, 300, dim, generator=generator, dtype=torch.float64) - 1.0
         # The corner farthest from 0 is where R* exceeds its limited version most.
