@@ -48,7 +48,7 @@ class LimitedCost(PowerCost):
     def conjugate_model(self, p: TaylorModel) -> TaylorModel:
         """Cells across `|p| = c^{q-1}` take `R*` less what it exceeds `R_c*` by, which grows quadratically from 0 there."""
         near, squares = super().conjugate_model(p), (p * p).sum()
-        low, high = squares.constants()
+        low, high = squares.bounds()
         far = squares.power(0.5) * self.limit + (-self._dearest)
         top = upward(high.clamp_min(0.0).sqrt())
         parts = top**self.conjugate_exponent / self.conjugate_exponent, self.limit * top, self._dearest

@@ -171,7 +171,7 @@ def test_taylor_models_hold_the_conjugate_below_across_and_beyond_the_limit(q, d
         centre = 2.0 * torch.rand(300, dim, generator=generator, dtype=torch.float64)
         box = Box(centre, torch.full_like(centre, half), 4)
         model = cost.conjugate_model(box.coordinates())
-        low, high = model.constants()
+        low, high = model.bounds()
         inner = 2.0 * torch.rand(20, 300, dim, generator=generator, dtype=torch.float64) - 1.0
         # The corner farthest from 0 is where R* exceeds its limited version most.
         for t in (*inner, torch.ones(300, dim, dtype=torch.float64)):
