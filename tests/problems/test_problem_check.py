@@ -37,7 +37,7 @@ def test_what_a_constructor_raises_is_told_with_the_line():
     with pytest.raises(
         InputError, match=r"__init__ of .*BrokenInit raised KeyError: 'missing' \(.*hostile_problems.py, line"
     ):
-        build_problem({"_target_": "hostile_problems.BrokenInit"})
+        build_problem({"_target_": "support.hostile_problems.BrokenInit"})
 
 
 def test_a_simulator_is_held_against_the_same():

@@ -167,13 +167,13 @@ def test_the_last_fields_are_handed_out_unless_they_are_clearly_worse(tmp_path, 
 
 def test_a_hopeless_run_is_told_plainly(tmp_path, monkeypatch, caplog):
     trainer = small(*WAY)
-    monkeypatch.setattr("looks.LOWER", 0.001)
+    monkeypatch.setattr("support.looks.LOWER", 0.001)
     with caplog.at_level("WARNING"):
         _, made = run(trainer, tmp_path, monkeypatch, lambda t: 80.0, zero=0.05)
     assert any("best constant V" in w for w in made.warnings)
     assert sum("worse than doing nothing" in w for w in made.warnings) == 1
     assert "step 12: the lower bound" in caplog.text
-    monkeypatch.setattr("looks.LOWER", LOWER)
+    monkeypatch.setattr("support.looks.LOWER", LOWER)
     _, made = run(small(*WAY), tmp_path / "good", monkeypatch, lambda t: 0.1)
     assert made.warnings == []
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 
 import numpy as np
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from ocp_torch.cli import compose as composition
 
@@ -19,19 +19,24 @@ def is_field(override: str) -> bool:
 
 @contextlib.contextmanager
 def quickly():
-    """Within, each choice of files is composed once; fields are then set by Hydra's own step, which reads none."""
+    """Within, each choice of files is composed once, and fields are then set in a copy; what is not plainly the setting of
+    a field that is there, or goes wrong, is composed from the files."""
     real, kept = composition.compose, {}
 
     def compose(config_name, overrides=()):
         files = tuple(o for o in overrides if not is_field(o))
         fields = composition.parsed([o for o in overrides if is_field(o) and not o.startswith("hydra.run.dir=")])
-        if any(o.is_sweep_override() for o in fields):
+        if any(o.is_sweep_override() or o.is_delete() or o.is_add() for o in fields):
             return real(config_name, list(overrides))
         if (config_name, files) not in kept:
             kept[config_name, files] = real(config_name, list(files))
         config = kept[config_name, files].copy()
         OmegaConf.set_struct(config, True)
-        ConfigLoaderImpl._apply_overrides_to_config(fields, config)
+        try:
+            for field in fields:
+                OmegaConf.update(config, field.key_or_group, field.value(), force_add=field.is_force_add())
+        except OmegaConfBaseException:
+            return real(config_name, list(overrides))
         return config
 
     composition.compose = compose
