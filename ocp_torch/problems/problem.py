@@ -14,11 +14,7 @@ from torch import Tensor
 from ocp_torch.errors import InputError, require_integer, require_number
 from ocp_torch.maths import calculus
 from ocp_torch.maths.sampling import scrambled_sobol
-<<<<<<< HEAD
 from ocp_torch.maths.seeds import fixed_generator
-from ocp_torch.maths.taylor import Box
-=======
->>>>>>> wt-prob
 from ocp_torch.problems.control_limit import control_cost
 from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.samples import Samples

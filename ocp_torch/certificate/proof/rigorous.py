@@ -27,7 +27,6 @@ from ocp_torch.certificate.sides import LowerSide
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.mlp import PeriodicMLP
 from ocp_torch.maths.sampling import scrambled_sobol
-from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.problem import Problem
 
@@ -72,72 +71,6 @@ class RigorousBound:
         )
 
 
-<<<<<<< HEAD
-def obstacle(problem: Problem, value: nn.Module) -> str | None:
-    """Why there can be no rigorous bound for ``value`` on ``problem``; `None` where there can."""
-    if problem.dim > MOST_DIMENSIONS:
-        return f"cells cover the torus in at most {MOST_DIMENSIONS} dimensions, and this problem has {problem.dim}"
-    if type(value) is not PeriodicMLP or not value.scalar or not all(map(_known, value.body.modules())):
-        return "V is not one of the package's own scalar networks"
-    weights = [*value.parameters(), *value.buffers()]
-    if not all(bool(torch.isfinite(w).all()) for w in weights):
-        return "V has weights that are not finite"
-    if not all(w.dtype == torch.float64 and w.device.type == "cpu" for w in weights):
-        return "V is not in float64 on the CPU"
-    data = ("state_cost", "drift", "control_matrix", "initial_density")
-    if not _speaks_for(problem, "enclosure", data) or not _speaks_for(
-        problem.control_cost, "conjugate_model", ("conjugate",)
-    ):
-        return "the problem's class changes its data, but not the enclosure it inherits"
-    generator = fixed_generator()
-    box = _cells(problem.dim, 16, DEGREE[problem.dim])
-    enclosure = problem.enclosure(box)
-    if enclosure is None:
-        return "the problem gives neither an enclosure of its data nor their Lipschitz constants (lipschitz)"
-    for half in (1.0, 2.0**-8):
-        small = Box(box.centre, half * box.half, box.degree)
-        t = 2.0 * torch.rand(box.centre.shape, generator=generator, dtype=torch.float64) - 1.0
-        wrong = contradiction(problem, small, problem.enclosure(small), t)
-        if wrong is not None:
-            return f"the problem's enclosure does not hold its own {wrong}"
-    return None
-
-
-def _known(layer: nn.Module) -> bool:
-    """Whether this is a layer that `network_model` encloses, the activations in their plain form."""
-    plain = getattr(layer, "approximate", "none") == "none" and getattr(layer, "beta", 1.0) == 1.0
-    return plain and type(layer) in (nn.Sequential, nn.Linear, Gated, *SERIES)
-
-
-def _speaks_for(owner: object, claim: str, methods: tuple[str, ...]) -> bool:
-    """Whether no class below the one that defines ``claim`` changes one of ``methods``."""
-    line = type(owner).__mro__
-    where = lambda name: next(i for i, c in enumerate(line) if name in vars(c))
-    general = getattr(type(owner), claim) is getattr(Problem, claim, None)
-    return general or all(where(claim) <= where(name) and name not in vars(owner) for name in methods)
-
-
-def _cells(dim: int, side: int, degree: int) -> Box:
-    edges = (torch.arange(side, dtype=torch.float64) + 0.5) / side
-    centre = torch.cartesian_prod(*[edges] * dim).reshape(-1, dim)
-    return Box(centre, torch.full_like(centre, 0.5 / side), degree)
-
-
-@torch.no_grad()
-def cell_models(problem: Problem, value: PeriodicMLP, theta: float, box: Box) -> tuple[TaylorModel, TaylorModel]:
-    """`Q` and `W mu0` for `W = theta V`, both ``(N,)``, over ``box``."""
-    data, rho = problem.enclosure(box), problem.discount
-    V, gradient = network_model(value, box)
-    V, gradient = V * theta, gradient * theta
-    pushed = (data.B * gradient[:, None]).sum(dim=-2) * (-1.0 / rho)
-    Q = V - data.f + problem.control_cost.conjugate_model(pushed)
-    if data.a is not None:
-        Q = Q - (gradient * data.a).sum() * (1.0 / rho)
-    return Q, V * data.mu0
-
-
-=======
->>>>>>> wt-prob
 @dataclass
 class _Finished:
     """What is proved on the cells that are not bisected any more: ``slack`` of all, and the integral over each."""
