@@ -28,10 +28,12 @@ from ocp_torch.certificate.sides import LowerSide
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.mlp import Gated, PeriodicMLP
 from ocp_torch.maths.enclosure import contradiction
+from ocp_torch.maths.jets import Jet
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.maths.taylor import ROUNDING, Box, TaylorModel, upward
+from ocp_torch.problems.generator import Generator, hjb_slack
 from ocp_torch.problems.problem import Problem
 
 MOST_DIMENSIONS = 2
@@ -129,14 +131,10 @@ def _cells(dim: int, side: int, degree: int) -> Box:
 @torch.no_grad()
 def cell_models(problem: Problem, value: PeriodicMLP, theta: float, box: Box) -> tuple[TaylorModel, TaylorModel]:
     """`Q` and `W mu0` for `W = theta V`, both ``(N,)``, over ``box``."""
-    data, rho = problem.enclosure(box), problem.discount
-    V, gradient = network_model(value, box)
-    V, gradient = V * theta, gradient * theta
-    pushed = (data.B * gradient[:, None]).sum(dim=-2) * (-1.0 / rho)
-    Q = V - data.f + problem.control_cost.conjugate_model(pushed)
-    if data.a is not None:
-        Q = Q - (gradient * data.a).sum() * (1.0 / rho)
-    return Q, V * data.mu0
+    data = problem.enclosure(box)
+    generator, V = Generator(data, problem.discount), Jet(*network_model(value, box)).map(lambda part: part * theta)
+    conjugate = problem.control_cost.conjugate_model(generator.push(V))
+    return hjb_slack(V.value, data.f, generator.transport(V), conjugate), V.value * data.mu0
 
 
 @dataclass
