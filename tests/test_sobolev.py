@@ -89,7 +89,7 @@ def test_closed_derivatives_agree_with_autograd(dim, kernel):
     torch.testing.assert_close(of_features[:, 1:] @ field.coefficients, gradient)
 
 
-def test_forward_mode_through_a_vector_field_matches_finite_differences():
+def test_the_divergence_of_a_vector_field_matches_finite_differences():
     field, x, h = random_field(2, outputs=2, modes=3), zoo.states(Problem(2), 20), 1e-6
     B = torch.eye(2, dtype=torch.float64).expand(20, 2, 2)
     w, flux = jets.control_flux_divergence(field, x, B, torch.zeros(20, 2, dtype=torch.float64))

@@ -60,7 +60,7 @@ class AugmentedSaddle(Objective):
     value player ignores a density player that has not arrived yet (the game is then a dual ascent with a best response),
     and nothing is lost at the equilibrium, where `L` is flat in `V`. With ``warm_start`` and `c = 0` the density player
     even rests for that part of the run: what it would answer to is not there yet. Then it also learns from ``density_batch``
-    states of each batch at most, of those that carry weight (`m` tangents through `w` make its states expensive).
+    states of each batch at most, of those that carry weight (`m` reverse passes through `w` make its states expensive).
 
     Convexity: `l` is a perspective plus linear terms, so `max(l, 0)` and `J` are convex in `(w, mu)`, and `c L + k F_M` is
     concave in `V`. For `c = 1` and where `l >= 0` the operator of the game is that of `L`, which is monotone, plus

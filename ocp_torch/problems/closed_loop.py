@@ -38,7 +38,7 @@ class ClosedLoop(Problem):
         return self.problem.velocity(x, self.policy(x))
 
     def drift_divergence(self, x: Tensor) -> Tensor | None:
-        """`div g_u = div a + (div B) . u + sum_k (d u_k along column k of B)`: `m` tangents through the controller."""
+        """`div g_u = div a + (div B) . u + sum_k (d u_k along column k of B)`: one reverse pass for each of the controls."""
         div_a, div_B = self.problem.drift_divergence(x), self.problem.control_divergence(x)
         if div_a is None or div_B is None:
             return None
