@@ -14,13 +14,17 @@ from torch.quasirandom import SobolEngine
 from ocp_torch.errors import InputError, require_integer
 from ocp_torch.maths.seeds import Branch, derive_seed
 
-# A fresh scrambling after so many points: keeps the stream endless and fast-forwarding cheap.
+# Points of one scrambling. Then another begins: a sequence ends, and resuming must draw again all points of the block so far.
 SOBOL_BLOCK = 2**18
+# Points drawn at once at least: a draw of few costs as much.
+DRAWN = 4096
+# Seeds that a Sobol engine takes are below this.
+ENGINE_SEEDS = 2**31
 
 
 def scrambled_sobol(count: int, dim: int, seed: int, dtype: torch.dtype, skip: int = 0) -> Tensor:
     """``count`` scrambled Sobol points in `[0, 1)^dim`, after ``skip`` of the same scrambling; ``(count, dim)``."""
-    engine = SobolEngine(dim, scramble=True, seed=seed % 2**31)
+    engine = SobolEngine(dim, scramble=True, seed=seed % ENGINE_SEEDS)
     if skip:
         engine.fast_forward(skip)
     points = engine.draw(count, dtype=torch.float64)
@@ -83,9 +87,9 @@ class SobolSampler:
         if self._start != block:
             self._start, self._buffer = block, torch.empty(0, self.dim, dtype=self.dtype)
             seed = derive_seed(self.seed, Branch.TRAINING, block)
-            self._engine = SobolEngine(self.dim, scramble=True, seed=seed % 2**31)
+            self._engine = SobolEngine(self.dim, scramble=True, seed=seed % ENGINE_SEEDS)
         while len(self._buffer) < stop:
-            fresh = self._engine.draw(max(stop - len(self._buffer), 4096), dtype=torch.float64)
+            fresh = self._engine.draw(max(stop - len(self._buffer), DRAWN), dtype=torch.float64)
             self._buffer = torch.cat([self._buffer, fresh.to(self.dtype).remainder(1.0)])
         return self._buffer
 

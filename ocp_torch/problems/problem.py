@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError, require_integer, require_number
-from ocp_torch.maths import calculus
+from ocp_torch.maths import jets
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.control_limit import control_cost
@@ -108,7 +108,7 @@ class Problem:
         """`div a`, ``(N,)``: by autograd through `drift`. Override where it is known, or give `None`."""
         if self.driftless:
             return torch.zeros_like(x[:, 0])
-        return calculus.divergence(self.drift, x)
+        return jets.divergence(self.drift, x)
 
     def control_divergence(self, x: Tensor) -> Tensor | None:
         """The divergence of each column of `B`, ``(N, m)``; by forward-mode autograd unless `B` is constant."""

@@ -11,7 +11,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.mixtures import SCANNED, Mixture, fitted_mixture
+from ocp_torch.maths.mixture_fit import SCANNED, fitted_mixture
+from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.simulator import Simulator

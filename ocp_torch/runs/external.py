@@ -17,7 +17,7 @@ from ocp_torch.control.policies import Policy, trained_policies
 from ocp_torch.errors import InputError, require_flag, require_integer
 from ocp_torch.fields import Fields
 from ocp_torch.fields.fields import VALUE, cost_unit
-from ocp_torch.maths.calculus import Field
+from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import SAMPLERS, scrambled_sobol
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import batched

@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
-from ocp_torch.maths.mixtures import Mixture, concentrated
+from ocp_torch.maths.mixture_fit import concentrated
+from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.errors import ProblemError
-from ocp_torch.maths.mixtures import worth
+from ocp_torch.maths.mixtures import effective_part
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import supremum
@@ -72,7 +72,7 @@ def check_problem(problem: Problem, sets: list[Samples]) -> WellPosed:
     positive = least >= -ROUNDING * abs(mass.value)
     if not positive:
         warnings.append(f"no bound is used: the initial density falls to {least:.3g}, but must not be negative.")
-    carried = worth(torch.cat([s.weight * s.mu0 for s in sets]).clamp_min(0.0))
+    carried = effective_part(torch.cat([s.weight * s.mu0 for s in sets]).clamp_min(0.0))
     whole = abs(mass.value - 1.0) <= MASS_TOLERANCE + mass.half_width(MASS_LEVEL)
     if not whole:
         warnings.append(

@@ -28,12 +28,12 @@ from ocp_torch.certificate.upper.lagrangian import Terms, best_multiples
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
 from ocp_torch.control.policies import NETWORK, Policy, trained_policies
 from ocp_torch.fields.fields import Fields
-from ocp_torch.maths import calculus
-from ocp_torch.maths.calculus import CHUNK, chunked_gradient
+from ocp_torch.maths import jets
+from ocp_torch.maths.jets import CHUNK, chunked_jet
 from ocp_torch.maths.seeds import Branch, derive_seed
-from ocp_torch.problems import formulas
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.control_cost import PowerCost
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.needs import SEARCHED
 from ocp_torch.problems.problem import MARGIN
 from ocp_torch.problems.recorded.dataset import Dataset
@@ -135,9 +135,9 @@ def penalised(problem: Dataset, fields: Fields, M: float, sets: list[Samples]) -
     """`F_M(V) = E[V mu0 - M max(Q, 0)]`."""
     values = []
     for samples in sets:
-        v, gradient = chunked_gradient(fields.value, samples.x)
-        slack = formulas.hjb_slack(samples, v, gradient, problem.control_cost, problem.discount)
-        values.append(integral(samples, v * samples.mu0 - M * slack.clamp_min(0.0)))
+        V = chunked_jet(fields.value, samples.x)
+        slack = Generator.of(problem, samples).hjb_slack(V)
+        values.append(integral(samples, V.value * samples.mu0 - M * slack.clamp_min(0.0)))
     return Estimate.of(values)
 
 
@@ -147,7 +147,7 @@ def closed_loop_samples(samples: Samples, policy: Policy, cost: PowerCost) -> Sa
     pieces = []
     for part in samples.split(CHUNK):
         div_a, div_B = part.require_divergences("the closed loop")
-        u, flux = calculus.control_flux_divergence(policy, part.x, part.B, div_B)
+        u, flux = jets.control_flux_divergence(policy, part.x, part.B, div_B)
         pushed = torch.einsum("ndm,nm->nd", part.B, u)
         none = torch.zeros_like(part.x)
         pieces.append(
@@ -209,20 +209,20 @@ def closed_loop_J(
     terms, densities, spreads, fluxes, largest, deepest = [], [], [], [], 0.0, 0.0
     for samples in sets:
         loop = closed_loop_samples(samples, policy, cost)
-        v, gradient = chunked_gradient(value, loop.x)
-        slack = formulas.hjb_slack(loop, v, gradient, cost, rho)
+        generator, V = Generator(loop, rho, cost), chunked_jet(value, loop.x)
+        slack = generator.hjb_slack(V)
         with torch.no_grad():
-            mu, spent = formulas.occupation_outflow(loop, fitted.log_occupation, rho)
-        terms.append(Terms(loop, v, mu * slack, loop.mu0 - spent))
-        largest, deepest = max(largest, float(v.max())), max(deepest, float(-slack.min()))
+            mu, outflow = generator.occupation_outflow(fitted.log_occupation)
+        terms.append(Terms(loop, V.value, mu * slack, loop.mu0 - outflow))
+        largest, deepest = max(largest, float(V.value.max())), max(deepest, float(-slack.min()))
         densities.append(mu)
-        fluxes.append(Flux(loop.x, loop.weight, spent - mu, mu.unsqueeze(-1) * loop.a / rho))
+        fluxes.append(Flux(loop.x, loop.weight, outflow - mu, mu.unsqueeze(-1) * loop.a / rho))
         spreads.append(loop.div_a)
     with torch.no_grad():
         loop = training.to(torch.zeros((), dtype=torch.float64))
-        v, gradient = calculus.value_and_gradient(value, loop.x)
-        slack = formulas.hjb_slack(loop, v, gradient, cost, rho)
-    largest, deepest = max(largest, float(v.max())), max(deepest, float(-slack.min()))
+        V = jets.jet(value, loop.x)
+        slack = Generator(loop, rho, cost).hjb_slack(V)
+    largest, deepest = max(largest, float(V.value.max())), max(deepest, float(-slack.min()))
     C_V = max(constants.C_V, MARGIN * (largest + deepest))
     excess = best_multiples(terms, lambda t, s: t.J(s, C_V))
     J = [integral(t.samples, t.v * t.samples.mu0) + e for t, e in zip(terms, excess, strict=True)]

@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.lower.shifted import SlackParts, slack_function
-from ocp_torch.maths.calculus import CHUNK, Field, chunked_gradient
+from ocp_torch.maths.jets import CHUNK, Field, chunked_jet
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import climb
+from ocp_torch.problems.generator import Generator, hjb_slack
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -47,7 +48,7 @@ class Program:
     def _evaluated(self, x: Tensor):
         problem, rho = self.problem, self.problem.discount
         samples = Samples.of(problem, x, divergences=False)
-        parts = SlackParts.of(samples, *chunked_gradient(self.value, x), problem.control_cost, rho)
+        parts = SlackParts.of(Generator.of(problem, samples), chunked_jet(self.value, x))
         axes = torch.eye(problem.dim, dtype=x.dtype)
         moved, pushed, features = [], [], []
         for part in samples.split(CHUNK):
@@ -61,7 +62,7 @@ class Program:
     def slack(self, c: Tensor) -> Tensor:
         """`Q_W`, ``(N,)``, for ``c`` ``(k,)``."""
         p = self.parts
-        return p.value + self.moved @ c - p.f + p.cost.conjugate(p.push + self.pushed @ c)
+        return hjb_slack(p.value + self.moved @ c, p.f, None, p.cost.conjugate(p.push + self.pushed @ c))
 
     def add(self, x: Tensor) -> None:
         """More states."""

@@ -25,10 +25,10 @@ from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
 from ocp_torch.certificate.simulated.simulation import Dynamics, Integrate, discounted_integral, rate_at, refined
 from ocp_torch.control.policies import Policy, ValuePolicy
-from ocp_torch.maths import calculus
-from ocp_torch.maths.calculus import Field
+from ocp_torch.maths import jets
+from ocp_torch.maths.jets import Field
 from ocp_torch.maths.seeds import Branch, derive_seed
-from ocp_torch.problems import formulas
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.starts import initial_points
@@ -62,7 +62,7 @@ class Simulated:
 def _dynamics(problem: Problem, policy: Policy, value: Field | None) -> Dynamics:
     """The closed loop and what it costs; with ``value`` its slack `-Q_u`, and as one more coordinate `z`, the sum of
     `grad V . g` from `V` at the start on, with `z - V` as a second rate."""
-    cost, rho = problem.control_cost, problem.discount
+    cost = problem.control_cost
 
     def dynamics(state: Tensor) -> tuple[Tensor, Tensor]:
         if value is None:
@@ -70,13 +70,13 @@ def _dynamics(problem: Problem, policy: Policy, value: Field | None) -> Dynamics
             return problem.velocity(state, u), problem.state_cost(state) + cost.cost(u)
         x, summed = state[:, :-1], state[:, -1]
         samples = Samples.of(problem, x, divergences=False)
-        v, gradient = calculus.value_and_gradient(value, x)
+        generator, V = Generator.of(problem, samples), jets.jet(value, x)
         own = isinstance(policy, ValuePolicy) and policy.value is value
-        u = policy.control(samples.B, gradient) if own else policy(x)
+        u = policy.control(samples.B, V) if own else policy(x)
         velocity = samples.a + torch.einsum("ndm,nm->nd", samples.B, u)
-        slack = formulas.bellman_slack(samples, v, gradient, u, cost, rho)
-        change = (gradient * velocity).sum(dim=-1, keepdim=True)
-        return torch.cat([velocity, change], dim=-1), torch.stack([-slack, summed - v], dim=-1)
+        slack = generator.bellman_slack(V, u)
+        change = (V.gradient * velocity).sum(dim=-1, keepdim=True)
+        return torch.cat([velocity, change], dim=-1), torch.stack([-slack, summed - V.value], dim=-1)
 
     return dynamics
 
