@@ -12,8 +12,8 @@ from ocp_torch.problems.checks.functions import Functions
 SOURCES = {"drift_divergence": "drift", "control_divergence": "control_matrix"}
 # States compared, and their branch (see `functions.BRANCH`).
 COMPARED, BRANCH = 24, 7
-# Steps of the differences. Where both agree within the first part of the largest divergence they are believed; a claim that is
-# off by more than the second part there is wrong. Kinks and jumps at a minority of states are forgiven.
+# Steps of the differences. They are believed where both agree within this part of the largest divergence, and a claim that is
+# off by more than that part there is wrong; kinks and jumps at a minority of states are forgiven.
 STEPS, AGREE, WRONG = (1e-3, 2.5e-4), 0.01, 0.1
 # Beyond so many numbers the differences cost too much.
 MOST_NUMBERS = 2**24
