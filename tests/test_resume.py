@@ -189,6 +189,7 @@ def test_sizes_by_dimension_are_those_the_run_began_with(tmp_path, monkeypatch):
     """Defaults may change between two versions; a run does not."""
     import dataclasses
 
+    from ocp_torch.fields import mlp
     from ocp_torch.training import budgets
 
     rest = [o for o in TINY if not o.startswith(("model.width", "trainer.batch"))]
@@ -197,8 +198,9 @@ def test_sizes_by_dimension_are_those_the_run_began_with(tmp_path, monkeypatch):
     run.trainer.fit(Silent(), tmp_path / "run" / "checkpoints" / "last.pt")
     (tmp_path / "run" / ".hydra").mkdir()
     (tmp_path / "run" / ".hydra" / "config.yaml").write_text(yaml.safe_dump(config))
-    others = tuple(dataclasses.replace(b, width=b.width + 8, batch=2 * b.batch) for b in budgets.BUDGETS)
+    others = tuple(dataclasses.replace(b, batch=2 * b.batch) for b in budgets.BUDGETS)
     monkeypatch.setattr(budgets, "BUDGETS", others)
+    monkeypatch.setattr(mlp, "SIZES", {dim: {**sizes, "width": sizes["width"] + 8} for dim, sizes in mlp.SIZES.items()})
     trainer = resuming(tmp_path / "run")
     assert trainer.config == run.trainer.config
 

@@ -48,14 +48,16 @@ def test_the_weight_of_the_slack_grows_along_a_round():
 
 
 def test_default_sizes_follow():
-    defaults = lambda problem: fill({"model": {}, "trainer": {}, "optimizer": {}, "certificate": {}}, problem)
+    defaults = lambda problem: fill(
+        {"model": {"name": "mlp"}, "trainer": {}, "optimizer": {}, "certificate": {}}, problem
+    )
     bounded, unbounded = defaults(Torus(2)), defaults(Arm())
     assert unbounded["trainer"]["batch"] > bounded["trainer"]["batch"]
     assert unbounded["model"]["waves"] > bounded["model"]["waves"]
 
 
 def test_the_larger_batch_is_not_for_the_density_player_unless_the_user_chose_it():
-    config = {"model": {}, "optimizer": {}, "certificate": {}, "method": {"name": "pd"}}
+    config = {"model": {"name": "mlp"}, "optimizer": {}, "certificate": {}, "method": {"name": "pd"}}
     given = lambda problem, trainer: fill({**config, "trainer": trainer}, problem)["method"].get("density_batch")
     assert given(Arm(), {}) == DENSITY_BATCH
     assert given(Arm(), {"batch": 4096}) is None
