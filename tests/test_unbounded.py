@@ -9,7 +9,7 @@ import pytest
 import zoo
 from ocp_torch.fields import VALUE, Fields, PeriodicMLP
 from ocp_torch.maths import calculus
-from ocp_torch.objectives import Dual
+from ocp_torch.objectives import Dual, Phase
 from ocp_torch.problems import Arm, Circle, Torus, formulas
 from ocp_torch.problems.constants import OCCUPATION_WEIGHT, resolve_constants
 from ocp_torch.problems.samples import Samples
@@ -36,10 +36,10 @@ def test_the_weight_of_the_slack_grows_along_a_round():
     violation, started = float(slack.clamp_min(0.0).mean()), float((value * samples.mu0).mean())
     weights = {}
     for unbounded in (True, False):
-        objective = Dual(problem, replace(constants, unbounded=unbounded), residual=0.0)
+        objective = Dual(problem, residual=0.0)
         for progress in (0.0, 0.35, 0.7, 1.0):
-            objective.progress = progress
-            loss = float(objective.losses(fields, samples)["value"])
+            phase = Phase(replace(constants, unbounded=unbounded), progress)
+            loss = float(objective.losses(fields, samples, phase)["value"])
             weights[unbounded, progress] = (loss + started) / violation
     M = constants.M
     for progress, expected in ((0.0, M / 20.0), (0.35, M / math.sqrt(20.0)), (0.7, M), (1.0, M)):

@@ -12,8 +12,8 @@ from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fiel
 from ocp_torch.maths import calculus
 from ocp_torch.objectives.dual import value_loss
 from ocp_torch.objectives.objective import NETWORK, SADDLE, Objective
+from ocp_torch.objectives.phase import Phase
 from ocp_torch.problems import formulas
-from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -29,20 +29,20 @@ class Saddle(Objective):
     players = {"value": (VALUE,), "density": (CONTROL_DENSITY,)}
     occupation = SADDLE
 
-    def __init__(self, problem: Problem, constants: Constants, augmentation: float = 0.0) -> None:
-        super().__init__(problem, constants)
+    def __init__(self, problem: Problem, augmentation: float = 0.0, notes: tuple[str, ...] = ()) -> None:
+        super().__init__(problem, notes)
         self.augmentation = augmentation
 
-    def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
+    def losses(self, fields: Fields, samples: Samples, phase: Phase) -> dict[str, Tensor]:
         value, gradient = calculus.value_and_gradient(fields.value, samples.x)
-        w = self.cost.within(fields.control_density(samples.x), self.constants.M)
+        w = self.cost.within(fields.control_density(samples.x), phase.constants.M)
         pushed = (formulas.pull_back(samples, gradient) * w).sum(dim=-1) / self.rho
         beta = samples.f - value + formulas.along(samples, gradient) / self.rho
-        psi = samples.mean(value * samples.mu0 + pushed + self.cost.saddle_minimum(w, beta, self.constants.M))
+        psi = samples.mean(value * samples.mu0 + pushed + self.cost.saddle_minimum(w, beta, phase.constants.M))
         if self.augmentation == 0.0:
             return {"value": -psi, "density": psi}
         slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
-        own = value_loss(self, fields, samples, value, slack, residual=0.0)
+        own = value_loss(phase, fields, samples, value, slack, residual=0.0)
         return {"value": -psi + self.augmentation * own, "density": psi}
 
 
@@ -61,9 +61,10 @@ class AugmentedSaddle(Objective):
     Why each change: the penalties are not linear along the flat directions of `L`, and damp the rotation of the plain
     game. Against a `V` that is no subsolution yet, `L` is unbounded below in `mu`; `max(l, 0)` is not. With `c = 0` the
     value player ignores a density player that has not arrived yet (the game is then a dual ascent with a best response),
-    and nothing is lost at the equilibrium, where `L` is flat in `V`. With ``warm_start`` and `c = 0` the density player
-    even rests for that part of the run: what it would answer to is not there yet. Then it also learns from ``density_batch``
-    states of each batch at most, of those that carry weight (`m` tangents through `w` make its states expensive).
+    and nothing is lost at the equilibrium, where `L` is flat in `V`. With `c = 0` the density player even waits for the
+    part ``warm_start`` of each round before it moves: what it would answer to is not there yet. It then learns from
+    ``density_batch`` states of each batch at most, of those that carry weight: derivatives of each of the `m` entries of `w`
+    make its states expensive.
 
     Convexity: `l` is a perspective plus linear terms, so `max(l, 0)` and `J` are convex in `(w, mu)`, and `c L + k F_M` is
     concave in `V`. For `c = 1` and where `l >= 0` the operator of the game is that of `L`, which is monotone, plus
@@ -76,29 +77,27 @@ class AugmentedSaddle(Objective):
     def __init__(
         self,
         problem: Problem,
-        constants: Constants,
         augmentation: float,
         coupling: float,
         residual: float,
         warm_start: float,
         density_batch: int | None,
     ) -> None:
-        super().__init__(problem, constants)
+        super().__init__(problem)
         self.augmentation, self.coupling, self.residual = augmentation, coupling, residual
         self.density_batch = density_batch
-        self.resting = {"density": warm_start if coupling == 0.0 else 0.0}
+        self.delays = {"density": warm_start if coupling == 0.0 else 0.0}
 
-    @property
-    def needs_divergences(self) -> bool:
+    def needs_divergences(self, phase: Phase) -> bool:
         """Only once the density player moves."""
-        return self.progress >= self.resting["density"]
+        return phase.progress >= self.delays["density"]
 
-    def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        k, C_V = self.augmentation, self.constants.C_V
+    def losses(self, fields: Fields, samples: Samples, phase: Phase) -> dict[str, Tensor]:
+        k, C_V = self.augmentation, phase.constants.C_V
         value, gradient = calculus.value_and_gradient(fields.value, samples.x)
         slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
-        of_value = k * value_loss(self, fields, samples, value, slack, self.residual)
-        if not self.needs_divergences:
+        of_value = k * value_loss(phase, fields, samples, value, slack, self.residual)
+        if not self.needs_divergences(phase):
             return {"value": of_value}
         if self.coupling == 0.0:
             samples, rows = samples.take_weighted(self.density_batch)
@@ -117,7 +116,6 @@ class AugmentedSaddle(Objective):
 
 def saddle(
     problem: Problem,
-    constants: Constants,
     augmentation: float = 0.25,
     coupling: float = 0.0,
     residual: float = 0.3,
@@ -136,9 +134,8 @@ def saddle(
     residual = require_number("method.residual", residual, at_least=0.0)
     warm_start = require_number("method.warm_start", warm_start, at_least=0.0, at_most=1.0)
     if weight == 0.0:
-        return Saddle(problem, constants)
+        return Saddle(problem)
     if problem.gives_divergences:
-        return AugmentedSaddle(problem, constants, weight, coupling, residual, warm_start, density_batch)
-    objective = Saddle(problem, constants, weight)
-    objective.notes = ("this problem gives no divergences of a and B: pd trains w alone, with mu in closed form.",)
-    return objective
+        return AugmentedSaddle(problem, weight, coupling, residual, warm_start, density_batch)
+    note = "this problem gives no divergences of a and B: pd trains w alone, with mu in closed form."
+    return Saddle(problem, weight, notes=(note,))
