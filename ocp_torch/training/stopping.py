@@ -9,8 +9,8 @@ from ocp_torch.training.state import TrainState
 
 STEPS, TARGET_GAP, MAX_SECONDS = "steps", "target_gap", "max_seconds"
 NOT_FINITE, FAILED = "not_finite", "failed"
-# After a certificate that did not reach the target gap, the next is tried at so many times the step: the effort for all of
-# them is then a fixed part of the run's, and the last comes at most a quarter too late.
+# After a certificate that did not reach the target gap, the next is tried at so many times the step: there are then few of
+# them, also in a long run, and it stops at most a quarter later than it could.
 RETRY = 1.25
 
 
