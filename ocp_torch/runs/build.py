@@ -36,7 +36,9 @@ from ocp_torch.runs.process import prepare
 from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.budgets import fill
+from ocp_torch.training.health import Health
 from ocp_torch.training.settings import TrainerSettings
+from ocp_torch.training.state import TrainState
 from ocp_torch.training.trainer import Trainer
 
 # Numbers that a step keeps per unit of a network and state: 6 to 10 were measured, in one and in four dimensions.
@@ -94,7 +96,7 @@ def build_trainer(config: dict) -> Trainer:
     method = require_section("method", config["method"])
     name = require_choice("method.name", method.pop("name", None), METHODS)
     constants = resolve_constants(problem, **{field: method.pop(field, None) for field in BOUND_FIELDS})
-    objective = call(METHODS[name], "method", method, problem=problem, constants=constants)
+    objective = call(METHODS[name], "method", method, problem=problem)
     if settings.target_gap is not None and VALUE not in objective.fields:
         raise InputError(
             f"trainer.target_gap is {settings.target_gap:g}, but {name} gives no lower bound to measure a gap by; "
@@ -118,9 +120,8 @@ def build_trainer(config: dict) -> Trainer:
         sampler = RowSampler(problem.rows, seed, problem.recording.digest)
     batches = Batches(problem, fields, objective, sampler, settings.batch, seed, visited)
     names = (problem_name(problem), name)
-    return Trainer(
-        problem, fields, objective, constants, stepper, average, batches, settings, network, seed, names, config
-    )
+    state = TrainState(names, config, fields, average, stepper, batches, Health.of(problem), constants)
+    return Trainer(problem, objective, settings, network, seed, state)
 
 
 def _bytes_per_state(problem: Problem, fields: Fields, settings: TrainerSettings) -> float:

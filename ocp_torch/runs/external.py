@@ -21,14 +21,14 @@ from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import SAMPLERS, scrambled_sobol
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import batched
-from ocp_torch.objectives import Dual
+from ocp_torch.objectives import Dual, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.runs import figures
 from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem
 from ocp_torch.runs.loading import load_policy, load_saved
 from ocp_torch.runs.process import prepare
-from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
+from ocp_torch.steppers import advance, short_fit
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.budgets import fill
 
@@ -87,15 +87,12 @@ def train_value(
 ) -> Fields:
     """A `V` by the dual, with the defaults of a run."""
     fields = Fields.build(problem, (VALUE,), network, derive_seed(seed, Branch.EXTERNAL_VALUE, 0))
-    objective = Dual(problem, constants)
+    objective = Dual(problem)
     states = SAMPLERS[sampler](problem.dim, derive_seed(seed, Branch.EXTERNAL_VALUE, 1), torch.float32)
     batches = Batches(problem, fields, objective, states, batch, derive_seed(seed, Branch.EXTERNAL_VALUE, 2))
-    makers = {player: optimizer_maker("soap", lr, betas=(0.95, 0.95)) for player in objective.players}
-    stepper = Simultaneous(fields, objective, makers, schedule_maker("cosine", steps), unit=cost_unit(problem))
-    average = averaged(fields, decay=0.98)
+    stepper, average = short_fit(fields, objective, lr, steps, cost_unit(problem))
     for step in range(steps):
-        objective.progress = step / steps
-        stepper.step(batches.draw, lambda: average.update_parameters(fields))
+        advance(stepper, average, batches.draw, Phase(constants, step / steps))
     return average.module
 
 

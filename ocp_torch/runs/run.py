@@ -27,7 +27,8 @@ from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.health import sanity_warnings
 from ocp_torch.training.monitor import Monitor
 from ocp_torch.training.signals import Signals
-from ocp_torch.training.trainer import FAILED, NOT_FINITE, TARGET_GAP, Trainer
+from ocp_torch.training.stopping import FAILED, NOT_FINITE, TARGET_GAP, postpone
+from ocp_torch.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
 
@@ -97,13 +98,13 @@ def _train(
         signals.saved = True  # from here on a signal need not wait
         signals.take()
         monitor.stopped(trainer, f"Training stopped: {trainer.why_stopped}", settings)
-        fields, note = trainer.choose()
+        fields, note = trainer.evaluator.choose(trainer.run)
         certificate = trainer.certify(settings, fields)
         gap = certificate.gap["certified"]
         if reason != TARGET_GAP or (gap is not None and gap <= target):
             return with_warnings(trainer, certificate, [note] if note else []), fields
         log.info("step %d: the certified gap is not %g yet; training goes on.", trainer.step, target)
-        trainer.go_on()
+        postpone(trainer.state)
 
 
 def _failure(trainer: Trainer, error: BaseException) -> str | None:
@@ -142,7 +143,7 @@ def _salvage(
     best, seen = trainer.health.best, trainer.health.certificate
     if best is None and trainer.step == 0:
         raise InputError(failure)
-    fields = trainer.averaged_fields if best is None else trainer.best_fields()
+    fields = trainer.averaged_fields if best is None else trainer.evaluator.best_fields()
     step = trainer.step if best is None else best.step
     notes = [f"handed out are the averaged fields of step {step}. {failure}"]
     monitor.stopped(trainer, failure, settings)

@@ -18,7 +18,6 @@ from ocp_torch.objectives import primal, saddle
 from ocp_torch.objectives.saddle import Saddle
 from ocp_torch.problems import Simulator
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.resume import OWN_TARGETS
 from support import zoo
@@ -242,8 +241,7 @@ def test_worker_processes_give_the_same_numbers(module, name):
 
 def test_methods_fall_back_without_divergences():
     _, bare = wrapped("swing")
-    constants = resolve_constants(bare)
-    assert type(saddle(bare, constants)) is type(primal(bare, constants)) is Saddle
+    assert type(saddle(bare)) is type(primal(bare)) is Saddle
 
 
 @pytest.mark.nightly

@@ -313,9 +313,8 @@ def test_nothing_is_claimed_that_samples_do_not_give(tmp_path):
         bare.control_matrix(torch.rand(2, 2))
     with pytest.raises(InputError, match="recorded states only"):
         bare.state_cost(torch.rand(2, 2))
-    constants = resolve_constants(bare)
-    assert {type(Dual(bare, constants)).__name__, type(saddle(bare, constants)).__name__} == {"Dual", "Saddle"}
-    assert type(primal(bare, constants)).__name__ == "Saddle"
+    assert {type(Dual(bare)).__name__, type(saddle(bare)).__name__} == {"Dual", "Saddle"}
+    assert type(primal(bare)).__name__ == "Saddle"
     certificate = certificate_of(bare, problem, 0, steps=3)
     assert certificate.upper["J"] is certificate.subject is None
     assert any("B varies" in w for w in certificate.warnings)
@@ -332,9 +331,9 @@ def test_a_torus_recorded_without_divergences_has_them_all_the_same(tmp_path):
     data = Dataset(str(record(tmp_path, zoo.build("torus 2-d chain"), 400, divergences=False)))
     assert data.driftless
     assert data.gives_divergences
-    assert primal(data, resolve_constants(data)).occupation == NETWORK
+    assert primal(data).occupation == NETWORK
     with pytest.raises(InputError, match=r"method\.occupation"):
-        primal(data, resolve_constants(data), occupation="closed")
+        primal(data, occupation="closed")
 
 
 @pytest.mark.parametrize(("discount", "bounded"), [(4.0, True), (0.5, False)])

@@ -16,8 +16,8 @@ from ocp_torch.runs.build import build_trainer
 from ocp_torch.runs.resume import find_run, saved_configuration
 from ocp_torch.runs.start import prepare
 from ocp_torch.runs.start import train as start
-from ocp_torch.training import trainer as trainer_module
 from ocp_torch.training.checkpoint import load_checkpoint, save_checkpoint
+from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.monitor import Silent
 from support.bits import differences
 from support.forked import TINY, train
@@ -67,7 +67,7 @@ def test_from_any_step_a_resumed_run_reaches_the_same_bits(way, tmp_path):
 
 
 def test_the_looks_so_far_are_part_of_the_state(monkeypatch, tmp_path):
-    monkeypatch.setattr(trainer_module.Trainer, "look", quick(lambda t: abs(t.step - 10.0) / 100.0))
+    monkeypatch.setattr(Evaluator, "evaluate", quick(lambda t: abs(t.step - 10.0) / 100.0))
     way = ("method=dual", "trainer.evaluate_every=4")
     whole = small(*way)
     whole.fit(Recorder(tmp_path, 6, 13), tmp_path / "run" / "last.pt")
@@ -102,7 +102,7 @@ def test_with_other_steps_a_run_is_one_of_the_new_length(method, schedule, tmp_p
     """Learning rates and the warm start are, at every step, those of a run that had that length from the start."""
     way = (f"method={method}", f"schedule={schedule}", *(["schedule.every=3"] if schedule == "decay" else []))
     rates = lambda seen: type("Rates", (Silent,), {"stepped": lambda _, t, r, log: seen.__setitem__(t.step, told(t))})()
-    told = lambda t: (t.stepper.learning_rates(), t.objective.needs_divergences)
+    told = lambda t: (t.stepper.learning_rates(), t.objective.needs_divergences(t.phase))
     made = maker(*way)
     made(steps=10).fit(Recorder(tmp_path, 8, 10))
     wanted = {steps: {} for steps in (24, 9, 6)}
@@ -122,12 +122,12 @@ def test_with_other_steps_a_run_is_one_of_the_new_length(method, schedule, tmp_p
 def test_the_round_follows_the_new_length(tmp_path):
     made = maker("method=dual")
     trainer = made(rounds=2, steps=4)
-    trainer.round, trainer.step = 1, 10
+    trainer.state.round, trainer.state.step = 1, 10
     save_checkpoint(tmp_path / "a.pt", trainer.state_dict())
     for steps, rounds, wanted in ((4, 2, 1), (5, 2, 1), (20, 2, 0), (3, 3, 2), (2, 1, 0)):
         other = made(rounds=rounds, steps=steps)
         other.resume(tmp_path / "a.pt")
-        assert other.round == wanted
+        assert other.state.round == wanted
 
 
 def test_an_optimisers_settings_can_change_at_a_resume_and_its_moments_stay(tmp_path):
@@ -189,6 +189,7 @@ def test_sizes_by_dimension_are_those_the_run_began_with(tmp_path, monkeypatch):
     """Defaults may change between two versions; a run does not."""
     import dataclasses
 
+    from ocp_torch.fields import mlp
     from ocp_torch.training import budgets
 
     rest = [o for o in TINY if not o.startswith(("model.width", "trainer.batch"))]
@@ -197,8 +198,9 @@ def test_sizes_by_dimension_are_those_the_run_began_with(tmp_path, monkeypatch):
     run.trainer.fit(Silent(), tmp_path / "run" / "checkpoints" / "last.pt")
     (tmp_path / "run" / ".hydra").mkdir()
     (tmp_path / "run" / ".hydra" / "config.yaml").write_text(yaml.safe_dump(config))
-    others = tuple(dataclasses.replace(b, width=b.width + 8, batch=2 * b.batch) for b in budgets.BUDGETS)
+    others = tuple(dataclasses.replace(b, batch=2 * b.batch) for b in budgets.BUDGETS)
     monkeypatch.setattr(budgets, "BUDGETS", others)
+    monkeypatch.setattr(mlp, "SIZES", {dim: {**sizes, "width": sizes["width"] + 8} for dim, sizes in mlp.SIZES.items()})
     trainer = resuming(tmp_path / "run")
     assert trainer.config == run.trainer.config
 

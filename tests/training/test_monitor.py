@@ -27,7 +27,7 @@ def test_the_game_is_shown_at_every_phase(way, tmp_path):
     events.Reload()
     shown = {tag: [e.step for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
     for player in trainer.objective.players:
-        moves = [s for s in (5, 10, 15, 20) if s > 20 * trainer.objective.resting.get(player, 0.0)]
+        moves = [s for s in (5, 10, 15, 20) if s > 20 * trainer.objective.delays.get(player, 0.0)]
         assert shown[f"loss/{player}"] == shown[f"gradient_norm/{player}"] == moves
     if trainer.fields.value is not None:
         assert shown["violation/slack_mean_positive"] == shown["violation/slack_maximum"] == [5, 10, 15, 20]
