@@ -8,8 +8,8 @@ import torch
 from ocp_torch.control.controller import load_controller
 from ocp_torch.maths.sampling import derive_seed
 from ocp_torch.runs.evaluate import policy_of
-from ocp_torch.runs.metrics import METRICS, STREAM
-from ocp_torch.runs.practice import metrics
+from ocp_torch.runs.metrics import metrics
+from ocp_torch.runs.metrics.writing import METRICS, STREAM
 from test_training import session, small
 
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
