@@ -24,8 +24,8 @@ REACH, DAMPING = 1.5, 0.1
 DRIVE, STEER = 1.0, 2.0
 # Oscillators: the gain of descent.
 DESCENT = 2.0
-# Pendulum: the gain of the pump; those of the balance, on angle (1/s^2) and velocity (1/s); and the angle in rad and the speed
-# in rad/s below which it balances.
+# Pendulum: the gain of the pump; those of the balance, on angle (1/s^2) and velocity (1/s); and angle in rad and speed in
+# rad/s below which it balances.
 PUMP, BALANCE, CATCH = 0.2, (20.0, 5.0), (0.5, 2.0)
 
 
