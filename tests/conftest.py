@@ -6,8 +6,8 @@ import pytest
 import torch
 from hypothesis import Phase, settings
 
-import zoo
-from composing import quickly
+from support import zoo
+from support.composing import quickly
 
 # The same examples on every run: a failure is then a change in the code, never luck. No shrinking: most examples are
 # seeds of networks, and a smaller seed is not a simpler network.

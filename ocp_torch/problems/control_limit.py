@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import require_number
-from ocp_torch.maths.calculus import Field
+from ocp_torch.maths.jets import Field
 from ocp_torch.problems.control_cost import PowerCost, norm_power
 
 # How far, relative to the limit, rounding may carry a control beyond it.

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError, require_integer, require_number
-from ocp_torch.maths import calculus
+from ocp_torch.maths import jets
 from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.control_limit import control_cost
 from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.samples import Samples
@@ -107,7 +108,7 @@ class Problem:
         """`div a`, ``(N,)``: by autograd through `drift`. Override where it is known, or give `None`."""
         if self.driftless:
             return torch.zeros_like(x[:, 0])
-        return calculus.divergence(self.drift, x)
+        return jets.divergence(self.drift, x)
 
     def control_divergence(self, x: Tensor) -> Tensor | None:
         """The divergence of each column of `B`, ``(N, m)``; by forward-mode autograd unless `B` is constant."""
@@ -153,7 +154,7 @@ class Problem:
     def independent_samples(self, count: int) -> Samples:
         """Data at independent draws of states, at most ``count``, the same ones always: evenly spread states show waves
         that are not there."""
-        x = torch.rand(count, self.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        x = torch.rand(count, self.dim, dtype=torch.float64, generator=fixed_generator())
         return Samples.of(self, x, divergences=False)
 
     @property

@@ -13,6 +13,8 @@ from ocp_torch.certificate.proof.enclosures import conjugate_model, enclosure
 from ocp_torch.certificate.proof.network_model import network_model
 from ocp_torch.certificate.proof.taylor import TaylorModel
 from ocp_torch.fields.mlp import PeriodicMLP
+from ocp_torch.maths.jets import Jet
+from ocp_torch.problems.generator import Generator, hjb_slack
 from ocp_torch.problems.problem import Problem
 
 # Degree of the models, by dimension: with a higher one fewer cells are needed, and each takes longer.
@@ -28,14 +30,10 @@ LONGEST = 4.5
 @torch.no_grad()
 def cell_models(problem: Problem, value: PeriodicMLP, theta: float, box: Box) -> tuple[TaylorModel, TaylorModel]:
     """`Q` and `W mu0` for `W = theta V`, both ``(N,)``, over ``box``."""
-    data, rho = enclosure(problem, box), problem.discount
-    V, gradient = network_model(value, box)
-    V, gradient = V * theta, gradient * theta
-    pushed = (data.B * gradient[:, None]).sum(dim=-2) * (-1.0 / rho)
-    Q = V - data.f + conjugate_model(problem.control_cost, pushed)
-    if data.a is not None:
-        Q = Q - (gradient * data.a).sum() * (1.0 / rho)
-    return Q, V * data.mu0
+    data = enclosure(problem, box)
+    generator, V = Generator(data, problem.discount), Jet(*network_model(value, box)).map(lambda part: part * theta)
+    conjugate = conjugate_model(problem.control_cost, generator.push(V))
+    return hjb_slack(V.value, data.f, generator.transport(V), conjugate), V.value * data.mu0
 
 
 @dataclass

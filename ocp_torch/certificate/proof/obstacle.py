@@ -9,6 +9,7 @@ from ocp_torch.certificate.proof.box import Box, equal_cells
 from ocp_torch.certificate.proof.cover import DEGREE
 from ocp_torch.certificate.proof.enclosures import conjugate_model, contradiction, enclosure
 from ocp_torch.certificate.proof.network_model import is_known
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.problem import Problem
 
 # The number of cells that a tolerance takes grows exponentially with the dimension.
@@ -31,7 +32,7 @@ def obstacle(problem: Problem, value: nn.Module) -> str | None:
         return "V is not in float64 on the CPU"
     if not enclosure.holds_for(problem) or not conjugate_model.holds_for(problem.control_cost):
         return "the problem's class changes its data, but not the enclosure it inherits"
-    generator = torch.Generator().manual_seed(0)
+    generator = fixed_generator()
     box = equal_cells(problem.dim, SPOT_CELLS, DEGREE[problem.dim])
     if enclosure(problem, box) is None:
         return "the problem gives neither an enclosure of its data nor their Lipschitz constants (lipschitz)"

@@ -88,6 +88,9 @@ class TaylorModel:
         radius = self.radius * (its_size + other.radius) + size * other.radius + cut
         return self._with(product, radius, size * its_size)
 
+    def __truediv__(self, other: float) -> TaylorModel:
+        return self * (1.0 / other)
+
     def reshape(self, *shape: int) -> TaylorModel:
         """The axes after the cells in another shape."""
         K, N = self.coefficients.shape[:2]

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import ProblemError
-from ocp_torch.maths.sampling import derive_seed, scrambled_sobol
+from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import Branch, derive_seed, fixed_generator
 from ocp_torch.problems.checks.functions import Functions
 from ocp_torch.problems.problem import Problem
 
@@ -29,8 +30,6 @@ LOOKS, PEAKS, EVEN = 4, 8, 0.3
 CLIMB, STEP, STEPS, GROWTH, DECAY = 120, 0.05, (1e-9, 0.3), 2.0, 0.8
 # Half-widths of a peak that are told apart: 2^-1 to 2^-NARROWEST. From BROAD on, a peak counts as flat along a coordinate.
 NARROWEST, BROAD = 30, 0.5
-# Branch of the seed tree.
-MASS_STREAM = 12
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def sampled_mass(density: Density, dim: int, count: int) -> Mass:
     From ``REPLICATES * count`` evenly spread states and, where these do not settle it, from as many near its peaks, up to
     `LOOKS` times: importance sampling from a mixture fitted to the peaks.
     """
-    sets = [scrambled_sobol(count, dim, derive_seed(MASS_STREAM, r), torch.float64) for r in range(REPLICATES)]
+    sets = [scrambled_sobol(count, dim, derive_seed(0, Branch.MASS, r), torch.float64) for r in range(REPLICATES)]
     x = torch.cat(sets)
     share = density(x)  # of the mass, times the number of states
     found, states = _mass(share, count), len(x)
@@ -90,7 +89,7 @@ def sampled_mass(density: Density, dim: int, count: int) -> Mass:
         top, top_widths, top_heights, used = _peaks(density, x, share)
         peaks, widths, heights = (torch.cat(p) for p in ((peaks, top), (widths, top_widths), (heights, top_heights)))
         peaks, widths, heights = _distinct(peaks, widths, heights)
-        generator = torch.Generator().manual_seed(derive_seed(MASS_STREAM, look, REPLICATES))
+        generator = torch.Generator().manual_seed(derive_seed(0, Branch.MASS, REPLICATES, look))
         x = _drawn(peaks, widths, REPLICATES * count, generator)
         share = density(x) / _density(x, peaks, widths)
         states += used + len(x)
@@ -109,7 +108,7 @@ def _peaks(density: Density, x: Tensor, share: Tensor) -> tuple[Tensor, Tensor, 
     and how many states that took."""
     at = x[share.topk(PEAKS).indices].clone()
     height, step = density(at), torch.full((PEAKS, 1), STEP, dtype=torch.float64)
-    generator = torch.Generator().manual_seed(0)
+    generator = fixed_generator()
     for _ in range(CLIMB):
         there = (at + step * torch.randn(at.shape, dtype=torch.float64, generator=generator)).remainder(1.0)
         reached = density(there)

@@ -7,6 +7,7 @@ import math
 import torch
 
 from ocp_torch.errors import ProblemError
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.blame import place
 from ocp_torch.problems.checks.functions import DATA, Functions
 from ocp_torch.problems.checks.purity import SAME
@@ -21,7 +22,7 @@ MOST_SHOWN = 8
 def require_period(functions: Functions) -> None:
     """The same values a few whole periods away, in all coordinates at once."""
     x = functions.exact_states(min(COMPARED, functions.count), BRANCH)
-    whole = torch.randint(LOWEST, HIGHEST + 1, x.shape, generator=torch.Generator().manual_seed(0)).to(x)
+    whole = torch.randint(LOWEST, HIGHEST + 1, x.shape, generator=fixed_generator()).to(x)
     for name in DATA:
         here, there = functions.ask(name, x), functions.ask(name, x + whole)
         change = (here - there).abs().reshape(len(x), -1).amax(dim=-1)

@@ -7,12 +7,10 @@ from dataclasses import replace
 import torch
 
 from ocp_torch.errors import InputError
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.samples import Samples
 
 TRAINING, VALIDATION, HELD_OUT = "training", "validation", "held_out"
-# Branch of the seed tree for the split.
-SPLIT_STREAM = 6
 # The part of what is not held out that evaluations during training are made on.
 VALIDATION_PART = 0.1
 # Fewest samples of a part that anything is estimated from.
@@ -25,7 +23,7 @@ def split(samples: Samples, held_out: float, seed: int) -> dict[str, Samples]:
     Raises `InputError` where a part would be too small.
     """
     count = len(samples)
-    generator = torch.Generator().manual_seed(derive_seed(seed, SPLIT_STREAM))
+    generator = torch.Generator().manual_seed(derive_seed(seed, Branch.DATASET_SPLIT))
     order = torch.randperm(count, generator=generator)
     held = round(held_out * count)
     chosen_by = max(FEWEST, round(VALIDATION_PART * (count - held)))

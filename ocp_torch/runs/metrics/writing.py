@@ -8,19 +8,17 @@ from pathlib import Path
 
 from ocp_torch.control.policies import Policy
 from ocp_torch.files.storage import write_atomically
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem
 from ocp_torch.runs.metrics.trial import metrics, metrics_table
 
 log = logging.getLogger(__name__)
 METRICS = "metrics.json"
-# Branch of the seed tree for the starts.
-STREAM = 8
 
 
 def write_metrics(problem: Problem, policy: Policy, seed: int, folder: Path | None) -> dict | None:
     """Print the numbers of ``policy`` and write them as `metrics.json` in ``folder``, where the problem has any."""
-    found = metrics(problem, policy, derive_seed(seed, STREAM))
+    found = metrics(problem, policy, derive_seed(seed, Branch.METRICS))
     if found is None:
         return None
     log.info("\n%s", metrics_table(found))

@@ -7,7 +7,7 @@ from functools import singledispatch
 from typing import TYPE_CHECKING
 
 from ocp_torch.control.policies import Policy, zero_policy
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 # Time drawn, in units of 1 / rho, and frames of it.
 DURATION, FRAMES = 5.0, 160
-# Branch of the seed tree for the starts.
-STREAM = 7
 # Starts drawn in one panel, of oscillators and of vehicles and pendulums; of arms, one in a panel.
 OSCILLATORS, TRACKS, ARMS = 24, 6, 3
 
@@ -75,7 +73,7 @@ def moving(problem: Problem, policy: Policy, seed: int = 0) -> Moving | None:
     if draw is None:
         return None
     count, apart = starts_drawn(problem)
-    x0 = random_starts(problem, count, derive_seed(seed, STREAM))
+    x0 = random_starts(problem, count, derive_seed(seed, Branch.PICTURES))
     duration = DURATION / problem.discount
     if apart:
         paths = [simulate(problem, policy, x0[i : i + 1], duration, FRAMES) for i in range(count)]
