@@ -19,7 +19,8 @@ from ocp_torch.fields import Fields
 from ocp_torch.files.storage import sweep_temporaries, write_atomically
 from ocp_torch.problems.blame import blamed
 from ocp_torch.runs import closing, figures
-from ocp_torch.runs.metrics import practical_figures, write_metrics
+from ocp_torch.runs.metrics import write_metrics
+from ocp_torch.runs.pictures import practical_figures
 from ocp_torch.steppers import NonFiniteError
 from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM
 from ocp_torch.training.checkpoint import LAST
