@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields, table
+from ocp_torch.certificate import CertificateSettings, Run, Trained, certify_fields, table
 from ocp_torch.certificate.lower.shifted import slack_function
 from ocp_torch.certificate.proof.activations import SERIES
 from ocp_torch.certificate.proof.network_model import SmoothModel, activate, embed, network_model, product
@@ -24,6 +24,7 @@ from ocp_torch.maths.taylor import Box, TaylorModel
 from ocp_torch.problems import Circle, Manufactured, Torus
 from ocp_torch.problems.constants import resolve_constants
 from support import zoo
+from support.honesty import BARE
 
 # Every problem of the zoo in at most two dimensions that encloses its data, and a few odd ones.
 LOW = [n for n in zoo.EXACT if zoo.build(n).dim <= 2]
@@ -416,9 +417,7 @@ def test_declared_lipschitz_constants_are_enough():
 
 
 def certificate_of(problem, V, rigorous):
-    settings = CertificateSettings(
-        points=256, replicates=2, trajectories=0, ascents=4, rigorous=rigorous, stage=StageSettings(steps=0)
-    )
+    settings = replace(BARE, points=256, replicates=2, trajectories=0, rigorous=rigorous)
     trained = Trained(Fields({"value": V.requires_grad_(True)}), None, PeriodicMLP)
     return certify_fields(problem, trained, resolve_constants(problem), settings, Run("test", "dual"))
 
