@@ -6,9 +6,8 @@ from torch import Tensor
 
 from ocp_torch.errors import require_number
 from ocp_torch.fields.fields import VALUE, Fields
-from ocp_torch.maths import calculus
+from ocp_torch.maths import jets
 from ocp_torch.objectives.objective import Objective
-from ocp_torch.problems import formulas
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
@@ -36,9 +35,9 @@ class Dual(Objective):
         self.residual = require_number("method.residual", residual, at_least=0.0)
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        value, gradient = calculus.value_and_gradient(fields.value, samples.x)
-        slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
-        return {"value": value_loss(self, fields, samples, value, slack, self.residual)}
+        V = jets.jet(fields.value, samples.x)
+        slack = self.generator(samples).hjb_slack(V)
+        return {"value": value_loss(self, fields, samples, V.value, slack, self.residual)}
 
 
 def value_loss(

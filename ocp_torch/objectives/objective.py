@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from ocp_torch.fields.fields import Fields
-from ocp_torch.maths import calculus
-from ocp_torch.maths.calculus import Field
-from ocp_torch.problems import formulas
+from ocp_torch.maths import jets
+from ocp_torch.maths.jets import Field
 from ocp_torch.problems.constants import Constants
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -42,6 +42,10 @@ class Objective(ABC):
         """All fields the method trains."""
         return tuple(name for names in self.players.values() for name in names)
 
+    def generator(self, samples: Samples) -> Generator:
+        """`L^u` at ``samples``."""
+        return Generator(samples, self.rho, self.cost)
+
     def admissible(self, fields: Fields) -> Field:
         """`w` within what a limit on the control and the network for `mu` allow."""
         return self.cost.admissible(fields.control_density, lambda x: fields.log_occupation(x).exp())
@@ -54,13 +58,13 @@ class Objective(ABC):
     def diagnostics(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
         """How far the two constraints are violated on ``samples``: the HJB slack and the Liouville residual."""
         shown: dict[str, Tensor] = {}
+        generator = self.generator(samples)
         if fields.value is not None:
-            value, gradient = calculus.value_and_gradient(fields.value, samples.x)
-            slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho).clamp_min(0.0)
+            slack = generator.hjb_slack(jets.jet(fields.value, samples.x)).clamp_min(0.0)
             shown |= {"slack_mean_positive": samples.mean(slack), "slack_maximum": slack.max()}
         given = samples.div_a is not None and samples.div_B is not None
         if given and fields.control_density is not None and fields.log_occupation is not None:
-            _, inflow = formulas.control_inflow(samples, self.admissible(fields), self.rho)
-            _, loss = formulas.occupation_outflow(samples, fields.log_occupation, self.rho)
-            shown["residual_mean_absolute"] = samples.mean((inflow - loss).abs())
+            _, inflow = generator.control_inflow(self.admissible(fields))
+            _, outflow = generator.occupation_outflow(fields.log_occupation)
+            shown["residual_mean_absolute"] = samples.mean((inflow - outflow).abs())
         return shown

@@ -6,9 +6,8 @@ import torch
 from torch import Tensor
 
 from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
-from ocp_torch.maths import calculus
+from ocp_torch.maths import jets
 from ocp_torch.objectives.objective import Objective
-from ocp_torch.problems import formulas
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.samples import Samples
@@ -31,11 +30,11 @@ class PolicyEvaluation(Objective):
         self.players = {"occupation": (LOG_OCCUPATION,)} | ({"value": (VALUE,)} if with_value else {})
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        _, loss = formulas.occupation_outflow(samples, fields.log_occupation, self.rho)
-        r = samples.mu0 - loss
+        generator = self.generator(samples)
+        _, outflow = generator.occupation_outflow(fields.log_occupation)
+        r = samples.mu0 - outflow
         losses = {"occupation": samples.mean(torch.where(r > 0.0, self.price, 1.0) * r.square())}
         if "value" in self.players:
-            value, gradient = calculus.value_and_gradient(fields.value, samples.x)
-            slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
+            slack = generator.hjb_slack(jets.jet(fields.value, samples.x))
             losses["value"] = samples.mean((slack / getattr(fields.value, "scale", 1.0)).square())
         return losses

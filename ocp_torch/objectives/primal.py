@@ -8,7 +8,6 @@ from ocp_torch.errors import InputError, require_choice
 from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, Fields
 from ocp_torch.objectives.objective import CLOSED, NETWORK, Objective
 from ocp_torch.objectives.saddle import Saddle
-from ocp_torch.problems import formulas
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
@@ -22,7 +21,7 @@ class ClosedPrimal(Objective):
     occupation = CLOSED
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        w, inflow = formulas.control_inflow(samples, fields.control_density, self.rho)
+        w, inflow = self.generator(samples).control_inflow(fields.control_density)
         return {"density": samples.mean(self.cost.primal_minimum(w, samples.f, self.constants.C_V, inflow))}
 
 
@@ -34,13 +33,10 @@ class NetworkPrimal(Objective):
     occupation = NETWORK
 
     def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        w, inflow = formulas.control_inflow(samples, self.admissible(fields), self.rho)
-        mu, loss = formulas.occupation_outflow(samples, fields.log_occupation, self.rho)
-        return {
-            "density": samples.mean(
-                formulas.primal_integrand(samples, w, mu, inflow - loss, self.cost, self.constants.C_V)
-            )
-        }
+        generator = self.generator(samples)
+        w, inflow = generator.control_inflow(self.admissible(fields))
+        mu, outflow = generator.occupation_outflow(fields.log_occupation)
+        return {"density": samples.mean(generator.primal_integrand(w, mu, inflow - outflow, self.constants.C_V))}
 
 
 def primal(problem: Problem, constants: Constants, occupation: str = "auto") -> Objective:

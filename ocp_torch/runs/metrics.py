@@ -9,7 +9,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from ocp_torch.files.storage import write_atomically
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem
 from ocp_torch.runs.pictures import motion
 from ocp_torch.runs.practice import metrics, metrics_table
@@ -17,13 +17,11 @@ from ocp_torch.runs.practice.paths import Law
 
 log = logging.getLogger(__name__)
 METRICS = "metrics.json"
-# Branch of the seeds of practical starts.
-STREAM = 8
 
 
 def write_metrics(problem: Problem, policy: Law, seed: int, folder: Path | None) -> dict | None:
     """Print the numbers of ``policy`` and write them as `metrics.json` in ``folder``, where the problem has any."""
-    found = metrics(problem, policy, derive_seed(seed, STREAM))
+    found = metrics(problem, policy, derive_seed(seed, Branch.METRICS))
     if found is None:
         return None
     log.info("\n%s", metrics_table(found))

@@ -10,12 +10,11 @@ from torch import Tensor
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.errors import InputError, require_number
 from ocp_torch.fields import VALUE, Fields
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives import Objective
 from ocp_torch.problems import Problem
 from ocp_torch.problems.samples import Samples
 
-VISITS_STREAM = 9
 # The part of a batch that is visited states, where no `M` is known and nobody said otherwise.
 VISITED = 0.25
 # At least a tenth of a batch is for the integrals.
@@ -59,7 +58,7 @@ class Batches:
                 else "this method has no V to follow"
             )
             raise InputError(f"sampler.visited is {visited:g}, but {lacks}; leave it out.")
-        self.generator = torch.Generator().manual_seed(derive_seed(seed, VISITS_STREAM))
+        self.generator = torch.Generator().manual_seed(derive_seed(seed, Branch.VISITS))
         self.states: Tensor | None = None  # (k, d), where the visitors are
 
     def draw(self) -> Samples:

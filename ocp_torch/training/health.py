@@ -10,14 +10,14 @@ from torch import Tensor
 
 from ocp_torch.certificate import Certificate
 from ocp_torch.errors import notes
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
 
 # A run whose weights or losses have grown by so much since it began is not coming back.
 GROWN_WEIGHTS, GROWN_LOSS = 100.0, 1e4
 # States on which the bound of the best constant V is computed.
-CONSTANT_STATES, CONSTANT_STREAM = 2**13, 7
+CONSTANT_STATES = 2**13
 CONTRADICTED = "bounds contradicted each other at step"
 # A lower bound that falls short of it by less is as good: networks round, and both are sampled.
 ROUNDING = 1e-4
@@ -136,6 +136,6 @@ def sanity_warnings(problem: Problem, constants: Constants, certificate: Certifi
 @torch.no_grad()
 def best_constant(problem: Problem, constants: Constants, seed: int) -> float:
     """`max_c F_M(c) = max_c c - M E[(c - f)_+]` over constants `c`, reached at the `1 / M` quantile of `f`."""
-    f, weight = problem.probe(CONSTANT_STATES, derive_seed(seed, CONSTANT_STREAM), "f", "weight")
+    f, weight = problem.probe(CONSTANT_STATES, derive_seed(seed, Branch.BEST_CONSTANT), "f", "weight")
     c = torch.quantile(f, min(1.0, 1.0 / constants.M))  # any c gives a lower bound: that of unweighted states will do
     return float(c - constants.M * (weight * (c - f).clamp_min(0.0)).mean())

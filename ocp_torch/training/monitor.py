@@ -14,8 +14,7 @@ from tqdm import tqdm
 
 from ocp_torch.certificate import Certificate, CertificateSettings
 from ocp_torch.control.policies import admissible_density, occupation_density
-from ocp_torch.maths import calculus
-from ocp_torch.problems import formulas
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import StepReport
 from ocp_torch.training.stages import Stages, in_words, rough_seconds
@@ -29,19 +28,20 @@ EVENTS = "events.out.tfevents."
 def liouville_residual(trainer, batch: Samples) -> dict[str, Tensor]:
     """`mean |mu0 - mu - div(a mu + B w) / rho|` on ``batch``, whatever gives `mu`: also where the loss needs no divergences
     (a player that rests, the plain saddle) or `mu` is in closed form. Nothing where the problem gives no divergences."""
-    problem, fields, rho = trainer.problem, trainer.fields, trainer.problem.discount
+    problem, fields = trainer.problem, trainer.fields
     samples = Samples.of(problem, batch.x) if problem.has_simulator else batch
     if samples.div_a is None or samples.div_B is None:
         return {}
     form = (trainer.objective.occupation, problem, fields, trainer.constants)
-    _, inflow = formulas.control_inflow(samples, admissible_density(*form), rho)
+    generator = Generator.of(problem, samples)
+    _, inflow = generator.control_inflow(admissible_density(*form))
     density = occupation_density(*form)
     if problem.driftless:
-        loss = density(samples.x)
+        outflow = density(samples.x)
     else:
-        mu, derivative = calculus.directional_derivative(density, samples.x, samples.a)
-        loss = mu + (mu * samples.div_a + derivative) / rho
-    return {"residual_mean_absolute": samples.mean((inflow - loss).abs())}
+        mu, drifted = generator.drift_flux_divergence(density)
+        outflow = mu + drifted / problem.discount
+    return {"residual_mean_absolute": samples.mean((inflow - outflow).abs())}
 
 
 class Silent:

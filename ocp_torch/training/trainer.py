@@ -23,7 +23,7 @@ from ocp_torch.certificate.progress import Progress, silent
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.fields.fields import typical_sizes
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives import Objective
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import blamed
@@ -48,8 +48,6 @@ QUICK = CertificateSettings(
     stage=StageSettings(steps=0),
 )
 SEARCHED = replace(QUICK, mollify=None)
-# Looks choose between fields; on a branch of states of their own they cannot flatter the certificate of their choice.
-LOOK_STREAM = 5
 STEPS, TARGET_GAP, MAX_SECONDS = "steps", "target_gap", "max_seconds"
 NOT_FINITE, FAILED = "not_finite", "failed"
 # After a certificate that did not reach the target gap, the next is tried this much further on.
@@ -230,7 +228,8 @@ class Trainer:
         return self._seen[2]
 
     def _quick(self, settings: CertificateSettings, fields: Fields | None = None) -> Certificate:
-        run = replace(self.run, seed=derive_seed(self.seed, LOOK_STREAM))
+        # These certificates choose between fields: on states of their own they cannot flatter the one of their choice.
+        run = replace(self.run, seed=derive_seed(self.seed, Branch.VALIDATION))
         return self.certify(settings, fields, run=run, problem=self.problem.validation_view)
 
     def certify(

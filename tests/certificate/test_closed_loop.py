@@ -13,10 +13,10 @@ from ocp_torch.certificate.upper.lagrangian import Terms, _integrands, best_mult
 from ocp_torch.certificate.upper.policy_evaluation import StageSettings, fit_closed_loop, missing_price, relative_excess
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields import Fields, PeriodicMLP
-from ocp_torch.maths import calculus
-from ocp_torch.problems import formulas
+from ocp_torch.maths import jets
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from support import zoo
 
@@ -28,8 +28,8 @@ def optimal_loop_samples(problem, count=2**13):
 
 
 def bellman_slack(loop, value, samples):
-    v, gradient = calculus.value_and_gradient(value, samples.x)
-    return v, formulas.hjb_slack(samples, v, gradient, loop.control_cost, loop.discount)
+    V = jets.jet(value, samples.x)
+    return V.value, Generator.of(loop, samples).hjb_slack(V)
 
 
 @zoo.on(zoo.FEW_SMOOTH)
@@ -54,7 +54,7 @@ def test_any_density_gives_the_performance_once_the_value_of_its_residual_is_add
     value, log_mu = (zoo.rough_network(problem.dim, seed, size=0.2) for seed in (6, 7))
 
     def performance(samples):
-        mu, spent = formulas.occupation_outflow(samples, log_mu, loop.discount)
+        mu, spent = Generator.of(loop, samples).occupation_outflow(log_mu)
         r, v = samples.mu0 - spent, value(samples.x)
         lagrangian = samples.f * mu + v * r
         return float((lagrangian + (problem.exact_value(samples.x) - v) * r).mean())

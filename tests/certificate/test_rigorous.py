@@ -1,6 +1,8 @@
 """The proved lower bound: enclosures hold what dense sampling meets, tighten at their order, and are refused where due."""
 
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 
@@ -12,21 +14,28 @@ from hypothesis import strategies as st
 
 from ocp_torch.certificate import CertificateSettings, Run, Trained, certify_fields, table
 from ocp_torch.certificate.lower.shifted import slack_function
+from ocp_torch.certificate.proof.activation_model import activate
 from ocp_torch.certificate.proof.activations import SERIES
-from ocp_torch.certificate.proof.network_model import SmoothModel, activate, embed, network_model, product
-from ocp_torch.certificate.proof.rigorous import cell_models, obstacle, rigorous_lower_bound
+from ocp_torch.certificate.proof.box import Box
+from ocp_torch.certificate.proof.cover import cell_models
+from ocp_torch.certificate.proof.enclosures import Enclosure, contradiction, enclosure
+from ocp_torch.certificate.proof.functions import absolute, power, reciprocal
+from ocp_torch.certificate.proof.network_model import network_model
+from ocp_torch.certificate.proof.obstacle import obstacle
+from ocp_torch.certificate.proof.rigorous import rigorous_lower_bound
+from ocp_torch.certificate.proof.smooth_model import SmoothModel, embed, product
+from ocp_torch.certificate.proof.taylor import TaylorModel
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.fields.mlp import ACTIVATIONS
-from ocp_torch.maths import calculus
-from ocp_torch.maths.enclosure import Lipschitz, contradiction
-from ocp_torch.maths.taylor import Box, TaylorModel
-from ocp_torch.problems import Circle, Manufactured, Torus
+from ocp_torch.maths.jets import jet
+from ocp_torch.problems import Circle, Lipschitz, Manufactured, Problem, Torus
 from ocp_torch.problems.constants import resolve_constants
 from support import zoo
 from support.honesty import BARE
 
 # Every problem of the zoo in at most two dimensions that encloses its data, and a few odd ones.
+TURN = 2.0 * math.pi
 LOW = [n for n in zoo.EXACT if zoo.build(n).dim <= 2]
 
 
@@ -123,7 +132,7 @@ def test_a_network_and_its_gradient_lie_in_their_models(dim, degree, level, acti
     t = corners_and_inside(box)
     value, gradient = network_model(V, box)
     assert holds(value, flat(V, box, t), t)
-    assert holds(gradient, flat(lambda x: calculus.value_and_gradient(V, x)[1], box, t), t)
+    assert holds(gradient, flat(lambda x: jet(V, x).gradient, box, t), t)
 
 
 def perturbed_models(degree: int, size: float, offset: float, slope: float, seed: int):
@@ -227,22 +236,22 @@ def test_the_arithmetic_of_models_encloses():
         "product": (model[0] * model[1], truth[..., 0] * truth[..., 1]),
         "difference": (model[0] * 3.0 - model[2] + 2.0, 3.0 * truth[..., 0] - truth[..., 2] + 2.0),
         "sum": (model.sum(), truth.sum(dim=-1)),
-        "reciprocal": ((model + 1.5).reciprocal(), 1.0 / (truth + 1.5)),
-        "absolute": (model.absolute(), truth.abs()),
-        "square root": (((model * model).power(0.5)), truth.abs()),
-        "power": ((model * model).power(1.7), truth.abs() ** 3.4),
-        "high power": ((model + 1.0).power(5.5), (truth + 1.0) ** 5.5),
+        "reciprocal": (reciprocal(model + 1.5), 1.0 / (truth + 1.5)),
+        "absolute": (absolute(model), truth.abs()),
+        "square root": (power(model * model, 0.5), truth.abs()),
+        "power": (power(model * model, 1.7), truth.abs() ** 3.4),
+        "high power": (power(model + 1.0, 5.5), (truth + 1.0) ** 5.5),
         "coordinates": (box.coordinates(), box.centre + box.half * t),
     }
-    for name, (enclosure, exact) in cases.items():
-        assert holds(enclosure, exact, t), name
+    for name, (found, exact) in cases.items():
+        assert holds(found, exact, t), name
     mean, radius = model.mean()
     grid = (
         torch.cartesian_prod(*[(torch.arange(64).double() + 0.5) / 32 - 1.0] * 2).unsqueeze(1).expand(-1, len(box), -1)
     )
     sampled = flat(g, box, grid).mean(dim=0)
     assert ((mean - sampled).abs() <= radius + 1e-4).all()
-    assert not torch.isfinite(model.reciprocal().radius).all()
+    assert not torch.isfinite(reciprocal(model).radius).all()
 
 
 ODD = {
@@ -265,18 +274,18 @@ def test_the_data_lie_in_their_enclosures(name, level):
     problem = low_problem(name)
     for degree in (1, 4):
         box = random_box(problem.dim, level, degree, seed=level, count=200)
-        enclosure = problem.enclosure(box)
+        found = enclosure(problem, box)
         for t in corners_and_inside(box, count=12):
-            assert contradiction(problem, box, enclosure, t) is None
+            assert contradiction(problem, box, found, t) is None
 
 
 def test_a_wrong_enclosure_is_contradicted():
     problem = zoo.build("manufactured 2-d B(x)")
     box = random_box(2, 6, 4, 0)
-    enclosure, t = problem.enclosure(box), corners_and_inside(box)[0]
+    found, t = enclosure(problem, box), corners_and_inside(box)[0]
     for field, name in (("f", "state_cost"), ("a", "drift"), ("B", "control_matrix"), ("mu0", "initial_density")):
-        off = getattr(enclosure, field) + 0.1
-        assert contradiction(problem, box, replace(enclosure, **{field: off}), t) == name
+        off = getattr(found, field) + 0.1
+        assert contradiction(problem, box, replace(found, **{field: off}), t) == name
 
 
 @pytest.mark.parametrize("name", ["circle rho=2", "torus 2-d chain", *ODD])
@@ -367,6 +376,24 @@ class Hilly(Circle):
         return 2.0 + super().state_cost(x)
 
 
+class Raised(Circle):
+    """A user's own class, which knows how to enclose what it changes."""
+
+    def state_cost(self, x):
+        return 2.0 + super().state_cost(x)
+
+    def enclosure(self, box):
+        found = enclosure(Circle(), box)
+        return replace(found, f=found.f + 2.0)
+
+
+class RaisedAgain(Raised):
+    """And one below it, which changes more."""
+
+    def initial_density(self, x):
+        return 1.0 + 0.5 * torch.cos(2.0 * math.pi * x[:, 0])
+
+
 class Declared(zoo.Swing):
     """What a user can say without writing an enclosure."""
 
@@ -394,6 +421,7 @@ def test_what_cannot_be_proved_is_refused_in_words():
         (Circle(), custom, "networks"),
         (Circle(), network(1, 0).float(), "float64"),
         (Hilly(), V, "inherits"),
+        (RaisedAgain(), V, "inherits"),
         (patched, V, "inherits"),
         (zoo.Swing(), V2, "lipschitz"),
         (Declared(state_cost=4.5), V2, "lipschitz"),
@@ -403,8 +431,33 @@ def test_what_cannot_be_proved_is_refused_in_words():
         assert words in obstacle(problem, value)
         assert rigorous_lower_bound(problem, value) is None
     assert obstacle(Circle(), V) is None
+    assert isinstance(enclosure(Raised(), random_box(1, 4, 2, 0)), Enclosure)
+    assert obstacle(Raised(), V) is None
     with pytest.raises(InputError, match="tolerance"):
         rigorous_lower_bound(Circle(), V, tolerance=0.0)
+
+
+class Flat(Problem):
+    """Everything but the cost is constant, so only the cost needs a Lipschitz constant."""
+
+    def __init__(self):
+        super().__init__(dim=1)
+        self.lipschitz = Lipschitz(state_cost=TURN)
+
+    def state_cost(self, x):
+        return 1.0 - torch.cos(TURN * x[:, 0])
+
+
+def test_what_is_not_overridden_needs_no_lipschitz_constant():
+    problem, V = Flat(), network(1, 0)
+    assert obstacle(problem, V) is None
+    problem.initial_density = lambda x: 1.0 + 0.5 * torch.cos(TURN * x[:, 0])  # on the instance: no constant any more
+    assert "lipschitz" in obstacle(problem, V)
+
+
+def test_the_proof_is_loaded_only_where_one_is_asked_for():
+    script = "import sys, ocp_torch; assert not [m for m in sys.modules if m.startswith('ocp_torch.certificate.proof')]"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
 
 
 @pytest.mark.nightly

@@ -15,16 +15,17 @@ from ocp_torch.certificate.lower.shifted import TOP, SlackParts, climbed, scaled
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.sides import lower_side
 from ocp_torch.fields import PeriodicMLP
-from ocp_torch.maths.calculus import value_and_gradient
+from ocp_torch.maths.jets import jet
 from ocp_torch.problems import Circle
 from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from support import zoo
 
 
 def parts_of(problem, value, count: int = 400) -> SlackParts:
     samples = Samples.of(problem, zoo.states(problem, count))
-    return SlackParts.of(samples, *value_and_gradient(value, samples.x), problem.control_cost, problem.discount)
+    return SlackParts.of(Generator.of(problem, samples), jet(value, samples.x))
 
 
 def near(problem, seed: int, size: float):
@@ -60,7 +61,7 @@ def test_scaling_never_loses_and_never_passes_the_optimum(name, seed, size):
     sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
     found = lower_side(problem, V, sets, 1.0, ascents=8)
     pieces = [
-        SlackParts.of(s, *value_and_gradient(V, s.x), problem.control_cost, problem.discount) for s in sets
+        SlackParts.of(Generator.of(problem, s), jet(V, s.x)) for s in sets
     ]  # the multiple 1, as it was before there was a choice
     plain = climbed(problem, V, SlackParts.join(pieces), 1.0, 8)
     initial = sum(found.initial) / len(found.initial)
@@ -101,7 +102,8 @@ def test_an_average_of_a_plane_wave_is_a_smaller_one(dim):
     torch.testing.assert_close(neighbours[len(axes) :], -axes)
     x = torch.rand(40, dim, generator=torch.Generator().manual_seed(dim), dtype=torch.float64)
     left = (1.0 + torch.cos(2.0 * math.pi * neighbours @ wave.wave).sum()) / (len(neighbours) + 1)
-    value, gradient = value_and_gradient(averaged, x)
+    found = jet(averaged, x)
+    value, gradient = found.value, found.gradient
     torch.testing.assert_close(value, left * wave(x))
     torch.testing.assert_close(averaged(x), value)
     slope = -2.0 * math.pi * left * torch.sin(2.0 * math.pi * x @ wave.wave)

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from ocp_torch.maths import sampling as samplers
-from ocp_torch.maths.sampling import SobolSampler, UniformSampler, derive_seed, evaluation_points, scrambled_sobol
+from ocp_torch.maths.sampling import SobolSampler, UniformSampler, evaluation_points, scrambled_sobol
+from ocp_torch.maths.seeds import Branch, derive_seed
 
 each_sampler = pytest.mark.parametrize("make", [UniformSampler, SobolSampler])
 each_precision = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -59,9 +60,9 @@ def test_training_and_evaluation_states_are_disjoint(make):
 
 
 def test_branches_of_the_seed_tree_are_distinct():
-    seeds = [derive_seed(seed, *path) for seed in range(5) for path in ((), (0,), (1,), (0, 0), (0, 1), (1, 0), (1, 1))]
+    seeds = [derive_seed(seed, *path) for seed in range(5) for path in ((0,), (1,), (0, 0), (0, 1), (1, 0), (1, 1))]
     assert len(set(seeds)) == len(seeds)
-    assert derive_seed(3, 1, 4) == derive_seed(3, 1, 4)
+    assert derive_seed(3, Branch.VISITS, 4) == derive_seed(3, Branch.VISITS, 4)
 
 
 @each_sampler
@@ -103,5 +104,5 @@ def test_a_sobol_stream_goes_on_past_what_is_buffered_and_never_repeats_itself(m
     sampler = SobolSampler(2, 0, torch.float64)
     x = torch.cat([sampler.draw(777) for _ in range(33)])
     assert len(rows(x)) == len(x)
-    engine = scrambled_sobol(10_000, 2, derive_seed(0, samplers.TRAINING_STREAM, 1), torch.float64)
+    engine = scrambled_sobol(10_000, 2, derive_seed(0, Branch.TRAINING, 1), torch.float64)
     assert torch.equal(x[10_000:20_000], engine)

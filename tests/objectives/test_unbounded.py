@@ -7,10 +7,11 @@ from functools import partial
 import pytest
 
 from ocp_torch.fields import VALUE, Fields, PeriodicMLP
-from ocp_torch.maths import calculus
+from ocp_torch.maths.jets import jet
 from ocp_torch.objectives import Dual
-from ocp_torch.problems import Arm, Circle, Torus, formulas
+from ocp_torch.problems import Arm, Circle, Torus
 from ocp_torch.problems.constants import OCCUPATION_WEIGHT, resolve_constants
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.training.budgets import DENSITY_BATCH, fill
 from support import zoo
@@ -31,9 +32,9 @@ def test_the_weight_of_the_slack_grows_along_a_round():
     constants = resolve_constants(problem)
     fields = Fields.build(problem, (VALUE,), partial(PeriodicMLP, width=16), 0).double()
     samples = Samples.of(problem, zoo.states(problem, 500), divergences=False)
-    value, gradient = calculus.value_and_gradient(fields.value, samples.x)
-    slack = formulas.hjb_slack(samples, value, gradient, problem.control_cost, problem.discount)
-    violation, started = float(slack.clamp_min(0.0).mean()), float((value * samples.mu0).mean())
+    V = jet(fields.value, samples.x)
+    slack = Generator.of(problem, samples).hjb_slack(V)
+    violation, started = float(slack.clamp_min(0.0).mean()), float((V.value * samples.mu0).mean())
     weights = {}
     for unbounded in (True, False):
         objective = Dual(problem, replace(constants, unbounded=unbounded), residual=0.0)

@@ -15,12 +15,13 @@ from ocp_torch.certificate.sides import lower_side, upper_side
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.policies import CLOSED, NETWORK, occupation_density
 from ocp_torch.fields import Fields
-from ocp_torch.maths import calculus
+from ocp_torch.maths.jets import jet
 from ocp_torch.objectives import Dual, primal, saddle
 from ocp_torch.objectives.primal import ClosedPrimal, NetworkPrimal
-from ocp_torch.problems import Problem, formulas
+from ocp_torch.problems import Problem
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import Constants, resolve_constants
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from support import zoo
 from support.formulas import ERRORS, random_fields
@@ -151,10 +152,10 @@ def test_the_saddle_is_never_below_the_dual_and_meets_it_at_the_best_response(na
     fields, constants = random_fields(problem, seed, size), bounds_of(name)
 
     def best_response(x):
-        value, gradient = calculus.value_and_gradient(fields.value, x)
+        V = jet(fields.value, x)
         samples = Samples.of(problem, x, divergences=False)
-        slack = formulas.hjb_slack(samples, value, gradient, problem.control_cost, problem.discount)
-        u = problem.control_cost.argmax(-formulas.pull_back(samples, gradient) / problem.discount)
+        generator = Generator.of(problem, samples)
+        slack, u = generator.hjb_slack(V), problem.control_cost.argmax(generator.push(V))
         return torch.where(slack > 0.0, constants.M, 0.0).unsqueeze(-1) * u
 
     class BestResponse(torch.nn.Module):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ocp_torch.cli.launch import again
 from ocp_torch.control.controller import load_controller
 from ocp_torch.errors import InputError
-from ocp_torch.maths import calculus
+from ocp_torch.maths.jets import jet
 from ocp_torch.objectives import primal, saddle
 from ocp_torch.objectives.saddle import Saddle
 from ocp_torch.problems import Simulator
@@ -81,7 +81,7 @@ def test_differences_go_through_every_transform_the_package_uses(name):
 
     def policy(owner):
         def control(x):
-            _, gradient = calculus.value_and_gradient(network, x)
+            gradient = jet(network, x).gradient
             return -torch.einsum("ndm,nd->nm", owner.control_matrix(x), gradient)
 
         return control

@@ -11,21 +11,24 @@ from hypothesis import strategies as st
 from ocp_torch.certificate import CertificateSettings, StageSettings
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.external.black_box import BlackBox
-from ocp_torch.certificate.proof.rigorous import obstacle, rigorous_lower_bound
+from ocp_torch.certificate.proof.box import Box
+from ocp_torch.certificate.proof.enclosures import conjugate_model
+from ocp_torch.certificate.proof.obstacle import obstacle
+from ocp_torch.certificate.proof.rigorous import rigorous_lower_bound
 from ocp_torch.certificate.sides import lower_side, upper_side
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.controller import load_controller
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, admissible_density, occupation_density, trained_policies
 from ocp_torch.errors import InputError
-from ocp_torch.maths import calculus
-from ocp_torch.maths.taylor import Box
+from ocp_torch.maths import jets
 from ocp_torch.objectives.primal import ClosedPrimal, NetworkPrimal
 from ocp_torch.objectives.saddle import Saddle
-from ocp_torch.problems import Circle, Manufactured, Torus, formulas
+from ocp_torch.problems import Circle, Manufactured, Torus
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.control_limit import LimitedCost
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.external import certify
 from ocp_torch.runs.run import controller_of
@@ -170,7 +173,7 @@ def test_taylor_models_hold_the_conjugate_below_across_and_beyond_the_limit(q, d
     for half in (0.2, 0.02, 1e-3):
         centre = 2.0 * torch.rand(300, dim, generator=generator, dtype=torch.float64)
         box = Box(centre, torch.full_like(centre, half), 4)
-        model = cost.conjugate_model(box.coordinates())
+        model = conjugate_model(cost, box.coordinates())
         low, high = model.bounds()
         inner = 2.0 * torch.rand(20, 300, dim, generator=generator, dtype=torch.float64) - 1.0
         # The corner farthest from 0 is where R* exceeds its limited version most.
@@ -196,9 +199,9 @@ def test_the_exact_truth_solves_its_equations_with_the_limit_reached(problem):
     assert 0.001 < float(reached) < 0.98
     assert float(u.norm(dim=-1).max()) <= problem.control_bound * (1.0 + 1e-12)
     flux = lambda y: problem.exact_occupation(y).unsqueeze(-1) * problem.velocity(y, problem.exact_control(y))
-    outflow = calculus.divergence(flux, x) / problem.discount
+    outflow = jets.divergence(flux, x) / problem.discount
     torch.testing.assert_close(problem.initial_density(x), problem.exact_occupation(x) + outflow, **ROUNDING)
-    given, by_autograd = problem.drift_divergence(x), calculus.divergence(problem.drift, x)
+    given, by_autograd = problem.drift_divergence(x), jets.divergence(problem.drift, x)
     torch.testing.assert_close(given, by_autograd, **ROUNDING)
     remade = type(problem)(**problem.parameters)
     assert torch.equal(remade.state_cost(x), problem.state_cost(x))
@@ -288,8 +291,7 @@ def test_rigorous_bounds_stand_with_a_limit_or_are_refused():
     without, within = (rigorous_lower_bound(p, network, cells=2000) for p in (free, tight))
     assert within.value >= without.value - 1e-9  # R_c* <= R*
     x = torch.linspace(0.0, 1.0, 4001, dtype=torch.float64).unsqueeze(-1)
-    v, gradient = calculus.value_and_gradient(lambda y: within.theta * network(y), x)
-    met = formulas.hjb_slack(Samples.of(tight, x), v, gradient, tight.control_cost, tight.discount)
+    met = Generator.of(tight, Samples.of(tight, x)).hjb_slack(jets.jet(lambda y: within.theta * network(y), x))
     assert float(met.max()) <= within.slack
     assert "enclosure" in obstacle(Manufactured(dim=1, control_limit=0.5), network)
 

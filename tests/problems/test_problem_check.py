@@ -5,8 +5,8 @@ import torch
 
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Simulator
-from ocp_torch.problems.check import check_once
-from ocp_torch.problems.mass import sampled_mass
+from ocp_torch.problems.checks import check_once
+from ocp_torch.problems.checks.mass import sampled_mass
 from ocp_torch.runs.build import build_problem
 from support import hostile_problems
 from support.hostile_problems import LEGAL, REFUSED, Good, with_

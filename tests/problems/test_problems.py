@@ -8,7 +8,7 @@ import torch
 
 from ocp_torch.certificate.sides import lower_side, upper_side
 from ocp_torch.errors import InputError
-from ocp_torch.maths import calculus
+from ocp_torch.maths import jets
 from ocp_torch.maths.sampling import evaluation_points
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems import Circle, Manufactured, Problem, Torus
@@ -92,14 +92,14 @@ def test_the_exact_value_solves_the_hamilton_jacobi_bellman_equation(problem):
 def test_the_exact_occupation_and_control_solve_the_liouville_equation(problem):
     x = zoo.states(problem, 2000, seed=2, off_kinks=True)
     flux = lambda y: problem.exact_occupation(y).unsqueeze(-1) * problem.velocity(y, problem.exact_control(y))
-    outflow = calculus.divergence(flux, x) / problem.discount
+    outflow = jets.divergence(flux, x) / problem.discount
     torch.testing.assert_close(problem.initial_density(x), problem.exact_occupation(x) + outflow, **ROUNDING)
 
 
 @zoo.on(zoo.EXACT)
 def test_the_exact_control_is_the_argmax_at_the_exact_value(problem):
     x = zoo.states(problem, 2000, seed=3, off_kinks=True)
-    _, gradient = calculus.value_and_gradient(problem.exact_value, x)
+    gradient = jets.jet(problem.exact_value, x).gradient
     pull = torch.einsum("ndm,nd->nm", problem.control_matrix(x), gradient)
     expected = problem.control_cost.argmax(-pull / problem.discount)
     torch.testing.assert_close(problem.exact_control(x), expected, **ROUNDING)

@@ -12,7 +12,8 @@ from ocp_torch.certificate.sides import lower_side
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
 from ocp_torch.control.policies import zero_policy
 from ocp_torch.gym.environment import make_environment
-from ocp_torch.maths.mixtures import Mixture, fitted_mixture, worth
+from ocp_torch.maths.mixture_fit import fitted_mixture
+from ocp_torch.maths.mixtures import Mixture, effective_part
 from ocp_torch.maths.sampling import evaluation_points
 from ocp_torch.problems import Problem, Simulator
 from ocp_torch.problems.constants import OCCUPATION_WEIGHT, resolve_constants
@@ -154,7 +155,7 @@ def test_what_is_fitted_serves_to_integrate(dim, function, truth):
     sets = [distribution.draw(512, r, 1) for r in range(8)]
     values = [weight * function(x) for x, weight in sets]
     assert_near(Estimate.of([float(v.mean()) for v in values]), truth, 0.2)
-    assert worth(torch.cat(values)) > 0.25
+    assert effective_part(torch.cat(values)) > 0.25
 
 
 def test_starts_that_count_the_same_are_drawn_from_the_density():

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from ocp_torch.control.controller import load_controller
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.runs.evaluate import policy_of
-from ocp_torch.runs.metrics import METRICS, STREAM
+from ocp_torch.runs.metrics import METRICS
 from ocp_torch.runs.practice import metrics
 from support.small import session, small
 
@@ -23,7 +23,7 @@ def test_a_run_leaves_numbers_and_a_picture(tmp_path, problem):
     found = json.loads((tmp_path / METRICS).read_text())
     assert {"controller", "zero", "classical"} <= found.keys()
     controller = load_controller(tmp_path / "controller.safetensors")
-    assert metrics(controller.problem, policy_of(controller), derive_seed(0, STREAM)) == found
+    assert metrics(controller.problem, policy_of(controller), derive_seed(0, Branch.METRICS)) == found
 
 
 @pytest.mark.nightly

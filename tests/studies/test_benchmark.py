@@ -12,8 +12,8 @@ from ocp_torch.control import policies
 from ocp_torch.errors import InputError
 from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields, SobolevField
 from ocp_torch.gym.environment import make_environment, observe
-from ocp_torch.problems import formulas
 from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.studies.benchmark import measure
 from ocp_torch.studies.benchmark.contest import build, contest
@@ -72,10 +72,10 @@ def test_the_judge_agrees_with_quadrature_on_a_dense_grid():
     numbers = Judge(problem, constants)(fields, policies.SADDLE)
     x = ((torch.arange(n, dtype=torch.float64) + 0.5) / n).unsqueeze(-1)
     samples = Samples.of(problem, x)
-    V, gradient = fields.value.value_and_gradient(x)
-    slack = formulas.hjb_slack(samples, V, gradient, problem.control_cost, problem.discount)
-    assert numbers["F_M"] == pytest.approx(float((V - 2.0 * slack.clamp_min(0.0)).mean()), abs=2e-5)
-    w, inflow = formulas.control_inflow(samples, fields.control_density, problem.discount)
+    generator, V = Generator.of(problem, samples), fields.value.jet(x)
+    slack = generator.hjb_slack(V)
+    assert numbers["F_M"] == pytest.approx(float((V.value - 2.0 * slack.clamp_min(0.0)).mean()), abs=2e-5)
+    w, inflow = generator.control_inflow(fields.control_density)
     G = problem.control_cost.primal_minimum(w, samples.f, 2.0, inflow).mean()
     assert numbers["G"] == pytest.approx(float(G), abs=2e-5)
     assert numbers["F_M"] < problem.exact_optimum < numbers["G"] <= numbers["J"]

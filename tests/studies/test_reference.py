@@ -10,9 +10,10 @@ import torch
 
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Circle, Manufactured, Problem, Torus
-from ocp_torch.studies.reference import linear, semi_lagrangian, solve_reference
+from ocp_torch.studies.reference import linear, policy_iteration, solve_reference
 from ocp_torch.studies.reference.files import save_reference
 from ocp_torch.studies.reference.grid import Grid
+from ocp_torch.studies.reference.policy_iteration import solve
 from ocp_torch.studies.reference.richardson import extrapolate
 from ocp_torch.studies.reference.semi_lagrangian import SemiLagrangian, discounted_weights
 from ocp_torch.studies.reference.session import prepare, table
@@ -95,12 +96,12 @@ def solved(problem, side, rise=None, step=1.0, start=None):
     grid = Grid(problem.dim, side)
     monotone = SemiLagrangian(problem, grid, step * grid.spacing)
     value = monotone.f.clone()
-    solution = monotone.solve(value, value.new_zeros(grid.count, problem.control_dim), 1e-6)
+    solution = solve(monotone, value, value.new_zeros(grid.count, problem.control_dim), 1e-6)
     if rise == 0.0:
         return monotone, solution
     rise = float(solution.value.max() - solution.value.min())
     scheme = SemiLagrangian(problem, grid, step * grid.spacing, rise)
-    return scheme, scheme.solve(solution.value, solution.control, 1e-8)
+    return scheme, solve(scheme, solution.value, solution.control, 1e-8)
 
 
 @pytest.mark.parametrize(("rise", "order"), [(0.0, 1.0), (None, 2.0)])
@@ -122,14 +123,14 @@ def test_no_control_at_all_is_better_than_the_candidates(make):
     best = solution.value.clone()
     for u in torch.linspace(-2.0, 2.0, 801, dtype=torch.float64):
         held = torch.full_like(solution.control, float(u))
-        best = torch.minimum(best, scheme._judged(solution.value, everything, held)[0])
+        best = torch.minimum(best, scheme.right_side(solution.value, everything, held)[0])
     off = (solution.grid.nodes()[:, 0] - 0.5).abs() < 0.5 - 4.0 * solution.grid.spacing
     assert float((solution.value - best)[off].max()) <= 2e-4 * scheme.gain
 
 
 @pytest.mark.parametrize("policies", [1, 2])
 def test_an_iteration_that_is_stopped_early_says_so_and_states_what_it_leaves(policies, monkeypatch):
-    monkeypatch.setattr(semi_lagrangian, "MOST_POLICIES", policies)
+    monkeypatch.setattr(policy_iteration, "MOST_POLICIES", policies)
     problem = Manufactured(dim=1, seed=1)
     reference = solve_reference(problem, 64)
     assert reference.unsettled > 1e-4 * problem.exact_optimum
@@ -289,7 +290,7 @@ def test_the_discount_weights_integrate_parabolas(rho, tau):
 @pytest.mark.parametrize("beta", [0.9, 0.9995])
 def test_iteration_and_factorisation_solve_the_same_system(beta, monkeypatch):
     scheme, solution = solved(Manufactured(seed=5), 16)
-    stencil = solution.grid.stencil(scheme._move(slice(0, solution.grid.count), solution.control)[1])
+    stencil = solution.grid.stencil(scheme.move(slice(0, solution.grid.count), solution.control)[1])
     W = solution.grid.matrix(stencil.index, stencil.linear)
     start = torch.zeros_like(scheme.f)
     direct = linear.solve_fixed_point(W, beta, scheme.f, start, 1e-10)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from ocp_torch.maths import calculus
-from ocp_torch.problems import formulas
+from ocp_torch.maths import jets
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 
 # Pure float64 arithmetic, with no approximation but rounding.
@@ -14,8 +14,7 @@ ROUNDING = dict(rtol=1e-9, atol=1e-9)
 
 def exact_slack(problem, x):
     samples = Samples.of(problem, x)
-    value, gradient = calculus.value_and_gradient(problem.exact_value, x)
-    return formulas.hjb_slack(samples, value, gradient, problem.control_cost, problem.discount)
+    return Generator.of(problem, samples).hjb_slack(jets.jet(problem.exact_value, x))
 
 
 def lattice(dim: int) -> torch.Tensor:

@@ -122,7 +122,7 @@ def states(problem: Problem, count: int, seed: int = 0, dtype=torch.float64, off
     generator = torch.Generator().manual_seed(seed)
     x = torch.rand(count, problem.dim, generator=generator, dtype=torch.float64).to(dtype)
     if off_kinks and isinstance(problem, Torus):
-        y = (x @ problem._A.to(x).T).remainder(1.0)
+        y = (x @ problem.A.to(x).T).remainder(1.0)
         x = x[((y > 0.01) & (y < 0.99)).all(dim=-1)]
     return x
 

@@ -10,11 +10,12 @@ from torch import nn
 
 from ocp_torch.errors import InputError
 from ocp_torch.fields import VALUE, Fields, PeriodicMLP
-from ocp_torch.maths import calculus
+from ocp_torch.maths.jets import jet
 from ocp_torch.maths.sampling import UniformSampler
 from ocp_torch.objectives import Dual, primal
-from ocp_torch.problems import Problem, formulas
+from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.problems.generator import Generator
 from ocp_torch.training.batches import VISITED, Batches
 from support import zoo
 
@@ -88,12 +89,12 @@ def test_the_penalty_sees_the_visited_states_too():
     batches.draw()
     s = batches.draw()
     assert int((s.weight == 0.0).sum()) == 100
-    value, gradient = calculus.value_and_gradient(batches.fields.value, s.x)
-    slack = formulas.hjb_slack(s, value, gradient, problem.control_cost, problem.discount)
+    V = jet(batches.fields.value, s.x)
+    slack = Generator.of(problem, s).hjb_slack(V)
     loss = Dual(problem, constants, residual=0.0).losses(batches.fields, s)["value"]
     assert bool((s.attention[:300] == 1.0).all())
     assert bool((s.attention > 0.0).all())
-    expected = 3.0 * (s.attention * slack.clamp_min(0.0)).mean() - (value * s.mu0)[:300].mean()
+    expected = 3.0 * (s.attention * slack.clamp_min(0.0)).mean() - (V.value * s.mu0)[:300].mean()
     torch.testing.assert_close(loss, expected)
 
 

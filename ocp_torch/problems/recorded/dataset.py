@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import MARGIN, Problem
 from ocp_torch.problems.recorded import recording
 from ocp_torch.problems.samples import Samples
 
-# Branch of the seed tree for the split; the part of what is not held out that looks during training are made on.
-SPLIT_STREAM, LOOKS_PART = 6, 0.1
+# The part of what is not held out that looks during training are made on.
+LOOKS_PART = 0.1
 # Fewest samples of a part that anything is estimated from.
 FEWEST_PART = 32
 CONSTANT = 1e-9
@@ -110,7 +110,7 @@ class Dataset(Problem):
         if samples.div_B is None and constant:
             samples = Samples(**{**vars(samples), "div_B": zero.unsqueeze(-1).expand(-1, self.control_dim)})
         count = len(samples)
-        generator = torch.Generator().manual_seed(derive_seed(self.seed, SPLIT_STREAM))
+        generator = torch.Generator().manual_seed(derive_seed(self.seed, Branch.DATASET_SPLIT))
         order = torch.randperm(count, generator=generator)
         held = round(self.held_out_part * count)
         looks = max(FEWEST_PART, round(LOOKS_PART * (count - held)))

@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ocp_torch.control.policies import zero_policy
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
@@ -20,8 +20,8 @@ from ocp_torch.runs.practice.paths import Law, Path, simulate
 
 # Time drawn, in units of 1 / rho, and frames of it.
 DURATION, FRAMES = 5.0, 160
-# Branch of the seeds of drawn starts, and how many are drawn.
-STREAM, OSCILLATORS = 7, 24
+# How many starts are drawn.
+OSCILLATORS = 24
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def moving(problem: Problem, policy: Law, seed: int = 0) -> Moving | None:
     if draw is None:
         return None
     count, apart = starts_drawn(problem)
-    x0 = random_starts(problem, count, derive_seed(seed, STREAM))
+    x0 = random_starts(problem, count, derive_seed(seed, Branch.PICTURES))
     duration = DURATION / problem.discount
     if apart:
         paths = [simulate(problem, policy, x0[i : i + 1], duration, FRAMES) for i in range(count)]
