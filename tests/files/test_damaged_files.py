@@ -14,7 +14,7 @@ from ocp_torch.files import storage
 from ocp_torch.runs.start import prepare
 from ocp_torch.training.checkpoint import MAGIC, SCHEMA, load_checkpoint, newest, save_checkpoint
 from ocp_torch.training.monitor import Silent
-from support.forked import TINY, train
+from support.forked import TINY, completed, train
 from support.small import small
 
 pytestmark = pytest.mark.usefixtures("quick_composition")
@@ -153,15 +153,14 @@ def little_room():
 def test_a_run_on_a_full_disk_stops_with_a_sentence_and_can_go_on_later(tmp_path):
     folder = tmp_path / "run"
     way = (*TINY, f"hydra.run.dir={folder}", "trainer.log_every=1000")
-    assert train(*way, "trainer.steps=10", cwd=tmp_path).status == 0
+    completed(*way, "trainer.steps=10", cwd=tmp_path)
     before = (folder / "checkpoints" / "last.pt").read_bytes()
     assert len(before) > 12_000
     (folder / "certificate.json").unlink()
     ended = train(f"resume={folder}", "trainer.steps=40", cwd=tmp_path, before=little_room)
     assert "cannot be written" in ended.sentence
     assert (folder / "checkpoints" / "last.pt").read_bytes() == before
-    ended = train(f"resume={folder}", cwd=tmp_path)
-    assert ended.status == 0, ended
+    completed(f"resume={folder}", cwd=tmp_path)
     assert newest(folder / "checkpoints")[0]["step"] == 40
 
 

@@ -20,7 +20,7 @@ from ocp_torch.training.checkpoint import load_checkpoint, save_checkpoint
 from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.monitor import Silent
 from support.bits import differences
-from support.forked import TINY, train
+from support.forked import TINY, completed, finished_run, train
 from support.looks import quick
 from support.small import METHODS, SMALL, configured, small, state_of
 
@@ -146,10 +146,7 @@ def test_an_optimisers_settings_can_change_at_a_resume_and_its_moments_stay(tmp_
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A finished run from the command line."""
-    folder = tmp_path_factory.mktemp("finished") / "run"
-    ended = train(*TINY, f"hydra.run.dir={folder}", cwd=folder.parent)
-    assert ended.status == 0, ended
-    return folder
+    return finished_run(tmp_path_factory.mktemp("finished") / "run", *TINY)
 
 
 def resuming(folder, *overrides: str):
@@ -208,12 +205,10 @@ def test_sizes_by_dimension_are_those_the_run_began_with(tmp_path, monkeypatch):
 def test_a_finished_run_says_so_and_more_steps_go_on_in_its_own_folder(finished, tmp_path):
     first = {p.name: p.read_bytes() for p in (finished / ".hydra").iterdir() if p.is_file()}
     before = (finished / "certificate.json").read_bytes()
-    ended = train(f"resume={finished}", cwd=tmp_path)
-    assert ended.status == 0
+    ended = completed(f"resume={finished}", cwd=tmp_path)
     assert "is finished" in ended.stdout
     assert (finished / "certificate.json").read_bytes() == before
-    ended = train(f"resume={finished}/checkpoints/last.pt", "trainer.steps=70", cwd=tmp_path)
-    assert ended.status == 0, ended
+    ended = completed(f"resume={finished}/checkpoints/last.pt", "trainer.steps=70", cwd=tmp_path)
     assert "going on from step 60" in ended.stdout
     assert json.loads((finished / "certificate.json").read_text())["step"] == 70
     assert {p.name: p.read_bytes() for p in (finished / ".hydra").iterdir() if p.is_file()} == first
@@ -229,10 +224,9 @@ def test_a_finished_run_says_so_and_more_steps_go_on_in_its_own_folder(finished,
 def test_auto_finds_the_last_run_of_this_configuration_or_starts_it(finished, tmp_path):
     folder = tmp_path / "runs" / "mine"
     way = (*TINY, "seed=7", "trainer.steps=5", f"hydra.run.dir={folder}", "resume=auto")
-    assert train(*way, cwd=tmp_path).status == 0
+    completed(*way, cwd=tmp_path)
     assert json.loads((folder / "certificate.json").read_text())["step"] == 5
-    again = train(*way, cwd=tmp_path)
-    assert again.status == 0
+    again = completed(*way, cwd=tmp_path)
     assert "is finished" in again.stdout
     os.remove(folder / "certificate.json")
     again = train(*way, cwd=tmp_path)
@@ -290,14 +284,12 @@ def test_a_problem_of_your_own_is_not_imported_for_a_file_but_must_be_named_agai
     name = f"own_{time.monotonic_ns()}"
     (tmp_path / f"{name}.py").write_text(OWN.format(canary=str(canary)))
     mine = f"problem._target_={name}.Mine"
-    ended = train(*TINY, mine, "+problem.height=0.25", "trainer.steps=4", f"hydra.run.dir={folder}", cwd=tmp_path)
-    assert ended.status == 0, ended
+    completed(*TINY, mine, "+problem.height=0.25", "trainer.steps=4", f"hydra.run.dir={folder}", cwd=tmp_path)
     canary.unlink()
     refused = train(f"resume={folder}", "trainer.steps=6", cwd=tmp_path)
     assert f"{name}.Mine" in refused.sentence
     assert "problem._target_=my_module.MyProblem" in refused.sentence
     assert not canary.exists()
-    ended = train(f"resume={folder}", "trainer.steps=6", mine, cwd=tmp_path)
-    assert ended.status == 0, ended
+    completed(f"resume={folder}", "trainer.steps=6", mine, cwd=tmp_path)
     assert canary.exists()
     assert json.loads((folder / "certificate.json").read_text())["step"] == 6

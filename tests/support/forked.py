@@ -106,6 +106,19 @@ def train(*arguments: str, cwd: Path, before=None) -> Ended:
     return command("train", *arguments, cwd=cwd, before=before)
 
 
+def completed(*arguments: str, cwd: Path, before=None) -> Ended:
+    """The same, of a run that must end well."""
+    ended = train(*arguments, cwd=cwd, before=before)
+    assert ended.status == 0, ended
+    return ended
+
+
+def finished_run(folder: Path, *arguments: str) -> Path:
+    """A finished run in ``folder``."""
+    completed(*arguments, f"hydra.run.dir={folder}", cwd=folder.parent)
+    return folder
+
+
 def script(name: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess:
     """The same, from a process that has imported everything."""
     ended = command(name, *arguments, cwd=cwd)
