@@ -176,7 +176,11 @@ REFUSED = {
     "mu0 negative": (lambda: with_(initial_density=lambda self, x: 1.0 + 1.5 * torch.cos(TURN * x[:, 0])),
                      "initial_density .* at least 0"),
     "mass 1.5": (lambda: with_(initial_density=lambda self, x: 1.5 * torch.ones_like(x[:, 0])), "integrates to 1.5"),
-    "mass 1/2": (lambda: with_(initial_density=lambda self, x: 0.5 + 0.5 * torch.cos(TURN * x[:, 0])), "integrates to 0.5"),
+    # An estimate, of which the last look has a half-width of 0.01.
+    "mass 1/2": (
+        lambda: with_(initial_density=lambda self, x: 0.5 + 0.5 * torch.cos(TURN * x[:, 0])),
+        r"integrates to 0\.(49|5)",
+    ),
     "mass 0": (lambda: with_(initial_density=lambda self, x: 0.0 * x[:, 0]), "is 0 at all of"),
     "mass of a bump": (lambda: with_(initial_density=bump(0.1)), "integrates to 0.06"),
     "mass of a needle": (lambda: with_(initial_density=bump(0.004)), "integrates to 0.0001|integrates to 9.*e-05"),
