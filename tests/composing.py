@@ -22,13 +22,13 @@ def quickly():
     """Within, each choice of files is composed once; fields are then set by Hydra's own step, which reads none."""
     real, kept = composition.compose, {}
 
-    def compose(config_name, overrides=()):
+    def compose(config_name, overrides=(), **options):
         files = tuple(o for o in overrides if not is_field(o))
         fields = composition.parsed([o for o in overrides if is_field(o) and not o.startswith("hydra.run.dir=")])
         if any(o.is_sweep_override() for o in fields):
-            return real(config_name, list(overrides))
+            return real(config_name, list(overrides), **options)
         if (config_name, files) not in kept:
-            kept[config_name, files] = real(config_name, list(files))
+            kept[config_name, files] = real(config_name, list(files), **options)
         config = kept[config_name, files].copy()
         OmegaConf.set_struct(config, True)
         ConfigLoaderImpl._apply_overrides_to_config(fields, config)

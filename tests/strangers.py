@@ -10,7 +10,7 @@ import torch
 import yaml
 
 from looks import certificate
-from ocp_torch.runs.run import controller_of
+from ocp_torch.runs.finish import controller_of
 from ocp_torch.training.checkpoint import MAGIC, SCHEMA, load_checkpoint
 from ocp_torch.training.monitor import Silent
 from test_training import small

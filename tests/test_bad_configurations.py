@@ -4,6 +4,7 @@ import contextlib
 import io
 import os
 import sys
+from unittest import mock
 
 import pytest
 import torch
@@ -12,8 +13,9 @@ from hypothesis import settings as examples
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from ocp_torch.cli.launch import CONFIGS, launch
-from ocp_torch.runs.start import prepare
+from ocp_torch.cli import launch as launching
+from ocp_torch.cli.launch import CONFIGS
+from ocp_torch.runs.training_run import training_run
 
 pytestmark = pytest.mark.usefixtures("quick_composition")
 EXAMPLES = int(os.environ.get("OCP_TORCH_EXAMPLES", "200"))
@@ -26,7 +28,8 @@ def entered(*arguments: str) -> tuple[int, str, str]:
     sys.argv = ["train.py", *arguments]
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            launch(lambda: print("trained"), "train", prepare)
+            with mock.patch.object(launching, "carry_out", side_effect=lambda *_: print("trained")):
+                launching.launch(lambda: print("trained"), "train", training_run, print)
         return 0, out.getvalue(), err.getvalue()
     except SystemExit as end:
         return end.code, out.getvalue(), err.getvalue()

@@ -29,7 +29,7 @@ from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.control_limit import LimitedCost
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.external import certify
-from ocp_torch.runs.run import controller_of
+from ocp_torch.runs.finish import controller_of
 from ocp_torch.studies.kernel.rules import DualRule
 from ocp_torch.studies.reference import solve_reference
 from test_control_cost import BOUND, central_differences, columns, lowest, two_dimensional, value_and_gradients

@@ -8,7 +8,7 @@ import yaml
 
 from forked import TINY, train
 from ocp_torch.cli import compose as composition
-from ocp_torch.runs.resume import read_configuration, saved_configuration
+from ocp_torch.runs.configuration import read_configuration, saved_configuration
 from ocp_torch.training.checkpoint import load_checkpoint
 
 # Everything but the defaults: what a command line of `resume` alone would compose is another run.

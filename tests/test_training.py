@@ -13,7 +13,7 @@ from ocp_torch.certificate import certify
 from ocp_torch.control.controller import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
-from ocp_torch.runs.run import run_session
+from ocp_torch.runs.run import run_to_end
 from ocp_torch.training.checkpoint import load_checkpoint
 from ocp_torch.training.monitor import Silent
 from test_config import configured
@@ -50,7 +50,7 @@ def small(*overrides: str):
 
 
 def session(trainer, folder):
-    return run_session(trainer, build_certificate_settings(trainer.config), folder)
+    return run_to_end(trainer, build_certificate_settings(trainer.config), folder)
 
 
 def state_of(trainer) -> dict:
