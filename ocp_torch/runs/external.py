@@ -38,7 +38,8 @@ log = logging.getLogger(__name__)
 JUDGE_STREAM = 4
 # States at which a controller trained under another limit is held against the problem's.
 LIMIT_PROBES = 2**14
-MODEL = {"name": "mlp", "modes": None, "waves": None, "width": None, "depth": 3, "activation": None, "gated": None}
+# The model whose own sizes the networks have that are trained for a given controller.
+MODEL = {"name": "mlp"}
 
 
 def certify(

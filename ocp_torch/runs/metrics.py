@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from matplotlib.figure import Figure
 
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.maths.sampling import derive_seed
@@ -13,9 +14,6 @@ from ocp_torch.problems import Problem
 from ocp_torch.runs.pictures import motion
 from ocp_torch.runs.practice import metrics, metrics_table
 from ocp_torch.runs.practice.paths import Law
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
 METRICS = "metrics.json"

@@ -11,7 +11,7 @@ from ocp_torch.errors import require_choice, require_number
 MOST_DECAY = 0.999999
 
 
-def averaged(fields: nn.Module, kind: str = "ema", decay: float = 0.998) -> AveragedModel:
+def averaged(fields: nn.Module, kind: str = "ema", decay: float = 0.98) -> AveragedModel:
     """A running average of ``fields``: ``ema`` (exponential with ``decay``), ``uniform`` as in the paper, or ``none``.
 
     Call ``update_parameters(fields)`` at each iterate that counts; the average is in ``.module``.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path as FilePath
 
+from matplotlib.animation import PillowWriter
+
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.problems.problem import Problem
 from ocp_torch.runs.pictures.picture import FRAMES, moving
@@ -27,8 +29,6 @@ def animate(problem: Problem, policy: Law, path: str | FilePath, seed: int = 0) 
 
     Raises `InputError` for another suffix or a problem without a scene, `StorageError` for a file that cannot be written.
     """
-    from matplotlib.animation import PillowWriter
-
     path, shown = require_gif(problem, path), moving(problem, policy, seed)
     figure, writer = shown.figure(), PillowWriter(fps=FRAMES_PER_SECOND)
     figure.set_layout_engine("none")  # the same axes in every frame, and not found anew for each

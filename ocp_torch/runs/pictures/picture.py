@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import singledispatch
-from typing import TYPE_CHECKING
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from ocp_torch.control.policies import zero_policy
 from ocp_torch.maths.sampling import derive_seed
@@ -12,13 +14,9 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.planar import PlanarVehicle
-from ocp_torch.runs.canvas import blank_figure
 from ocp_torch.runs.pictures.scenes import Scene, projection, scene
 from ocp_torch.runs.practice.metrics import random_starts
 from ocp_torch.runs.practice.paths import Law, Path, simulate
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 # Time drawn, in units of 1 / rho, and frames of it.
 DURATION, FRAMES = 5.0, 160
@@ -43,7 +41,8 @@ class Moving:
 
     def figure(self) -> Figure:
         """An empty figure of the right size."""
-        figure = blank_figure(4.6 * len(self.panels), 4.2)
+        figure = Figure(figsize=(4.6 * len(self.panels), 4.2), layout="constrained")
+        FigureCanvasAgg(figure)
         return figure
 
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import singledispatch
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle, Wedge
 from torch import Tensor
 
 from ocp_torch.problems.problem import Problem
@@ -23,11 +24,8 @@ from ocp_torch.problems.systems.planar import PlanarVehicle
 from ocp_torch.problems.systems.robot import RobotArm
 from ocp_torch.runs.practice.paths import Path
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-# Of axes, a path and a frame k: draws the path up to that frame.
-Scene = Callable[..., None]
+# Draws the path up to frame k.
+Scene = Callable[[Axes, Path, int], None]
 # Earlier poses of an arm that stay visible.
 GHOSTS = 12
 
@@ -50,8 +48,6 @@ def _(problem: RobotArm) -> str:
 
 
 def _obstacles(axes: Axes, discs: list, clearance: float, period: float | None = None) -> None:
-    from matplotlib.patches import Circle
-
     shifts = [0.0] if period is None else [-period, 0.0, period]
     for x, y, radius in discs:
         for dx in shifts:
@@ -136,7 +132,6 @@ def phases_scene(problem) -> Scene:
 @scene.register
 def pendulum_scene(problem: Pendulum) -> Scene:
     """The portrait of angle and velocity, with the band in which the model is faithful; the rod at the end in a corner."""
-    from matplotlib.patches import Wedge
 
     def draw(axes: Axes, path: Path, k: int) -> None:
         for speed in (-problem.max_speed, problem.max_speed):
