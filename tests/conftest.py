@@ -6,8 +6,8 @@ import pytest
 import torch
 from hypothesis import Phase, settings
 
-import zoo
-from composing import quickly
+from support import zoo
+from support.composing import quickly
 
 # The same examples on every run: a failure is then a change in the code, never luck. No shrinking: most examples are
 # seeds of networks, and a smaller seed is not a simpler network.
@@ -33,11 +33,11 @@ def quick_composition():
 @pytest.fixture(scope="module")
 def cheap_looks():
     """For modules whose looks on the way need not say much."""
-    from ocp_torch.training import trainer
+    from ocp_torch.training import evaluator
 
-    little = replace(trainer.QUICK, points=64, replicates=2, trajectories=2, ascents=1, tolerance=0.01)
+    little = replace(evaluator.QUICK, points=64, replicates=2, trajectories=2, ascents=1, tolerance=0.01)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer, "QUICK", little)
+        patch.setattr(evaluator, "QUICK", little)
         yield
 
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -20,7 +21,6 @@ from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.external.recorded import certify_recorded
 from ocp_torch.certificate.progress import Progress, silent
-from ocp_torch.certificate.proof.rigorous import RigorousBound, proved_lower
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.sides import LowerSide, lower_side, upper_side
 from ocp_torch.certificate.simulated.occupation import a_priori_sup_occupation, estimated_sup_occupation
@@ -42,6 +42,9 @@ from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.scan import odd_states
+
+if TYPE_CHECKING:
+    from ocp_torch.certificate.proof.rigorous import RigorousBound
 
 # Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
 # a controller that another one clearly beats.
@@ -101,9 +104,13 @@ def certify_fields(
         lower = lower_side(
             problem, fields.value, sets, constants.M, settings.ascents, settings.searches(constants), seed, odd
         )
+    proved, proof_notes = None, []
     if settings.rigorous:
         progress("proof")
-    proved, proof_notes = proved_lower(problem, fields.value, lower) if settings.rigorous and lower else (None, [])
+        from ocp_torch.certificate.proof.rigorous import proved_lower  # loaded only where a proof is asked for
+
+        if lower:
+            proved, proof_notes = proved_lower(problem, fields.value, lower)
     posed = check_problem(problem, sets if has_value else few)
     policies = trained_policies(occupation, problem, fields, constants)
     if settings.trajectories:

@@ -15,9 +15,8 @@ from ocp_torch.certificate.lower.mollified import mollified_shift
 from ocp_torch.certificate.lower.recombined import recombined
 from ocp_torch.certificate.lower.shifted import Shift, slack_parts
 from ocp_torch.control.policies import Density
-from ocp_torch.maths import calculus
-from ocp_torch.maths.calculus import CHUNK, Field
-from ocp_torch.problems import formulas
+from ocp_torch.maths.jets import CHUNK, Field
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -115,19 +114,18 @@ def upper_side(
 def _upper_integrands(problem, control_density, occupation, samples: Samples, C_V: float):
     """The integrands of `J` and, without drift, `G`; `div(a mu + B w)` and `a mu + B w`."""
     cost, rho = problem.control_cost, problem.discount
-    w, inflow = formulas.control_inflow(samples, control_density, rho)
+    generator = Generator.of(problem, samples)
+    w, inflow = generator.control_inflow(control_density)
     spread, pushed = rho * (samples.mu0 - inflow), torch.einsum("ndm,nm->nd", samples.B, w)
     if problem.driftless:
         mu = occupation(samples.x)
         # An infinite mu stands still at no cost where f = 0: the closed minimum has that limit, J needs the number.
         J = torch.where(
             torch.isfinite(mu),
-            formulas.primal_integrand(samples, w, torch.where(torch.isfinite(mu), mu, 1.0), inflow - mu, cost, C_V),
+            generator.primal_integrand(w, torch.where(torch.isfinite(mu), mu, 1.0), inflow - mu, C_V),
             cost.primal_minimum(w, samples.f, C_V, inflow),
         )
         return J, cost.primal_minimum(w, samples.f, C_V, inflow), spread, pushed
-    div_a, _ = samples.require_divergences("J")
-    mu, derivative = calculus.directional_derivative(occupation, samples.x, samples.a)
-    drifted = mu * div_a + derivative
-    J = formulas.primal_integrand(samples, w, mu, inflow - mu - drifted / rho, cost, C_V)
+    mu, drifted = generator.drift_flux_divergence(occupation)
+    J = generator.primal_integrand(w, mu, inflow - mu - drifted / rho, C_V)
     return J, None, spread + drifted, pushed + mu.unsqueeze(-1) * samples.a

@@ -16,7 +16,7 @@ from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE
 from ocp_torch.files.limits import require_held, require_modest_problem
 from ocp_torch.files.storage import finite, load_tensors, save_tensors
 from ocp_torch.problems import PROBLEMS, Problem
-from ocp_torch.problems.check import check_once
+from ocp_torch.problems.checks import check_once
 from ocp_torch.problems.commands import ForeignProblem, made_by, naming
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.renamed import current_name, current_section

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from ocp_torch.fields.fields import Fields
-from ocp_torch.maths import calculus
-from ocp_torch.maths.calculus import Field
+from ocp_torch.maths import jets
+from ocp_torch.maths.jets import Field, Jet
 from ocp_torch.objectives.objective import CLOSED, NETWORK, SADDLE
-from ocp_torch.problems import formulas
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.control_cost import PowerCost
+from ocp_torch.problems.generator import Generator, pull_back
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -29,13 +29,11 @@ class ValuePolicy:
         self.problem, self.value = problem, value
 
     def __call__(self, x: Tensor) -> Tensor:
-        _, gradient = calculus.value_and_gradient(self.value, x)
-        return self.control(self.problem.control_matrix(x), gradient)
+        return self.control(self.problem.control_matrix(x), jets.jet(self.value, x))
 
-    def control(self, B: Tensor, gradient: Tensor) -> Tensor:
-        """The control where `grad V` is known already."""
-        pull = torch.einsum("ndm,nd->nm", B, gradient)
-        return self.problem.control_cost.argmax(-pull / self.problem.discount)
+    def control(self, B: Tensor, V: Jet) -> Tensor:
+        """The control where the jet of `V` is known already."""
+        return self.problem.control_cost.argmax(-pull_back(B, V.gradient) / self.problem.discount)
 
 
 def admissible_density(kind: str, problem: Problem, fields: Fields, constants: Constants) -> Field:
@@ -71,12 +69,12 @@ def occupation_density(kind: str, problem: Problem, fields: Fields, constants: C
 
     def closed(x: Tensor) -> Tensor:
         samples = Samples.of(problem, x)
-        w, inflow = formulas.control_inflow(samples, fields.control_density, rho)
+        w, inflow = Generator.of(problem, samples).control_inflow(fields.control_density)
         return cost.primal_occupation(w, samples.f, constants.C_V, inflow)
 
     def saddle(x: Tensor) -> Tensor:
-        value, gradient = calculus.value_and_gradient(fields.value, x)
-        beta = problem.state_cost(x) - value + (gradient * problem.drift(x)).sum(dim=-1) / rho
+        V = jets.jet(fields.value, x)
+        beta = problem.state_cost(x) - V.value + (V.gradient * problem.drift(x)).sum(dim=-1) / rho
         return cost.saddle_occupation(fields.control_density(x), beta, constants.M)
 
     return {CLOSED: closed, SADDLE: saddle, NETWORK: lambda x: fields.log_occupation(x).exp()}[kind]

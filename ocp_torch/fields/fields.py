@@ -72,7 +72,9 @@ class Fields(nn.Module):
 
 # A state cost whose mean is within this factor of 1 is of an ordinary size.
 ORDINARY = 1e4
-# What was found for a problem: the search takes seconds in eight dimensions, and the stage builds networks again.
+# States that a problem's units are estimated from; a spread below so much of the mean is rounding.
+SIZED, CONSTANT = 1024, 1e-12
+# What was found for a problem: the search takes seconds in eight dimensions, and fits to closed loops build networks too.
 _found: WeakKeyDictionary[Problem, dict[int, Tensor]] = WeakKeyDictionary()
 
 
@@ -87,7 +89,7 @@ def _waves(problem: Problem, count: int) -> Tensor:
 def cost_unit(problem: Problem) -> float:
     """What losses are divided by before they are differentiated: 1 for costs of an ordinary size, else the power of two next
     to their mean, so that no optimiser takes a gradient of 1e-12 for none."""
-    (f,) = problem.probe(1024, 0, "f")
+    (f,) = problem.probe(SIZED, 0, "f")
     size = float(f.abs().mean())
     ordinary = not math.isfinite(size) or size == 0.0 or 1.0 / ORDINARY <= size <= ORDINARY
     return 1.0 if ordinary else 2.0 ** round(math.log2(size))
@@ -98,7 +100,7 @@ def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:
 
     Raises `InputError` when the state cost is not finite at some sampled state.
     """
-    x, f = problem.probe(1024, 0, "x", "f")
+    x, f = problem.probe(SIZED, 0, "x", "f")
     if f.shape != (len(x),):
         raise InputError(f"state_cost gave shape {tuple(f.shape)} for states {tuple(x.shape)}; it must give (N,).")
     if not torch.isfinite(f).all():
@@ -106,6 +108,6 @@ def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:
         raise InputError(f"state_cost is not finite at x = {at}; it must be finite on the whole torus.")
     spread = float(f.std())
     mean = float(f.mean())
-    spread = spread if spread > 1e-12 * max(abs(mean), 1e-300) else max(abs(mean), 1.0)
+    spread = spread if spread > CONSTANT * max(abs(mean), 1e-300) else max(abs(mean), 1.0)
     control = math.pow(problem.exponent * spread, 1.0 / problem.exponent)
     return (mean, spread), control if problem.control_limit is None else min(control, problem.control_limit)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from ocp_torch.errors import InputError, require_choice, require_flag, require_integer, require_number
+from ocp_torch.maths.jets import Jet
 
 KERNELS = ("product", "isotropic")
 # Pairs of frequencies at most: beyond, one batch of features would fill the memory.
@@ -140,6 +141,11 @@ class SobolevField(nn.Module):
         self._make(SobolevFeatures(dim, regularity, kernel, modes), outputs, shift, scale, scaled)
 
     @classmethod
+    def defaults(cls, dim: int, worst_state: bool = False) -> dict:
+        """None: where ``modes`` is `None` the features choose."""
+        return {}
+
+    @classmethod
     def of(cls, features: SobolevFeatures, outputs: int | None) -> SobolevField:
         """The zero field on ``features`` that are there already, in units of 1."""
         field = cls.__new__(cls)
@@ -157,14 +163,14 @@ class SobolevField(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return self.shift + self.scale * (nn.functional.linear(self.features(x), self.coefficients))
 
-    def value_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """`V(x)` ``(N,)`` and `grad V(x)` ``(N, d)`` of a scalar field in closed form, from one set of waves."""
+    def jet(self, x: Tensor) -> Jet:
+        """The jet of a scalar field in closed form, from one set of waves."""
         cosines, sines, amplitudes = self.features._waves(x)
         constant, rest = self.coefficients[:1], self.coefficients[1:]
         of_cosine, of_sine = amplitudes * rest[: len(amplitudes)], amplitudes * rest[len(amplitudes) :]
         value = self.shift + self.scale * (constant + cosines @ of_cosine + sines @ of_sine)
         turned = cosines * of_sine - sines * of_cosine
-        return value, self.scale * 2.0 * math.pi * (turned @ self.features.frequencies)
+        return Jet(value, self.scale * 2.0 * math.pi * (turned @ self.features.frequencies))
 
     @property
     def norm(self) -> Tensor:

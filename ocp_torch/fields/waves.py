@@ -13,14 +13,17 @@ import math
 import torch
 from torch import Tensor
 
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.samples import Samples
 
 # States the coefficients are estimated from, and random mixtures that stand for all entries of `a` and of `B`.
 STATES, MIXTURES = 8192, 4
 # Wave vectors looked at are sums `l + r` of two lists; so many sums at most, and no entry beyond the highest harmonic.
 MOST_SUMS, HIGHEST = 1_000_000, 6
-# By how much, in the exponent, the largest coefficient of pure noise is exceeded with probability e^-3.
+# Under noise alone, the chance that any coefficient of any function passes the bar is e^-MARGIN, 5 %.
 MARGIN = 3.0
+# A standard deviation below so much of the mean size is rounding, in single precision: the function is constant.
+CONSTANT = 1e-5
 
 
 def prominent_waves(samples: Samples, count: int) -> Tensor:
@@ -90,7 +93,7 @@ def candidate_parts(dim: int) -> tuple[Tensor, Tensor]:
 
 def _channels(samples: Samples) -> list[Tensor]:
     """The data as scalar functions ``(N,)`` of mean 0 and variance 1; what is constant is left out."""
-    generator = torch.Generator().manual_seed(0)
+    generator = fixed_generator()
     raw = [samples.f, samples.mu0]
     for entries in (samples.a, samples.B.flatten(1)):
         spread = entries.float().std(dim=0)
@@ -109,4 +112,4 @@ def standardised(y: Tensor) -> list[Tensor]:
     """``y`` with mean 0 and variance 1, as a list; empty where it is constant."""
     centred = y - y.mean()
     spread = float(centred.std())
-    return [centred / spread] if spread > 1e-5 * float(y.abs().mean()) else []
+    return [centred / spread] if spread > CONSTANT * float(y.abs().mean()) else []

@@ -9,14 +9,12 @@ import numpy as np
 import torch
 
 from ocp_torch.errors import InputError, require_choice, require_number
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed, fixed_generator
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import drawn_starts, starts_narrowly
 from ocp_torch.runs.canvas import blank_figure
 
-# Branch of the seed tree for initial states of episodes, beside those of training.
-EPISODE_STREAM = 4
 # Rejections at most for one start: `mu0` has mean 1, so that a bound of its supremum is met soon.
 MOST_TRIES = 10_000
 # Where `mu0` is narrow episodes start at one of so many draws from it.
@@ -82,10 +80,10 @@ def _environment_class() -> type:
             self.time_step, self.horizon = time_step, horizon
             self.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (2 * problem.dim,), np.float32)
             self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (problem.control_dim,), np.float32)
-            self.generator = torch.Generator().manual_seed(derive_seed(seed, EPISODE_STREAM))
-            candidates = torch.rand(4096, problem.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+            self.generator = torch.Generator().manual_seed(derive_seed(seed, Branch.EPISODES))
+            candidates = torch.rand(4096, problem.dim, dtype=torch.float64, generator=fixed_generator())
             narrow = starts_narrowly(problem)
-            self._drawn = drawn_starts(problem, DRAWN_STARTS, derive_seed(seed, EPISODE_STREAM)) if narrow else None
+            self._drawn = drawn_starts(problem, DRAWN_STARTS, derive_seed(seed, Branch.EPISODES)) if narrow else None
             self._ceiling = 1.05 * float(problem.initial_density(candidates).max())
             self._weight = -math.expm1(-problem.discount * time_step)
             self.x, self.elapsed = torch.full((1, problem.dim), 0.5, dtype=torch.float64), 0.0
@@ -93,7 +91,7 @@ def _environment_class() -> type:
         def reset(self, *, seed: int | None = None, options: dict | None = None):
             super().reset(seed=seed)
             if seed is not None:
-                self.generator.manual_seed(derive_seed(seed, EPISODE_STREAM))
+                self.generator.manual_seed(derive_seed(seed, Branch.EPISODES))
             self.elapsed = 0.0
             if self._drawn is not None:
                 row = torch.randint(len(self._drawn), (1,), generator=self.generator)

@@ -7,27 +7,24 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
 from ocp_torch.errors import InputError, require_integer
+from ocp_torch.maths.seeds import Branch, derive_seed
 
-# A fresh scrambling after so many points: keeps the stream endless and fast-forwarding cheap.
+# Points of one scrambling. Then another begins: a sequence ends, and resuming must draw again all points of the block so far.
 SOBOL_BLOCK = 2**18
-# Evaluation draws come from another branch of the seed tree than training draws.
-TRAINING_STREAM, EVALUATION_STREAM = 0, 1
-
-
-def derive_seed(seed: int, *path: int) -> int:
-    """A seed for the branch ``path`` below ``seed``: distinct branches give independent streams."""
-    return int(np.random.SeedSequence(entropy=seed, spawn_key=path).generate_state(1, np.uint64)[0] >> 1)
+# Points drawn at once at least: a draw of few costs as much.
+DRAWN = 4096
+# Seeds that a Sobol engine takes are below this.
+ENGINE_SEEDS = 2**31
 
 
 def scrambled_sobol(count: int, dim: int, seed: int, dtype: torch.dtype, skip: int = 0) -> Tensor:
     """``count`` scrambled Sobol points in `[0, 1)^dim`, after ``skip`` of the same scrambling; ``(count, dim)``."""
-    engine = SobolEngine(dim, scramble=True, seed=seed % 2**31)
+    engine = SobolEngine(dim, scramble=True, seed=seed % ENGINE_SEEDS)
     if skip:
         engine.fast_forward(skip)
     points = engine.draw(count, dtype=torch.float64)
@@ -41,7 +38,7 @@ def evaluation_points(count: int, dim: int, replicate: int, seed: int) -> Tensor
     Digits beyond those the net property of ``count`` points rests on are drawn independently: with the shared digits of a
     linear scrambling, errors have heavy tails, and a few replicates give standard errors that cannot be trusted.
     """
-    branch = derive_seed(seed, EVALUATION_STREAM, replicate)
+    branch = derive_seed(seed, Branch.EVALUATION, replicate)
     points = scrambled_sobol(count, dim, branch, torch.float64)
     cells = 2.0 ** math.ceil(math.log2(count)) if count > 1 else 1.0
     jitter = torch.rand(count, dim, dtype=torch.float64, generator=torch.Generator().manual_seed(branch))
@@ -53,7 +50,7 @@ class UniformSampler:
 
     def __init__(self, dim: int, seed: int, dtype: torch.dtype) -> None:
         self.dim, self.dtype = dim, dtype
-        self.generator = torch.Generator().manual_seed(derive_seed(seed, TRAINING_STREAM))
+        self.generator = torch.Generator().manual_seed(derive_seed(seed, Branch.TRAINING))
 
     def draw(self, count: int) -> Tensor:
         """The next ``count`` states, ``(count, d)``."""
@@ -89,10 +86,10 @@ class SobolSampler:
         """The first points of ``block``, at least up to ``stop``; kept, because an engine's start costs more than a draw."""
         if self._start != block:
             self._start, self._buffer = block, torch.empty(0, self.dim, dtype=self.dtype)
-            seed = derive_seed(self.seed, TRAINING_STREAM, block)
-            self._engine = SobolEngine(self.dim, scramble=True, seed=seed % 2**31)
+            seed = derive_seed(self.seed, Branch.TRAINING, block)
+            self._engine = SobolEngine(self.dim, scramble=True, seed=seed % ENGINE_SEEDS)
         while len(self._buffer) < stop:
-            fresh = self._engine.draw(max(stop - len(self._buffer), 4096), dtype=torch.float64)
+            fresh = self._engine.draw(max(stop - len(self._buffer), DRAWN), dtype=torch.float64)
             self._buffer = torch.cat([self._buffer, fresh.to(self.dtype).remainder(1.0)])
         return self._buffer
 
@@ -108,7 +105,7 @@ class RowSampler:
 
     def __init__(self, rows: int, seed: int, digest: str) -> None:
         self.rows, self.digest = rows, digest
-        self.generator = torch.Generator().manual_seed(derive_seed(seed, TRAINING_STREAM))
+        self.generator = torch.Generator().manual_seed(derive_seed(seed, Branch.TRAINING))
 
     def draw(self, count: int) -> Tensor:
         """The next ``count`` rows, ``(count,)``."""

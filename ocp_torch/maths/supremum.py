@@ -8,6 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ocp_torch.maths.seeds import fixed_generator
+
+# The first step of an ascent, and the factors by which steps grow on success and shrink on failure. One of each together
+# shrinks them: an ascent that has come near a maximum goes on in smaller steps.
+FIRST_STEP, GROWTH, SHRINKAGE = 1e-2, 1.5, 0.4
 # How often `minimiser` narrows its interval: (2/3)^30 of it is left.
 NARROWINGS = 30
 
@@ -33,7 +38,7 @@ def supremum(
     points: Tensor,
     ascents: int = 32,
     steps: int = 60,
-    start_step: float = 1e-2,
+    start_step: float = FIRST_STEP,
     differentiable: bool = True,
 ) -> Extremum:
     """The largest value of ``function`` ``(N, d) -> (N,)`` met at ``points`` and on ascents from the ``ascents`` best.
@@ -57,13 +62,13 @@ def climb(
     x: Tensor,
     best: Tensor,
     steps: int = 60,
-    start_step: float = 1e-2,
+    start_step: float = FIRST_STEP,
     differentiable: bool = True,
 ) -> tuple[Tensor, Tensor]:
     """Where local ascents from ``x`` ``(N, d)``, with values ``best`` ``(N,)``, end, and the values there; they stop at the
     first NaN that any of them meets, which is then the value of its row."""
     step = torch.full_like(best, start_step)
-    generator = torch.Generator(device="cpu").manual_seed(0)
+    generator = fixed_generator()
     for _ in range(steps):
         direction = _gradient(function, x) if differentiable else torch.randn(x.shape, generator=generator).to(x)
         direction = direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-30)
@@ -76,7 +81,7 @@ def climb(
         best = torch.where(better, reached, best)
         if odd.any():
             break
-        step = torch.where(better, 1.5 * step, 0.4 * step)
+        step = torch.where(better, GROWTH * step, SHRINKAGE * step)
     return x, best
 
 

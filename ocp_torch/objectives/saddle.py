@@ -9,11 +9,10 @@ from torch import Tensor
 
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fields
-from ocp_torch.maths import calculus
+from ocp_torch.maths import jets
 from ocp_torch.objectives.dual import value_loss
 from ocp_torch.objectives.objective import NETWORK, SADDLE, Objective
-from ocp_torch.problems import formulas
-from ocp_torch.problems.constants import Constants
+from ocp_torch.objectives.phase import Phase
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -29,20 +28,18 @@ class Saddle(Objective):
     players = {"value": (VALUE,), "density": (CONTROL_DENSITY,)}
     occupation = SADDLE
 
-    def __init__(self, problem: Problem, constants: Constants, augmentation: float = 0.0) -> None:
-        super().__init__(problem, constants)
+    def __init__(self, problem: Problem, augmentation: float = 0.0, notes: tuple[str, ...] = ()) -> None:
+        super().__init__(problem, notes)
         self.augmentation = augmentation
 
-    def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        value, gradient = calculus.value_and_gradient(fields.value, samples.x)
-        w = self.cost.within(fields.control_density(samples.x), self.constants.M)
-        pushed = (formulas.pull_back(samples, gradient) * w).sum(dim=-1) / self.rho
-        beta = samples.f - value + formulas.along(samples, gradient) / self.rho
-        psi = samples.mean(value * samples.mu0 + pushed + self.cost.saddle_minimum(w, beta, self.constants.M))
+    def losses(self, fields: Fields, samples: Samples, phase: Phase) -> dict[str, Tensor]:
+        generator, V = self.generator(samples), jets.jet(fields.value, samples.x)
+        w = self.cost.within(fields.control_density(samples.x), phase.constants.M)
+        pushed, beta = generator.controlled(V, w) / self.rho, generator.reduced_cost(V)
+        psi = samples.mean(V.value * samples.mu0 + pushed + self.cost.saddle_minimum(w, beta, phase.constants.M))
         if self.augmentation == 0.0:
             return {"value": -psi, "density": psi}
-        slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
-        own = value_loss(self, fields, samples, value, slack, residual=0.0)
+        own = value_loss(phase, fields, samples, V.value, generator.hjb_slack(V), residual=0.0)
         return {"value": -psi + self.augmentation * own, "density": psi}
 
 
@@ -63,7 +60,7 @@ class AugmentedSaddle(Objective):
     value player ignores a density player that has not arrived yet (the game is then a dual ascent with a best response),
     and nothing is lost at the equilibrium, where `L` is flat in `V`. With ``warm_start`` and `c = 0` the density player
     even rests for that part of the run: what it would answer to is not there yet. Then it also learns from ``density_batch``
-    states of each batch at most, of those that carry weight (`m` tangents through `w` make its states expensive).
+    states of each batch at most, of those that carry weight (`m` reverse passes through `w` make its states expensive).
 
     Convexity: `l` is a perspective plus linear terms, so `max(l, 0)` and `J` are convex in `(w, mu)`, and `c L + k F_M` is
     concave in `V`. For `c = 1` and where `l >= 0` the operator of the game is that of `L`, which is monotone, plus
@@ -76,48 +73,44 @@ class AugmentedSaddle(Objective):
     def __init__(
         self,
         problem: Problem,
-        constants: Constants,
         augmentation: float,
         coupling: float,
         residual: float,
         warm_start: float,
         density_batch: int | None,
     ) -> None:
-        super().__init__(problem, constants)
+        super().__init__(problem)
         self.augmentation, self.coupling, self.residual = augmentation, coupling, residual
         self.density_batch = density_batch
-        self.resting = {"density": warm_start if coupling == 0.0 else 0.0}
+        self.delays = {"density": warm_start if coupling == 0.0 else 0.0}
 
-    @property
-    def needs_divergences(self) -> bool:
+    def needs_divergences(self, phase: Phase) -> bool:
         """Only once the density player moves."""
-        return self.progress >= self.resting["density"]
+        return phase.progress >= self.delays["density"]
 
-    def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        k, C_V = self.augmentation, self.constants.C_V
-        value, gradient = calculus.value_and_gradient(fields.value, samples.x)
-        slack = formulas.hjb_slack(samples, value, gradient, self.cost, self.rho)
-        of_value = k * value_loss(self, fields, samples, value, slack, self.residual)
-        if not self.needs_divergences:
+    def losses(self, fields: Fields, samples: Samples, phase: Phase) -> dict[str, Tensor]:
+        k, C_V = self.augmentation, phase.constants.C_V
+        generator, V = self.generator(samples), jets.jet(fields.value, samples.x)
+        of_value = k * value_loss(phase, fields, samples, V.value, generator.hjb_slack(V), self.residual)
+        if not self.needs_divergences(phase):
             return {"value": of_value}
         if self.coupling == 0.0:
             samples, rows = samples.take_weighted(self.density_batch)
-            value, gradient = value[rows], gradient[rows]
-        w, inflow = formulas.control_inflow(samples, self.admissible(fields), self.rho)
-        mu, loss = formulas.occupation_outflow(samples, fields.log_occupation, self.rho)
+            generator, V = self.generator(samples), V.map(lambda part: part[rows])
+        w, inflow = generator.control_inflow(self.admissible(fields))
+        mu, outflow = generator.occupation_outflow(fields.log_occupation)
         running = samples.f * mu + self.cost.perspective(w, mu)
-        hinged = running + C_V * (inflow - loss).clamp_min(0.0)
+        hinged = running + C_V * (inflow - outflow).clamp_min(0.0)
         # Each player sees the other as data.
-        local = running + formulas.multiplier_term(samples, value.detach(), gradient.detach(), mu, w, self.rho)
+        local = running + generator.multiplier_term(V.map(Tensor.detach), mu, w)
         if self.coupling > 0.0:
-            seen = formulas.multiplier_term(samples, value, gradient, mu.detach(), w.detach(), self.rho)
-            of_value = of_value - self.coupling * samples.mean(value * samples.mu0 + seen)
+            seen = generator.multiplier_term(V, mu.detach(), w.detach())
+            of_value = of_value - self.coupling * samples.mean(V.value * samples.mu0 + seen)
         return {"value": of_value, "density": samples.mean(local.clamp_min(0.0) + k * hinged)}
 
 
 def saddle(
     problem: Problem,
-    constants: Constants,
     augmentation: float = 0.25,
     coupling: float = 0.0,
     residual: float = 0.3,
@@ -136,9 +129,8 @@ def saddle(
     residual = require_number("method.residual", residual, at_least=0.0)
     warm_start = require_number("method.warm_start", warm_start, at_least=0.0, at_most=1.0)
     if weight == 0.0:
-        return Saddle(problem, constants)
+        return Saddle(problem)
     if problem.gives_divergences:
-        return AugmentedSaddle(problem, constants, weight, coupling, residual, warm_start, density_batch)
-    objective = Saddle(problem, constants, weight)
-    objective.notes = ("this problem gives no divergences of a and B: pd trains w alone, with mu in closed form.",)
-    return objective
+        return AugmentedSaddle(problem, weight, coupling, residual, warm_start, density_batch)
+    note = "this problem gives no divergences of a and B: pd trains w alone, with mu in closed form."
+    return Saddle(problem, weight, notes=(note,))

@@ -3,6 +3,7 @@
 from ocp_torch.problems.exact.circle import Circle
 from ocp_torch.problems.exact.manufactured import Manufactured
 from ocp_torch.problems.exact.torus import Torus
+from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.recorded.dataset import Dataset
 from ocp_torch.problems.simulator.simulator import Simulator
@@ -29,4 +30,7 @@ PROBLEMS = {
     "robot": RobotArm,
 }
 
-__all__ = ["Simulator", "Problem", "PROBLEMS", *sorted(cls.__name__ for cls in PROBLEMS.values())]
+# What `Simulator` was called in files written before.
+Callable = Simulator
+
+__all__ = ["Lipschitz", "Problem", "Simulator", "PROBLEMS", *sorted(cls.__name__ for cls in PROBLEMS.values())]

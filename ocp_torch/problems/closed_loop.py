@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from ocp_torch.maths import calculus
+from ocp_torch.maths import jets
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -28,7 +28,7 @@ class ClosedLoop(Problem):
 
     def samples_of(self, sets: list[Samples]) -> list[Samples]:
         """Its data at the states of ``sets``, with their weights."""
-        pieces = lambda s: [Samples.of(self, part.x, weight=part.weight) for part in s.split(calculus.CHUNK)]
+        pieces = lambda s: [Samples.of(self, part.x, weight=part.weight) for part in s.split(jets.CHUNK)]
         return [Samples.concatenate(pieces(samples)) for samples in sets]
 
     def state_cost(self, x: Tensor) -> Tensor:
@@ -38,11 +38,11 @@ class ClosedLoop(Problem):
         return self.problem.velocity(x, self.policy(x))
 
     def drift_divergence(self, x: Tensor) -> Tensor | None:
-        """`div g_u = div a + (div B) . u + sum_k (d u_k along column k of B)`: `m` tangents through the controller."""
+        """`div g_u = div a + (div B) . u + sum_k (d u_k along column k of B)`: one reverse pass for each of the controls."""
         div_a, div_B = self.problem.drift_divergence(x), self.problem.control_divergence(x)
         if div_a is None or div_B is None:
             return None
-        _, flux = calculus.control_flux_divergence(self.policy, x, self.problem.control_matrix(x), div_B)
+        _, flux = jets.control_flux_divergence(self.policy, x, self.problem.control_matrix(x), div_B)
         return div_a + flux
 
     def control_matrix(self, x: Tensor) -> Tensor:

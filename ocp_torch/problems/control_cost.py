@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import require_number
-from ocp_torch.maths.calculus import Field
-from ocp_torch.maths.taylor import TaylorModel
+from ocp_torch.maths.jets import Field
 
 
 def power(base: Tensor, exponent: float) -> Tensor:
@@ -62,10 +61,6 @@ class PowerCost:
     def conjugate(self, p: Tensor) -> Tensor:
         """`R*(p) = sup_u p.u - R(u)`: ``(N, m) -> (N,)``."""
         return norm_power(p, self.conjugate_exponent) / self.conjugate_exponent
-
-    def conjugate_model(self, p: TaylorModel) -> TaylorModel:
-        """`R*(p)` over a batch of cells, ``(N, m) -> (N,)``."""
-        return (p * p).sum().power(0.5 * self.conjugate_exponent) * (1.0 / self.conjugate_exponent)
 
     def argmax(self, p: Tensor) -> Tensor:
         """`grad R*(p) = |p|^{q'-2} p`, the control that attains the conjugate: ``(N, m) -> (N, m)``."""

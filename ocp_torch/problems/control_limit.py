@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import require_number
-from ocp_torch.maths.calculus import Field
-from ocp_torch.maths.taylor import ROUNDING, TaylorModel, upward
+from ocp_torch.maths.jets import Field
 from ocp_torch.problems.control_cost import PowerCost, norm_power
 
 # How far, relative to the limit, rounding may carry a control beyond it.
@@ -31,8 +30,8 @@ class LimitedCost(PowerCost):
     def __init__(self, exponent: float, limit: float) -> None:
         super().__init__(exponent)
         self.limit = require_number("problem.control_limit", limit, above=0.0, at_least=1e-9, at_most=1e9)
-        self._knee = self.limit ** (self.q - 1.0)  # where |grad R*(p)| reaches the limit
-        self._dearest = self.limit**self.q / self.q  # R at the limit
+        self.knee = self.limit ** (self.q - 1.0)  # where |grad R*(p)| reaches the limit
+        self.largest = self.limit**self.q / self.q  # R at the limit
 
     def cost(self, u: Tensor) -> Tensor:
         allowed = norm_power(u.detach(), 1.0) <= self.limit * (1.0 + _slack(u))
@@ -40,26 +39,14 @@ class LimitedCost(PowerCost):
 
     def conjugate(self, p: Tensor) -> Tensor:
         size = norm_power(p, 1.0)
-        inside = size <= self._knee
+        inside = size <= self.knee
         # The power of a large |p| overflows, and would spoil the gradient from the branch that is not taken.
         near = super().conjugate(torch.where(inside.unsqueeze(-1), p, 0.0))
-        return torch.where(inside, near, self.limit * size - self._dearest)
-
-    def conjugate_model(self, p: TaylorModel) -> TaylorModel:
-        """Cells across `|p| = c^{q-1}` take `R*` less what it exceeds `R_c*` by, which grows quadratically from 0 there."""
-        near, squares = super().conjugate_model(p), (p * p).sum()
-        low, high = squares.bounds()
-        far = squares.power(0.5) * self.limit + (-self._dearest)
-        top = upward(high.clamp_min(0.0).sqrt())
-        parts = top**self.conjugate_exponent / self.conjugate_exponent, self.limit * top, self._dearest
-        excess = upward((parts[0] - parts[1] + parts[2]).clamp_min(0.0) + 1e-12 * sum(parts))
-        across = near + TaylorModel.constant(-0.5 * excess, upward(0.5 * excess + ROUNDING * excess), near.basis)
-        inside, outside = high <= (1.0 - 1e-12) * self._knee**2, low >= (1.0 + 1e-12) * self._knee**2
-        return near.where(inside, far.where(outside, across))
+        return torch.where(inside, near, self.limit * size - self.largest)
 
     def argmax(self, p: Tensor) -> Tensor:
         size = norm_power(p, 1.0).unsqueeze(-1)
-        inside = size <= self._knee
+        inside = size <= self.knee
         near = super().argmax(torch.where(inside, p, 0.0))
         return torch.where(inside, near, self.limit * p / torch.where(inside, 1.0, size))
 
@@ -88,7 +75,7 @@ class LimitedCost(PowerCost):
     def primal_minimum(self, w: Tensor, f: Tensor, value_bound: float, residual: Tensor) -> Tensor:
         least = norm_power(w, 1.0) / self.limit
         clipped = super().primal_occupation(w.detach(), f, value_bound, residual.detach()) < least
-        at_limit = least * (f + self._dearest) + value_bound * (residual - least).clamp_min(0.0)
+        at_limit = least * (f + self.largest) + value_bound * (residual - least).clamp_min(0.0)
         return torch.where(clipped, at_limit, super().primal_minimum(w, f, value_bound, residual))
 
     def saddle_occupation(self, w: Tensor, beta: Tensor, occupation_bound: float) -> Tensor:
@@ -100,7 +87,7 @@ class LimitedCost(PowerCost):
         """As in Lemma 3 over `[|w| / c, M]`, and infinite where that is empty: hand in ``within(w, M)``."""
         least = norm_power(w, 1.0) / self.limit
         clipped = super().saddle_occupation(w.detach(), beta.detach(), occupation_bound) < least
-        at_limit = least * (beta + self._dearest)
+        at_limit = least * (beta + self.largest)
         found = torch.where(clipped, at_limit, super().saddle_minimum(w, beta, occupation_bound))
         return torch.where(least > occupation_bound * (1.0 + _slack(w)), math.inf, found)
 

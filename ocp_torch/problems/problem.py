@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError, require_integer, require_number
-from ocp_torch.maths import calculus
-from ocp_torch.maths.enclosure import Enclosure, Lipschitz, lipschitz_enclosure
+from ocp_torch.maths import jets
 from ocp_torch.maths.sampling import scrambled_sobol
-from ocp_torch.maths.taylor import Box
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.control_limit import control_cost
+from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.samples import Samples
 
 # Beyond this, B alone would fill the memory.
@@ -108,7 +108,7 @@ class Problem:
         """`div a`, ``(N,)``: by autograd through `drift`. Override where it is known, or give `None`."""
         if self.driftless:
             return torch.zeros_like(x[:, 0])
-        return calculus.divergence(self.drift, x)
+        return jets.divergence(self.drift, x)
 
     def control_divergence(self, x: Tensor) -> Tensor | None:
         """The divergence of each column of `B`, ``(N, m)``; by forward-mode autograd unless `B` is constant."""
@@ -124,14 +124,6 @@ class Problem:
         """Whether `div a` and `div B` are to be had."""
         x = torch.full((1, self.dim), 0.5, dtype=torch.float64)
         return self.drift_divergence(x) is not None and self.control_divergence(x) is not None
-
-    def enclosure(self, box: Box) -> Enclosure | None:
-        """What `f`, `a`, `B` and `mu0` can be over a batch of cells, for rigorous bounds; `None` where nobody knows.
-
-        Here from ``lipschitz`` constants alone. Taylor models, as in `Torus`, converge faster; a class that overrides the
-        data must override this too.
-        """
-        return lipschitz_enclosure(self, Problem, box)
 
     # Exact truth, where known: `None` otherwise.
     def exact_value(self, x: Tensor) -> Tensor | None:
@@ -162,7 +154,7 @@ class Problem:
     def independent_samples(self, count: int) -> Samples:
         """Data at independent draws of states, at most ``count``, the same ones always: evenly spread states show waves
         that are not there."""
-        x = torch.rand(count, self.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        x = torch.rand(count, self.dim, dtype=torch.float64, generator=fixed_generator())
         return Samples.of(self, x, divergences=False)
 
     @property

@@ -11,12 +11,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import climb
 from ocp_torch.problems.problem import Problem
 
-# Branch of the seed tree.
-STREAM = 10
 # States scanned at once, states kept for each column and kind of oddity, and how far off a neighbour is.
 CHUNK, KEPT, NEARBY = 2**16, 16, 0.02
 # Steps downhill and uphill, along gradients where there are some and then in random directions.
@@ -35,7 +33,7 @@ def odd_states(problem: Problem, count: int, seed: int) -> Tensor:
 @torch.no_grad()
 def _odd_states(problem: Problem, count: int, seed: int) -> Tensor:
     pairs = count // 2
-    generator = torch.Generator().manual_seed(derive_seed(seed, STREAM))
+    generator = torch.Generator().manual_seed(derive_seed(seed, Branch.SCAN))
     draw = lambda size: torch.rand(size, problem.dim, generator=generator, dtype=torch.float64)
     found: dict[str, tuple[Tensor, Tensor]] = {}
     for start in range(0, pairs, CHUNK):

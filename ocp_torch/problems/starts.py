@@ -11,8 +11,9 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.mixtures import SCANNED, Mixture, fitted_mixture
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.mixture_fit import SCANNED, fitted_mixture
+from ocp_torch.maths.mixtures import Mixture
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.simulator import Simulator
 
@@ -63,7 +64,7 @@ def drawn_starts(problem: Problem, count: int, seed: int) -> Tensor:
     x, weight = initial_points(problem, CANDIDATES * count, 0, seed)
     if not float(weight.sum()) > 0.0:
         return x[:count]
-    generator = torch.Generator().manual_seed(derive_seed(seed, count))
+    generator = torch.Generator().manual_seed(derive_seed(seed, Branch.DRAWN_STARTS, count))
     return x[torch.multinomial(weight, count, replacement=True, generator=generator)]
 
 

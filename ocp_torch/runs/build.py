@@ -24,11 +24,12 @@ from ocp_torch.fields import MODELS, VALUE, Fields
 from ocp_torch.fields.fields import cost_unit
 from ocp_torch.fields.waves import STATES
 from ocp_torch.files.memory import require_memory
-from ocp_torch.maths.sampling import SAMPLERS, RowSampler, derive_seed
+from ocp_torch.maths.sampling import SAMPLERS, RowSampler
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives import METHODS, Objective
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import in_their_words, origin, words
-from ocp_torch.problems.check import check_once
+from ocp_torch.problems.checks import check_once
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.problem import MOST_COORDINATES
 from ocp_torch.problems.renamed import current_target
@@ -36,11 +37,11 @@ from ocp_torch.runs.process import use_threads
 from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.budgets import fill
+from ocp_torch.training.health import Health
 from ocp_torch.training.settings import TrainerSettings
+from ocp_torch.training.state import TrainState
 from ocp_torch.training.trainer import Trainer
 
-# Branch of the seed tree for network weights, beside those of the samplers.
-WEIGHTS_STREAM = 2
 # Numbers that a step keeps per unit of a network and state: 6 to 10 were measured, in one and in four dimensions.
 VALUES_PER_UNIT = 5
 # Of all methods; a learning rate may be set for each that the chosen one has.
@@ -96,14 +97,14 @@ def build_trainer(config: dict) -> Trainer:
     method = require_section("method", config["method"])
     name = require_choice("method.name", method.pop("name", None), METHODS)
     constants = resolve_constants(problem, **{field: method.pop(field, None) for field in BOUND_FIELDS})
-    objective = call(METHODS[name], "method", method, problem=problem, constants=constants)
+    objective = call(METHODS[name], "method", method, problem=problem)
     if settings.target_gap is not None and VALUE not in objective.fields:
         raise InputError(
             f"trainer.target_gap is {settings.target_gap:g}, but {name} gives no lower bound to measure a gap by; "
             "use dual or pd."
         )
     network = build_network(config["model"])
-    fields = Fields.build(problem, objective.fields, network, derive_seed(seed, WEIGHTS_STREAM))
+    fields = Fields.build(problem, objective.fields, network, derive_seed(seed, Branch.WEIGHTS))
     fields = fields.to(dtype=settings.torch_dtype, device=settings.torch_device)
     require_memory("trainer.batch", settings.batch, _bytes_per_state(problem, fields, settings))
     stepper = _build_stepper(config, fields, objective, settings.steps, cost_unit(problem))
@@ -120,9 +121,8 @@ def build_trainer(config: dict) -> Trainer:
         sampler = RowSampler(problem.rows, seed, problem.recording.digest)
     batches = Batches(problem, fields, objective, sampler, settings.batch, seed, visited)
     names = (problem_name(problem), name)
-    return Trainer(
-        problem, fields, objective, constants, stepper, average, batches, settings, network, seed, names, config
-    )
+    state = TrainState(names, config, fields, average, stepper, batches, Health.of(problem), constants)
+    return Trainer(problem, objective, settings, network, seed, state)
 
 
 def _bytes_per_state(problem: Problem, fields: Fields, settings: TrainerSettings) -> float:

@@ -17,10 +17,11 @@ from ocp_torch.control.policies import Policy, trained_policies
 from ocp_torch.errors import InputError, require_flag, require_integer
 from ocp_torch.fields import Fields
 from ocp_torch.fields.fields import VALUE, cost_unit
-from ocp_torch.maths.calculus import Field
-from ocp_torch.maths.sampling import SAMPLERS, derive_seed, scrambled_sobol
+from ocp_torch.maths.jets import Field
+from ocp_torch.maths.sampling import SAMPLERS, scrambled_sobol
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import batched
-from ocp_torch.objectives import Dual
+from ocp_torch.objectives import Dual, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.runs import figures
@@ -28,14 +29,12 @@ from ocp_torch.runs.build import build_certificate_settings, build_network, buil
 from ocp_torch.runs.interval import interval_figure
 from ocp_torch.runs.loading import load_policy, load_saved
 from ocp_torch.runs.process import use_threads
-from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
+from ocp_torch.steppers import advance, short_fit
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.budgets import fill
 
 log = logging.getLogger(__name__)
 
-# Branch of the seed tree for the V trained here, beside those of runs, evaluation and the stage.
-JUDGE_STREAM = 4
 # States at which a controller trained under another limit is held against the problem's.
 LIMIT_PROBES = 2**14
 # The model whose own sizes the networks have that are trained for a given controller.
@@ -89,16 +88,13 @@ def train_value(
     seed: int,
 ) -> Fields:
     """A `V` by the dual, with the defaults of a run."""
-    fields = Fields.build(problem, (VALUE,), network, derive_seed(seed, JUDGE_STREAM, 0))
-    objective = Dual(problem, constants)
-    states = SAMPLERS[sampler](problem.dim, derive_seed(seed, JUDGE_STREAM, 1), torch.float32)
-    batches = Batches(problem, fields, objective, states, batch, derive_seed(seed, JUDGE_STREAM, 2))
-    makers = {player: optimizer_maker("soap", lr, betas=(0.95, 0.95)) for player in objective.players}
-    stepper = Simultaneous(fields, objective, makers, schedule_maker("cosine", steps), unit=cost_unit(problem))
-    average = averaged(fields, decay=0.98)
+    fields = Fields.build(problem, (VALUE,), network, derive_seed(seed, Branch.EXTERNAL_VALUE, 0))
+    objective = Dual(problem)
+    states = SAMPLERS[sampler](problem.dim, derive_seed(seed, Branch.EXTERNAL_VALUE, 1), torch.float32)
+    batches = Batches(problem, fields, objective, states, batch, derive_seed(seed, Branch.EXTERNAL_VALUE, 2))
+    stepper, average = short_fit(fields, objective, lr, steps, cost_unit(problem))
     for step in range(steps):
-        objective.progress = step / steps
-        stepper.step(batches.draw, lambda: average.update_parameters(fields))
+        advance(stepper, average, batches.draw, Phase(constants, step / steps))
     return average.module
 
 

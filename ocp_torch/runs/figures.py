@@ -15,7 +15,7 @@ from ocp_torch.certificate.simulated.simulation import rate_at
 from ocp_torch.control.policies import NETWORK, occupation_density, trained_policies
 from ocp_torch.fields import Fields
 from ocp_torch.files.storage import write_atomically
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LINE_POINTS, MAP_POINTS = 400, 80
-# Of the simulated occupation density: bins a coordinate by dimension, starts, steps of a trajectory, branch of the seeds.
-BINS, STARTS, FIGURE_STEPS, FIGURE_STREAM = {1: 50, 2: 20}, 2048, 16, 5
+# Of the simulated occupation density: bins a coordinate by dimension, starts, steps of a trajectory.
+BINS, STARTS, FIGURE_STEPS = {1: 50, 2: 20}, 2048, 16
 TITLES = {
     "value": "V",
     "control_value": "u from V",
@@ -66,7 +66,7 @@ def simulated_occupation(
     Starts weigh `mu0`; their number and the bins are few enough for a fraction of a second.
     """
     bins = BINS[problem.dim]
-    points, start_mass = initial_points(problem, STARTS, 0, derive_seed(seed, FIGURE_STREAM), extra=1)
+    points, start_mass = initial_points(problem, STARTS, 0, derive_seed(seed, Branch.FIGURES), extra=1)
     x0, times = points[:, :-1], -torch.log1p(-points[:, -1]) / problem.discount
     _, end = rate_at(lambda x: (problem.velocity(x, policy(x)), x[:, 0]), x0, problem.discount, times, FIGURE_STEPS)
     cell = lambda x: ((x * bins).long().clamp(0, bins - 1) * bins ** torch.arange(problem.dim)).sum(dim=-1)

@@ -17,12 +17,13 @@ from ocp_torch.files.storage import write_atomically
 from ocp_torch.problems.blame import blamed
 from ocp_torch.runs import completion, figures
 from ocp_torch.runs.interval import interval_figure
-from ocp_torch.runs.metrics import practical_figures
+from ocp_torch.runs.pictures import practical_figures
 from ocp_torch.steppers import NonFiniteError
 from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM
 from ocp_torch.training.health import sanity_warnings
 from ocp_torch.training.monitor import Monitor
-from ocp_torch.training.trainer import FAILED, NOT_FINITE, Trainer
+from ocp_torch.training.stopping import FAILED, NOT_FINITE
+from ocp_torch.training.trainer import Trainer
 
 
 def failure_of(trainer: Trainer, error: BaseException) -> str | None:
@@ -61,7 +62,7 @@ def salvaged(
     best, seen = trainer.health.best, trainer.health.certificate
     if best is None and trainer.step == 0:
         raise InputError(failure)
-    fields = trainer.averaged_fields if best is None else trainer.best_fields()
+    fields = trainer.averaged_fields if best is None else trainer.evaluator.best_fields()
     step = trainer.step if best is None else best.step
     notes = [f"handed out are the averaged fields of step {step}. {failure}"]
     monitor.stopped(trainer, failure, settings)

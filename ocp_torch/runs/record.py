@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
 from ocp_torch.files.memory import require_memory
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem
 from ocp_torch.problems.recorded import recording
 from ocp_torch.problems.samples import Samples
@@ -19,8 +19,8 @@ from ocp_torch.runs.build import build_problem
 
 log = logging.getLogger(__name__)
 
-# Branch of the seed tree for recorded states; states evaluated at once.
-RECORD_STREAM, CHUNK = 8, 4096
+# States evaluated at once.
+CHUNK = 4096
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Recorder:
 
     def _states(self) -> Tensor:
         """Independent states: uniform, or by rejection, coordinate by coordinate."""
-        generator = torch.Generator().manual_seed(derive_seed(self.seed, RECORD_STREAM))
+        generator = torch.Generator().manual_seed(derive_seed(self.seed, Branch.RECORDING))
         draw = lambda *shape: torch.rand(*shape, dtype=torch.float64, generator=generator)
         x = draw(self.count, self.problem.dim)
         wrong = torch.full(x.shape, self.contrast > 0.0)

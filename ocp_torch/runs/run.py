@@ -22,7 +22,8 @@ from ocp_torch.training.checkpoint import LAST
 from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.monitor import Monitor
 from ocp_torch.training.signals import Signals
-from ocp_torch.training.trainer import TARGET_GAP, Trainer
+from ocp_torch.training.stopping import TARGET_GAP, postpone
+from ocp_torch.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
 
@@ -97,13 +98,13 @@ def _trained(
         signals.saved = True  # from here on a signal need not wait
         signals.take()
         monitor.stopped(trainer, f"Training stopped: {trainer.why_stopped}", settings)
-        fields, note = trainer.choose()
+        fields, note = trainer.evaluator.choose(trainer.run)
         certificate = trainer.certify(settings, fields)
         gap = certificate.gap["certified"]
         if reason != TARGET_GAP or (gap is not None and gap <= target):
             return with_warnings(trainer, certificate, [note] if note else []), fields
         log.info("step %d: the certified gap is not %g yet; training goes on.", trainer.step, target)
-        trainer.go_on()
+        postpone(trainer.state)
 
 
 def summary(trainer: Trainer) -> str:

@@ -7,15 +7,12 @@ import random
 import numpy as np
 import torch
 
-from ocp_torch.maths.sampling import derive_seed
-
-# Branch of the seed tree for the global generators, beside samplers, weights and the certification stage.
-GLOBAL_STREAM = 4
+from ocp_torch.maths.seeds import Branch, derive_seed
 
 
 def seed_generators(seed: int) -> None:
     """Start every global generator from ``seed`` alone."""
-    branch = derive_seed(seed, GLOBAL_STREAM)
+    branch = derive_seed(seed, Branch.GLOBAL_GENERATORS)
     torch.manual_seed(branch)
     np.random.seed(branch % 2**32)  # noqa: NPY002 (the global one is what a user's code draws from)
     random.seed(branch)

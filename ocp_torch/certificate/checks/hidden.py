@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.student import t_factor
+from ocp_torch.maths.seeds import fixed_generator
 
 # Waves along each of the first axes, and in random directions.
 ALONG, MOST_AXES, RANDOM, LARGEST = (1, 2, 3, 4, 6, 8, 12), 8, 24, 4
@@ -93,5 +94,5 @@ def _waves(dim: int) -> Tensor:
     """Whole vectors ``(K, d)``: 0, some along the axes, some at random."""
     axes = torch.eye(dim, dtype=torch.float64)[:MOST_AXES]
     along = [k * axes for k in ALONG]
-    draw = torch.randint(-LARGEST, LARGEST + 1, (RANDOM, dim), generator=torch.Generator().manual_seed(0)).to(axes)
+    draw = torch.randint(-LARGEST, LARGEST + 1, (RANDOM, dim), generator=fixed_generator()).to(axes)
     return torch.cat([torch.zeros(1, dim, dtype=torch.float64), *along, draw]).unique(dim=0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from ocp_torch.certificate.proof.rigorous import MOST_DIMENSIONS
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.errors import InputError
 from ocp_torch.files.memory import require_memory
@@ -17,12 +16,8 @@ AT_ONCE = 4
 def require_possible(problem: Problem, settings: CertificateSettings, trains_value: bool = True) -> None:
     """Raise `InputError` where ``settings`` ask for more memory than there is, or for a proof that there is none of."""
     d, m, replicates = problem.dim, problem.control_dim, settings.replicates
-    if settings.rigorous and (d > MOST_DIMENSIONS or not trains_value):
-        why = f"d = {d}" if d > MOST_DIMENSIONS else "no V that the proof could speak of"
-        raise InputError(
-            f"certificate.rigorous is true, but a bound is proved for a trained V in at most {MOST_DIMENSIONS} dimensions, "
-            f"and here there is {why}; leave it false."
-        )
+    if settings.rigorous:
+        _require_provable(d, trains_value)
     sample = DOUBLE * (2 * d + 2)  # x, f, a and mu0; a constant B takes no room
     moving = DOUBLE * AT_ONCE * (d + m)
     require_memory("certificate.replicates", replicates, sample)
@@ -31,3 +26,14 @@ def require_possible(problem: Problem, settings: CertificateSettings, trains_val
     require_memory("certificate.occupation_states", settings.occupation_states, moving)
     require_memory("certificate.ascents", settings.ascents, moving)
     require_memory("certificate.stage.batch", settings.stage.batch, sample)
+
+
+def _require_provable(dim: int, trains_value: bool) -> None:
+    from ocp_torch.certificate.proof.obstacle import MOST_DIMENSIONS  # a proof is loaded only where one is asked for
+
+    if dim > MOST_DIMENSIONS or not trains_value:
+        why = f"d = {dim}" if dim > MOST_DIMENSIONS else "no V that the proof could speak of"
+        raise InputError(
+            f"certificate.rigorous is true, but a bound is proved for a trained V in at most {MOST_DIMENSIONS} dimensions, "
+            f"and here there is {why}; leave it false."
+        )

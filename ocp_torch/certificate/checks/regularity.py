@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.control.policies import Policy
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
 
@@ -63,7 +64,7 @@ def largest_jump(
         functions[MATRIX] = lambda x: problem.control_matrix(x).flatten(1)
         if not problem.driftless:
             functions[DRIFT] = problem.drift
-    generator = torch.Generator().manual_seed(seed)
+    generator = fixed_generator(seed)
     draw = lambda *shape: torch.rand(*shape, dtype=torch.float64, generator=generator)
     left = draw(SEGMENTS, dim)
     direction = torch.nn.functional.normalize(torch.randn(SEGMENTS, dim, dtype=torch.float64, generator=generator))

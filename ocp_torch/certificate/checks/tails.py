@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
-from ocp_torch.maths.mixtures import Mixture, concentrated
-from ocp_torch.maths.sampling import derive_seed
+from ocp_torch.maths.mixture_fit import concentrated
+from ocp_torch.maths.mixtures import Mixture
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.starts import UNIFORM_STATES, evaluation_distribution
@@ -26,8 +27,8 @@ from ocp_torch.problems.starts import UNIFORM_STATES, evaluation_distribution
 FEW, KURTOSIS = 30.0, 30.0
 # What a few carry is let pass up to that part of the answer.
 MATERIAL = 1e-3
-# How often states are drawn anew; branch of the seed tree for them.
-ROUNDS, STREAM = 3, 6
+# How often states are drawn anew.
+ROUNDS = 3
 
 
 def rarity(contributions: Tensor, size: float) -> float:
@@ -86,7 +87,7 @@ def sharpened(evaluate: Callable[[list[Samples]], R], problem: Problem, sets: li
             break
         policy = Mixture.join([policy.scaled((1.0 - UNIFORM_STATES) / len(policies)) for policy in policies])
         divergences = sets[0].div_a is not None
-        fresh = derive_seed(seed, STREAM, k)
+        fresh = derive_seed(seed, Branch.TAILS, k)
         sets = replicated_samples(problem, len(sets[0]), len(sets), fresh, divergences, policy)
         found = evaluate(sets)
     return found

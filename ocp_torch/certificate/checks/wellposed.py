@@ -9,8 +9,9 @@ from torch import Tensor
 
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.errors import ProblemError
-from ocp_torch.maths.mixtures import worth
+from ocp_torch.maths.mixtures import effective_part
 from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.blame import place
 from ocp_torch.problems.problem import Problem
@@ -71,7 +72,7 @@ def check_problem(problem: Problem, sets: list[Samples]) -> WellPosed:
     positive = least >= -ROUNDING * abs(mass.value)
     if not positive:
         warnings.append(f"no bound is used: the initial density falls to {least:.3g}, but must not be negative.")
-    carried = worth(torch.cat([s.weight * s.mu0 for s in sets]).clamp_min(0.0))
+    carried = effective_part(torch.cat([s.weight * s.mu0 for s in sets]).clamp_min(0.0))
     whole = abs(mass.value - 1.0) <= MASS_TOLERANCE + mass.half_width(MASS_LEVEL)
     if not whole:
         warnings.append(
@@ -105,7 +106,7 @@ def _differences(problem: Problem, x: Tensor, y: Tensor, tolerance: float, sizes
 
 def _periods(problem: Problem, sizes: dict[str, float]) -> dict[str, float]:
     x = scrambled_sobol(PROBES, problem.dim, 2, torch.float64)
-    whole = torch.randint(-2, 4, x.shape, generator=torch.Generator().manual_seed(0)).to(x)
+    whole = torch.randint(-2, 4, x.shape, generator=fixed_generator()).to(x)
     return _differences(problem, x, x + whole, ROUNDING, sizes)
 
 

@@ -28,7 +28,7 @@ from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
 from ocp_torch.control.policies import Policy, ValuePolicy, zero_policy
-from ocp_torch.maths.calculus import Field
+from ocp_torch.maths.jets import Field
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem

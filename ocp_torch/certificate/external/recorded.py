@@ -28,12 +28,12 @@ from ocp_torch.certificate.upper.lagrangian import Terms, best_multiples
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
 from ocp_torch.control.policies import NETWORK, Policy, trained_policies
 from ocp_torch.fields.fields import Fields
-from ocp_torch.maths import calculus
-from ocp_torch.maths.calculus import CHUNK, chunked_gradient
-from ocp_torch.maths.sampling import derive_seed
-from ocp_torch.problems import formulas
+from ocp_torch.maths import jets
+from ocp_torch.maths.jets import CHUNK, chunked_jet
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.control_cost import PowerCost
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.needs import SEARCHED
 from ocp_torch.problems.problem import MARGIN
 from ocp_torch.problems.recorded.dataset import Dataset
@@ -44,8 +44,6 @@ from ocp_torch.problems.samples import Samples
 GROUPS, FEWEST = 64, 8
 # The samples with most mass, at which the contraction of the flow is looked at.
 TOP = 10
-# Branch of the seed tree for the draws of the fit, as in `stage`.
-STREAM = 3
 
 
 def certify_recorded(
@@ -57,7 +55,7 @@ def certify_recorded(
     kind = handed_out(problem, trained)
     warnings = [
         f"from {sum(map(len, sets)):,} held-out samples, taken for independent draws from "
-        f"{'the density given with them' if weighted(problem) else 'the uniform policy'}; nothing was simulated.",
+        f"{'the density given with them' if weighted(problem) else 'the uniform law'}; nothing was simulated.",
         *problem.recording.notes,
     ]
     policy = trained_policies(trained.occupation, problem, fields, constants)[kind] if kind else None
@@ -137,9 +135,9 @@ def penalised(problem: Dataset, fields: Fields, M: float, sets: list[Samples]) -
     """`F_M(V) = E[V mu0 - M max(Q, 0)]`."""
     values = []
     for samples in sets:
-        v, gradient = chunked_gradient(fields.value, samples.x)
-        slack = formulas.hjb_slack(samples, v, gradient, problem.control_cost, problem.discount)
-        values.append(integral(samples, v * samples.mu0 - M * slack.clamp_min(0.0)))
+        V = chunked_jet(fields.value, samples.x)
+        slack = Generator.of(problem, samples).hjb_slack(V)
+        values.append(integral(samples, V.value * samples.mu0 - M * slack.clamp_min(0.0)))
     return Estimate.of(values)
 
 
@@ -149,7 +147,7 @@ def closed_loop_samples(samples: Samples, policy: Policy, cost: PowerCost) -> Sa
     pieces = []
     for part in samples.split(CHUNK):
         div_a, div_B = part.require_divergences("the closed loop")
-        u, flux = calculus.control_flux_divergence(policy, part.x, part.B, div_B)
+        u, flux = jets.control_flux_divergence(policy, part.x, part.B, div_B)
         pushed = torch.einsum("ndm,nm->nd", part.B, u)
         none = torch.zeros_like(part.x)
         pieces.append(
@@ -204,27 +202,27 @@ def closed_loop_J(
     rough = trained_policies(trained.occupation, problem, trained.fields, constants)[kind]
     like = next(trained.fields.parameters())
     training = closed_loop_samples(problem.training.to(like), rough, cost)
-    pool = Drawn(training, derive_seed(seed, STREAM, 2))
+    pool = Drawn(training, derive_seed(seed, Branch.POLICY_EVALUATION, 2))
     fitted = fit_closed_loop(problem, rough, trained.fields, trained.network, constants, settings.stage, seed, pool)
     fitted = replace(trained, fields=fitted).in_float64()
     value = fields.value if fields.value is not None else fitted.value
     terms, densities, spreads, fluxes, largest, deepest = [], [], [], [], 0.0, 0.0
     for samples in sets:
         loop = closed_loop_samples(samples, policy, cost)
-        v, gradient = chunked_gradient(value, loop.x)
-        slack = formulas.hjb_slack(loop, v, gradient, cost, rho)
+        generator, V = Generator(loop, rho, cost), chunked_jet(value, loop.x)
+        slack = generator.hjb_slack(V)
         with torch.no_grad():
-            mu, spent = formulas.occupation_outflow(loop, fitted.log_occupation, rho)
-        terms.append(Terms(loop, v, mu * slack, loop.mu0 - spent))
-        largest, deepest = max(largest, float(v.max())), max(deepest, float(-slack.min()))
+            mu, outflow = generator.occupation_outflow(fitted.log_occupation)
+        terms.append(Terms(loop, V.value, mu * slack, loop.mu0 - outflow))
+        largest, deepest = max(largest, float(V.value.max())), max(deepest, float(-slack.min()))
         densities.append(mu)
-        fluxes.append(Flux(loop.x, loop.weight, spent - mu, mu.unsqueeze(-1) * loop.a / rho))
+        fluxes.append(Flux(loop.x, loop.weight, outflow - mu, mu.unsqueeze(-1) * loop.a / rho))
         spreads.append(loop.div_a)
     with torch.no_grad():
         loop = training.to(torch.zeros((), dtype=torch.float64))
-        v, gradient = calculus.value_and_gradient(value, loop.x)
-        slack = formulas.hjb_slack(loop, v, gradient, cost, rho)
-    largest, deepest = max(largest, float(v.max())), max(deepest, float(-slack.min()))
+        V = jets.jet(value, loop.x)
+        slack = Generator(loop, rho, cost).hjb_slack(V)
+    largest, deepest = max(largest, float(V.value.max())), max(deepest, float(-slack.min()))
     C_V = max(constants.C_V, MARGIN * (largest + deepest))
     excess = best_multiples(terms, lambda t, s: t.J(s, C_V))
     J = [integral(t.samples, t.v * t.samples.mu0) + e for t, e in zip(terms, excess, strict=True)]

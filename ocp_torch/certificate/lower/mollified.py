@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.lower.shifted import Shift, SlackParts, slack_parts
-from ocp_torch.maths import calculus
-from ocp_torch.maths.calculus import Field
+from ocp_torch.maths.jets import Field, Jet, jet
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -36,7 +36,7 @@ class Mollified:
     def __init__(self, value: Field, dim: int, radius: float) -> None:
         axes = torch.eye(dim, dtype=torch.float64)
         if dim > DIRECTIONS:
-            generator = torch.Generator().manual_seed(0)
+            generator = fixed_generator()
             mixed = torch.randn(dim, DIRECTIONS, generator=generator, dtype=torch.float64)
             axes = torch.linalg.qr(mixed).Q.T
         self.value, self.radius = value, radius
@@ -49,11 +49,9 @@ class Mollified:
     def __call__(self, x: Tensor) -> Tensor:
         return self.value(self.neighbours(x)).unflatten(0, (len(x), -1)).mean(dim=1)
 
-    def value_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Value ``(N,)`` and gradient ``(N, d)``."""
-        found = calculus.value_and_gradient(self.value, self.neighbours(x))
-        value, gradient = (part.unflatten(0, (len(x), -1)).mean(dim=1) for part in found)
-        return value, gradient
+    def jet(self, x: Tensor) -> Jet:
+        """The average of the neighbours' jets."""
+        return jet(self.value, self.neighbours(x)).map(lambda part: part.unflatten(0, (len(x), -1)).mean(dim=1))
 
     def fitting(self, sets: list[Samples]) -> list[Samples]:
         """As many of the first states of each of ``sets``, a power of two times fewer, as the budget allows."""

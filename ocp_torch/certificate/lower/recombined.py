@@ -15,14 +15,14 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.lower.shifted import SlackParts, slack_function
-from ocp_torch.maths.calculus import CHUNK, Field, chunked_gradient
-from ocp_torch.maths.sampling import derive_seed, scrambled_sobol
+from ocp_torch.maths.jets import CHUNK, Field, chunked_jet
+from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import climb
+from ocp_torch.problems.generator import Generator, hjb_slack
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# Branch of the seed tree for the states that the weights are chosen on, beside those of the certificate.
-STREAM = 11
 # States at most, and numbers kept for them at most (128 MiB of float64).
 STATES, NUMBERS = 8192, 2**24
 # Rounds, L-BFGS iterations in each, ascents between them, and how much less the maximum is smoothed each time: in two
@@ -48,7 +48,7 @@ class Program:
     def _evaluated(self, x: Tensor):
         problem, rho = self.problem, self.problem.discount
         samples = Samples.of(problem, x, divergences=False)
-        parts = SlackParts.of(samples, *chunked_gradient(self.value, x), problem.control_cost, rho)
+        parts = SlackParts.of(Generator.of(problem, samples), chunked_jet(self.value, x))
         axes = torch.eye(problem.dim, dtype=x.dtype)
         moved, pushed, features = [], [], []
         for part in samples.split(CHUNK):
@@ -62,7 +62,7 @@ class Program:
     def slack(self, c: Tensor) -> Tensor:
         """`Q_W`, ``(N,)``, for ``c`` ``(k,)``."""
         p = self.parts
-        return p.value + self.moved @ c - p.f + p.cost.conjugate(p.push + self.pushed @ c)
+        return hjb_slack(p.value + self.moved @ c, p.f, None, p.cost.conjugate(p.push + self.pushed @ c))
 
     def add(self, x: Tensor) -> None:
         """More states."""
@@ -83,7 +83,7 @@ def recombined(problem: Problem, value: Field, seed: int) -> Field | None:
         return None
     width = value.features(torch.zeros(1, problem.dim, dtype=torch.float64)).shape[1]
     count = min(STATES, NUMBERS // (width * (problem.control_dim + 2)))
-    x = scrambled_sobol(count, problem.dim, derive_seed(seed, STREAM), torch.float64)
+    x = scrambled_sobol(count, problem.dim, derive_seed(seed, Branch.RECOMBINATION), torch.float64)
     program = Program(problem, value, x)
     c = torch.zeros(program.basis.shape[1], dtype=torch.float64)
     slack = program.slack(c)

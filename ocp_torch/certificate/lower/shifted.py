@@ -16,11 +16,10 @@ from torch import Tensor
 
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.simulated.control_variate import integrals
-from ocp_torch.maths import calculus
-from ocp_torch.maths.calculus import Field, chunked_gradient
+from ocp_torch.maths.jets import Field, Jet, chunked_jet, jet
 from ocp_torch.maths.supremum import Extremum, minimiser, supremum
-from ocp_torch.problems import formulas
 from ocp_torch.problems.control_cost import PowerCost
+from ocp_torch.problems.generator import Generator, hjb_slack
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -34,16 +33,16 @@ class SlackParts:
 
     x: Tensor  # (N, d)
     initial: Tensor  # (N,) V mu0
-    value: Tensor  # (N,) V - grad V . a / rho
+    value: Tensor  # (N,) V - L^0 V / rho
     f: Tensor  # (N,)
     push: Tensor  # (N, m) -B^T grad V / rho
     cost: PowerCost
 
     @classmethod
-    def of(cls, samples: Samples, value: Tensor, gradient: Tensor, cost: PowerCost, rho: float) -> SlackParts:
-        transported = value - formulas.along(samples, gradient) / rho
-        push = -formulas.pull_back(samples, gradient) / rho
-        return cls(samples.x, value * samples.mu0, transported, samples.f, push, cost)
+    def of(cls, generator: Generator, V: Jet) -> SlackParts:
+        samples = generator.data
+        value = V.value - generator.transport(V)
+        return cls(samples.x, V.value * samples.mu0, value, samples.f, generator.push(V), generator.cost)
 
     @staticmethod
     def join(parts: list[SlackParts]) -> SlackParts:
@@ -52,13 +51,12 @@ class SlackParts:
 
     def slack(self, theta: float) -> Tensor:
         """`Q_{theta V}`, ``(N,)``."""
-        return theta * self.value - self.f + self.cost.conjugate(theta * self.push)
+        return hjb_slack(theta * self.value, self.f, None, self.cost.conjugate(theta * self.push))
 
 
 def slack_parts(problem: Problem, value: Field, sets: list[Samples]) -> list[SlackParts]:
     """The parts on each of ``sets``."""
-    evaluated = [(s, *chunked_gradient(value, s.x)) for s in sets]
-    return [SlackParts.of(s, v, g, problem.control_cost, problem.discount) for s, v, g in evaluated]
+    return [SlackParts.of(Generator.of(problem, s), chunked_jet(value, s.x)) for s in sets]
 
 
 @dataclass(frozen=True)
@@ -110,8 +108,7 @@ def slack_function(problem: Problem, value: Field):
 
     def slack(x: Tensor) -> Tensor:
         samples = Samples.of(problem, x, divergences=False) if not x.requires_grad else _live(problem, x)
-        v, gradient = calculus.value_and_gradient(value, x)
-        return formulas.hjb_slack(samples, v, gradient, problem.control_cost, problem.discount)
+        return Generator.of(problem, samples).hjb_slack(jet(value, x))
 
     return slack
 

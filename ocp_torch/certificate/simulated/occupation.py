@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ocp_torch.certificate.simulated.simulation import Dynamics, discounted_integral
 from ocp_torch.control.policies import Policy
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.problem import Problem
@@ -88,7 +89,7 @@ def estimated_sup_occupation(problem: Problem, policy: Policy, end_states: Tenso
     highest of them."""
     count = max(1, 2 * states // 3)
     picked = end_states[:: max(1, len(end_states) // count)][:count]
-    generator = torch.Generator().manual_seed(0)
+    generator = fixed_generator()
     uniform = torch.rand(states - len(picked), problem.dim, dtype=picked.dtype, generator=generator)
     x = torch.cat([picked, uniform])
     met = lambda x: settled_occupation(problem, policy, x).nan_to_num(nan=math.inf, posinf=math.inf)

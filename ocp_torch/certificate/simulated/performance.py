@@ -25,10 +25,10 @@ from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
 from ocp_torch.certificate.simulated.simulation import Dynamics, Integrate, discounted_integral, rate_at, refined
 from ocp_torch.control.policies import Policy, ValuePolicy
-from ocp_torch.maths import calculus
-from ocp_torch.maths.calculus import Field
-from ocp_torch.maths.sampling import derive_seed
-from ocp_torch.problems import formulas
+from ocp_torch.maths import jets
+from ocp_torch.maths.jets import Field
+from ocp_torch.maths.seeds import Branch, derive_seed
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.starts import initial_points
@@ -62,7 +62,7 @@ class Simulated:
 def _dynamics(problem: Problem, policy: Policy, value: Field | None) -> Dynamics:
     """The closed loop and what it costs; with ``value`` its slack `-Q_u`, and as one more coordinate `z`, the sum of
     `grad V . g` from `V` at the start on, with `z - V` as a second rate."""
-    cost, rho = problem.control_cost, problem.discount
+    cost = problem.control_cost
 
     def dynamics(state: Tensor) -> tuple[Tensor, Tensor]:
         if value is None:
@@ -70,13 +70,13 @@ def _dynamics(problem: Problem, policy: Policy, value: Field | None) -> Dynamics
             return problem.velocity(state, u), problem.state_cost(state) + cost.cost(u)
         x, summed = state[:, :-1], state[:, -1]
         samples = Samples.of(problem, x, divergences=False)
-        v, gradient = calculus.value_and_gradient(value, x)
+        generator, V = Generator.of(problem, samples), jets.jet(value, x)
         own = isinstance(policy, ValuePolicy) and policy.value is value
-        u = policy.control(samples.B, gradient) if own else policy(x)
+        u = policy.control(samples.B, V) if own else policy(x)
         velocity = samples.a + torch.einsum("ndm,nm->nd", samples.B, u)
-        slack = formulas.bellman_slack(samples, v, gradient, u, cost, rho)
-        change = (gradient * velocity).sum(dim=-1, keepdim=True)
-        return torch.cat([velocity, change], dim=-1), torch.stack([-slack, summed - v], dim=-1)
+        slack = generator.bellman_slack(V, u)
+        change = (V.gradient * velocity).sum(dim=-1, keepdim=True)
+        return torch.cat([velocity, change], dim=-1), torch.stack([-slack, summed - V.value], dim=-1)
 
     return dynamics
 
@@ -174,7 +174,7 @@ def simulate_performance(
         integrate = Sliding(integrate, len(x0), tolerance * size)
     speed = float(velocity.norm(dim=-1).max())
     steps = max(8, 2 * math.ceil(0.5 * longest * max(rho / 0.4, speed / 0.2)))
-    generator = torch.Generator().manual_seed(derive_seed(seed, SIMULATION_REPLICATE))
+    generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT))
     means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
     noise = lambda results: Estimate.of(means(results).tolist()).se
     result, end, bias = refined(integrate, mass, steps, tolerance * size, generator, noise)

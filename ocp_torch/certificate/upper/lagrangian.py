@@ -30,10 +30,10 @@ from ocp_torch.certificate.checks.hidden import Flux, Hidden, hidden_divergence
 from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.lower.shifted import slack_function
-from ocp_torch.maths.calculus import CHUNK, Field, chunked_gradient
+from ocp_torch.maths.jets import CHUNK, Field, chunked_jet
 from ocp_torch.maths.supremum import Extremum, batched, minimiser, supremum
-from ocp_torch.problems import formulas
 from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 
 # Multiples of mu that are tried.
@@ -167,12 +167,12 @@ def best_multiples(terms: list[Terms], bound: Callable[[Terms, float], float]) -
 @torch.no_grad()
 def _integrands(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples):
     """`V`, `mu Q_u`, `r` and `Q_u` at the states of ``samples``, and the flux `mu g_u`."""
-    v, gradient = chunked_gradient(value, samples.x)
-    slack = formulas.hjb_slack(samples, v, gradient, loop.control_cost, loop.discount)
-    pairs = [formulas.occupation_outflow(part, log_occupation, loop.discount) for part in samples.split(CHUNK)]
-    mu, spent = torch.cat([m for m, _ in pairs]), torch.cat([s for _, s in pairs])
-    flux = Flux(samples.x, samples.weight, spent - mu, mu.unsqueeze(-1) * samples.a / loop.discount)
-    return v, mu * slack, samples.mu0 - spent, slack, flux
+    V = chunked_jet(value, samples.x)
+    slack = Generator.of(loop, samples).hjb_slack(V)
+    pairs = [Generator.of(loop, part).occupation_outflow(log_occupation) for part in samples.split(CHUNK)]
+    mu, outflow = torch.cat([m for m, _ in pairs]), torch.cat([o for _, o in pairs])
+    flux = Flux(samples.x, samples.weight, outflow - mu, mu.unsqueeze(-1) * samples.a / loop.discount)
+    return V.value, mu * slack, samples.mu0 - outflow, slack, flux
 
 
 def _climbed(function, values: torch.Tensor, states: torch.Tensor, ascents: int) -> Extremum:

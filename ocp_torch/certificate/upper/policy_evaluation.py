@@ -12,21 +12,21 @@ from ocp_torch.certificate.upper.lagrangian import MULTIPLES, Terms
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
-from ocp_torch.maths import calculus
-from ocp_torch.maths.calculus import CHUNK, Field
-from ocp_torch.maths.sampling import SobolSampler, derive_seed
+from ocp_torch.maths import jets
+from ocp_torch.maths.jets import CHUNK, Field
+from ocp_torch.maths.sampling import SobolSampler
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import minimiser
+from ocp_torch.objectives.phase import Phase
 from ocp_torch.objectives.policy_evaluation import PolicyEvaluation
-from ocp_torch.problems import formulas
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import Constants
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
-from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
+from ocp_torch.steppers import advance, short_fit
 from ocp_torch.steppers.optimizers import LARGEST_RATE
 
-# Branch of the seed tree for the stage's states and weights, beside those of training and evaluation.
-STAGE_STREAM = 3
 # The closed loop's data are computed once on so many states at most: their divergences cost more than a step.
 POOL = 2**16
 # Beyond that ratio of the two suprema of the slack the residual is not weighed any more lopsidedly.
@@ -77,23 +77,20 @@ def fit_closed_loop(
     loop = ClosedLoop(problem, policy)
     with_value = fields is None or fields.value is None
     names = (LOG_OCCUPATION, VALUE) if with_value else (LOG_OCCUPATION,)
-    fitted = Fields.build(problem, names, network, derive_seed(seed, STAGE_STREAM, 0)).to(like)
+    fitted = Fields.build(problem, names, network, derive_seed(seed, Branch.POLICY_EVALUATION, 0)).to(like)
     if fields is not None and fields.log_occupation is not None:
         fitted.log_occupation.load_state_dict(fields.log_occupation.state_dict())
-    pool = pool or Pool(loop, derive_seed(seed, STAGE_STREAM, 1), like, double=fields is None)
-    draw = lambda: pool.draw(settings.batch)
+    pool = pool or Pool(loop, derive_seed(seed, Branch.POLICY_EVALUATION, 1), like, double=fields is None)
+    draw = lambda phase: pool.draw(settings.batch)
     pool.grow(min(POOL, settings.steps * settings.batch))
-    price = 1.0 if with_value else missing_price(loop, fields.value, pool.samples.take(slice(EXCESS_STATES)))
-    objective = PolicyEvaluation(loop, constants, with_value, price)
-    optimizer = optimizer_maker("soap", settings.lr, betas=(0.95, 0.95))
-    makers = {player: optimizer for player in objective.players}
-    stepper = Simultaneous(fitted, objective, makers, schedule_maker("cosine", settings.steps))
-    average = averaged(fitted, decay=0.98)
+    weight = 1.0 if with_value else positive_weight(loop, fields.value, pool.samples.take(slice(EXCESS_STATES)))
+    objective, phase = PolicyEvaluation(loop, with_value, weight), Phase(constants)
+    stepper, average = short_fit(fitted, objective, settings.lr, settings.steps)
     for k in range(settings.rounds):
         steps = settings.steps * 2**k
         pool.grow(min(POOL, steps * settings.batch))
         for _ in range(steps):
-            stepper.step(draw, lambda: average.update_parameters(fitted))
+            advance(stepper, average, draw, phase)
         value = average.module.value if with_value else fields.value
         excess = relative_excess(loop, value, average.module.log_occupation, pool.samples.take(slice(EXCESS_STATES)))
         if excess <= settings.good_excess:
@@ -129,10 +126,9 @@ class Pool:
 
 
 @torch.no_grad()
-def missing_price(loop: ClosedLoop, value: Field, samples: Samples) -> float:
-    """How much more a positive residual should weigh than a negative one: the root of `eps_hi / eps_lo`, within limits."""
-    v, gradient = calculus.value_and_gradient(value, samples.x)
-    slack = formulas.hjb_slack(samples, v, gradient, loop.control_cost, loop.discount)
+def positive_weight(loop: ClosedLoop, value: Field, samples: Samples) -> float:
+    """What a positive residual should weigh where a negative one weighs 1: the root of `eps_hi / eps_lo`, within limits."""
+    slack = Generator.of(loop, samples).hjb_slack(jets.jet(value, samples.x))
     hi, lo = float((-slack).max().clamp_min(1e-30)), float(slack.max().clamp_min(1e-30))
     return math.sqrt(min(max(hi / lo, 1.0 / MOST_LOPSIDED), MOST_LOPSIDED))
 
@@ -141,10 +137,10 @@ def missing_price(loop: ClosedLoop, value: Field, samples: Samples) -> float:
 def relative_excess(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples) -> float:
     """What the residual costs the Lagrangian bound on ``samples``, relative to `|E[V mu0]|`: the bound's part above
     `E[V mu0 - mu Q_u]`, for the best multiple of `mu`."""
-    v, gradient = calculus.value_and_gradient(value, samples.x)
-    slack = formulas.hjb_slack(samples, v, gradient, loop.control_cost, loop.discount)
-    mu, spent = formulas.occupation_outflow(samples, log_occupation, loop.discount)
-    terms = Terms(samples, v, mu * slack, samples.mu0 - spent)
+    generator, V = Generator.of(loop, samples), jets.jet(value, samples.x)
+    slack = generator.hjb_slack(V)
+    mu, outflow = generator.occupation_outflow(log_occupation)
+    terms = Terms(samples, V.value, mu * slack, samples.mu0 - outflow)
     hi, lo = float((-slack).max().clamp_min(0.0)), float(slack.max().clamp_min(0.0))
     least = terms.lagrangian(minimiser(lambda s: terms.lagrangian(s, hi, lo), *MULTIPLES), hi, lo)
-    return (least + float(samples.mean(terms.spent))) / max(abs(float(samples.mean(v * samples.mu0))), 1e-30)
+    return (least + float(samples.mean(terms.spent))) / max(abs(float(samples.mean(V.value * samples.mu0))), 1e-30)

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import require_choice, require_integer
-from ocp_torch.maths.enclosure import Enclosure
-from ocp_torch.maths.taylor import Box, TaylorModel
 from ocp_torch.problems.problem import Problem
 
 SHEARS = ("none", "chain", "random")
+# rho and d k that differ by less, relative to rho, are taken to be equal: where they are, the formula of mu* is 0 / 0.
+CRITICAL = 1e-9
 
 
 def shear_matrix(dim: int, shear: str, seed: int) -> Tensor:
@@ -51,8 +51,8 @@ class Torus(Problem):
         super().__init__(dim=dim, discount=discount, control_limit=control_limit)
         self.shear = require_choice("problem.shear", shear, SHEARS)
         self.seed = require_integer("problem.seed", seed, 0)
-        self._A = shear_matrix(self.dim, self.shear, self.seed)
-        self._B = torch.linalg.inv(self._A).round()
+        self.A = shear_matrix(self.dim, self.shear, self.seed)
+        self.A_inverse = torch.linalg.inv(self.A).round()
         rho, d = self.discount, self.dim
         self._alpha = (math.sqrt(1.0 + 8.0 / (d * rho**2)) - 1.0) * rho**2 / 4.0
         self._rate = 2.0 * self._alpha / rho
@@ -60,7 +60,7 @@ class Torus(Problem):
         self.state_cost_bound = 0.25
         self.value_bound = d * self._alpha / 4.0
         self.control_bound = math.sqrt(d) * self._alpha / rho
-        self.occupation_bound = rho / excess if excess > 1e-9 * rho else math.inf
+        self.occupation_bound = rho / excess if excess > CRITICAL * rho else math.inf
         self.exact_optimum = d * self._alpha / 12.0
         self._exact = control_limit is None or self.control_bound <= self.control_limit
         if not self._exact:
@@ -70,27 +70,16 @@ class Torus(Problem):
 
     def _offset(self, x: Tensor) -> Tensor:
         """`y - 1/2` in `[-1/2, 1/2)`, ``(N, d)``."""
-        return (x @ self._like(x, "A", self._A).T).remainder(1.0) - 0.5
+        return (x @ self._like(x, "A", self.A).T).remainder(1.0) - 0.5
 
     def state_cost(self, x: Tensor) -> Tensor:
         return self._offset(x).square().mean(dim=-1)
 
     def control_matrix(self, x: Tensor) -> Tensor:
-        return self._like(x, "B", self._B).expand(len(x), self.dim, self.dim)
+        return self._like(x, "B", self.A_inverse).expand(len(x), self.dim, self.dim)
 
     def control_divergence(self, x: Tensor) -> Tensor:
         return torch.zeros_like(x)
-
-    def enclosure(self, box: Box) -> Enclosure:
-        """With `s = y - n` and `n` the nearest integer, `(y_i - 1/2)^2 = s^2 - |s| + 1/4`: only `|s|` needs care."""
-        y = TaylorModel.stack([(box.coordinates() * row).sum() for row in self._A.to(box.centre)])
-        s = y - y.coefficients[0].round()
-        square = s * s - s.absolute() + 0.25
-        # A cell that reaches beyond |s| = 1 knows only the range.
-        far = s.size >= 1.0
-        parts = square.where(~far, box.constant(torch.full_like(s.radius, 0.125), 0.125))
-        B = box.constant(self._B.to(box.centre).expand(len(box), self.dim, self.dim))
-        return Enclosure(parts.sum() * (1.0 / self.dim), None, B, box.constant(1.0))
 
     def exact_value(self, x: Tensor) -> Tensor | None:
         return None if not self._exact else self._alpha * self._offset(x).square().sum(dim=-1)
@@ -105,6 +94,6 @@ class Torus(Problem):
         excess = self.discount - self.dim * self._rate
         # log(1/reach)/k is when a start on the cube's face arrives: mu* integrates rho e^{-excess t} up to then.
         arrival = -reach.log() / self._rate
-        if abs(excess) < 1e-9 * self.discount:
+        if abs(excess) < CRITICAL * self.discount:
             return self.discount * arrival
         return -self.discount / excess * torch.expm1(-excess * arrival)

@@ -7,8 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.taylor import Box, TaylorModel
-
 
 class TrigonometricPolynomial:
     """`p(x) = c + sum_j b_j cos(2 pi k_j . x + theta_j)` with integer wave vectors `k_j != 0`.
@@ -37,6 +35,17 @@ class TrigonometricPolynomial:
             self.constant - other.constant,
         )
 
+    def integral_with(self, other: TrigonometricPolynomial) -> float:
+        """`int p q` over the torus: cosines of different wave vectors are orthogonal, equal or opposite ones are not."""
+        total = self.constant * other.constant
+        for k, b, theta in zip(self.waves, self.amplitudes, self.phases, strict=True):
+            for l, c, eta in zip(other.waves, other.amplitudes, other.phases, strict=True):
+                if torch.equal(k, l):
+                    total += 0.5 * float(b * c * torch.cos(theta - eta))
+                elif torch.equal(k, -l):
+                    total += 0.5 * float(b * c * torch.cos(theta + eta))
+        return total
+
     def _angle(self, x: Tensor) -> Tensor:
         return 2.0 * math.pi * (x @ self.waves.to(x).T) + self.phases.to(x)
 
@@ -48,19 +57,6 @@ class TrigonometricPolynomial:
         """`grad p(x)`, ``(N, d)``."""
         slopes = -2.0 * math.pi * self.amplitudes.to(x) * self._angle(x).sin()
         return slopes @ self.waves.to(x)
-
-    def model(self, box: Box) -> TaylorModel:
-        """`p` over a batch of cells, ``(N,)``."""
-        if len(self.waves) == 0:
-            return box.constant(self.constant)
-        waved = box.cosine(self.waves.to(box.centre), self.phases.to(box.centre))
-        return (waved * self.amplitudes.to(box.centre)).sum() + self.constant
-
-    def gradient_model(self, box: Box) -> TaylorModel:
-        """`grad p` over a batch of cells, ``(N, d)``; a cosine a quarter turn on is the derivative of a cosine."""
-        turned = box.cosine(self.waves.to(box.centre), self.phases.to(box.centre) + 0.5 * math.pi)
-        slopes = 2.0 * math.pi * self.amplitudes.unsqueeze(-1) * self.waves
-        return (turned[..., None] * slopes.to(box.centre)).sum(dim=-2)
 
     def hessian(self, x: Tensor) -> Tensor:
         """Second derivatives of `p`, ``(N, d, d)``."""

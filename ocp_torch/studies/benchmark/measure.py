@@ -12,7 +12,7 @@ from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.control.policies import Policy, admissible_density, occupation_density, trained_policies
 from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
-from ocp_torch.maths.calculus import Field
+from ocp_torch.maths.jets import Field
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples

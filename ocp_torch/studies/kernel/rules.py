@@ -14,11 +14,18 @@ import numpy as np
 
 from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import CONTROL_DENSITY, VALUE
+from ocp_torch.maths.jets import Jet
 from ocp_torch.problems.constants import Constants
+from ocp_torch.problems.generator import Generator, hjb_slack
 from ocp_torch.problems.problem import Problem
 from ocp_torch.studies.kernel.stream import Datum
 
 Jets = dict[str, np.ndarray]
+
+
+def _scalar(jet: np.ndarray) -> Jet:
+    """That of a field with one output."""
+    return Jet(jet[:, 0, 0], jet[:, 1:, 0])
 
 
 class Rule(ABC):
@@ -55,11 +62,11 @@ class DualRule(Rule):
 
     def __call__(self, datum: Datum, jets: Jets) -> Jets:
         jet = jets[VALUE]
-        v, g = jet[:, 0, 0], jet[:, 1:, 0]
-        p = -np.matmul(g[:, None], datum.B)[:, 0] / self.rho  # -B^T grad V / rho, (R, m)
+        generator, V = Generator(datum, self.rho), _scalar(jet)
+        p = generator.push(V)
         size = np.sqrt(np.square(p).sum(axis=1))
         u = p if self.q == 2.0 else (size ** (self.conjugate - 2.0))[:, None] * p
-        slack = v - datum.f - (g * datum.a).sum(axis=1) / self.rho + size**self.conjugate / self.conjugate
+        slack = hjb_slack(V.value, datum.f, generator.transport(V), size**self.conjugate / self.conjugate)
         weight = np.where(slack > 0.0, self.M, 0.0)
         step = np.empty_like(jet)
         step[:, 0, 0] = datum.mu0 - weight
@@ -99,15 +106,15 @@ class SaddleRule(Rule):
 
     def __call__(self, datum: Datum, jets: Jets) -> Jets:
         of_value, of_density = jets[VALUE], jets[CONTROL_DENSITY]
-        v, g, w = of_value[:, 0, 0], of_value[:, 1:, 0], of_density[:, 0]
-        beta = datum.f - v + (g * datum.a).sum(axis=1) / self.rho
+        generator, V, w = Generator(datum, self.rho), _scalar(of_value), of_density[:, 0]
+        beta = generator.reduced_cost(V)
         size = np.sqrt(np.square(w).sum(axis=1))
         speed = np.maximum(size / self.M, self._free_speed(beta))
         mu = np.where(speed > 0.0, size / np.where(speed > 0.0, speed, 1.0), np.where(beta > 0.0, 0.0, self.M))
         up, down = np.empty_like(of_value), np.zeros_like(of_density)
         up[:, 0, 0] = datum.mu0 - mu
         up[:, 1:, 0] = (np.matmul(datum.B, w[:, :, None])[:, :, 0] + mu[:, None] * datum.a) / self.rho
-        down[:, 0] = -np.matmul(g[:, None], datum.B)[:, 0] / self.rho - self._toward(w, size, speed)
+        down[:, 0] = generator.push(V) - self._toward(w, size, speed)
         return {VALUE: up, CONTROL_DENSITY: down}
 
 

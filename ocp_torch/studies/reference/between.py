@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import batched, supremum
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import start_distribution
@@ -16,7 +17,7 @@ from ocp_torch.studies.reference.grid import Grid
 
 # States looked at for each node, and at least and at most; in pieces that a stencil of 64 nodes fits.
 PER_NODE, FEWEST, MOST, PIECE = 4, 2**16, 2**18, 2**13
-NEAR_STARTS, STREAM = 2**10, 7
+NEAR_STARTS = 2**10
 ASCENTS, STEPS = 32, 60
 # So much of a function's oscillation, unseen by the nodes around, makes the error unknown; so much missing mass of mu0 too.
 UNSEEN = 0.02
@@ -39,8 +40,9 @@ class Between:
 def look_between(problem: Problem, grid: Grid) -> Between:
     """Compare `f`, `a` and `B` with what the nodes of ``grid`` around give, at many states between and on ascents from there,
     and the mass of `mu0` at the nodes with 1."""
-    x = scrambled_sobol(min(max(PER_NODE * grid.count, FEWEST), MOST), problem.dim, STREAM, torch.float64)
-    x = torch.cat([x, start_distribution(problem).draw(NEAR_STARTS, 0, STREAM)[0]])
+    seed = derive_seed(0, Branch.REFERENCE)
+    x = scrambled_sobol(min(max(PER_NODE * grid.count, FEWEST), MOST), problem.dim, seed, torch.float64)
+    x = torch.cat([x, start_distribution(problem).draw(NEAR_STARTS, 0, seed)[0]])
     cost = lambda x: problem.state_cost(x).unsqueeze(-1)
     found = [
         _unseen("the state cost falls", grid, cost, x, -1.0),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from ocp_torch.errors import InputError, require_integer, require_number
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.studies.reference.grid import OFFSETS, Grid
 from ocp_torch.studies.reference.semi_lagrangian import PIECE, running_cost
@@ -51,7 +52,7 @@ def require_solvable(problem: Problem, grid: Grid) -> None:
     period 1, and its control costs `|u|^q / q`."""
     d, m = problem.dim, problem.control_dim
     shapes = {"state_cost": (), "drift": (d,), "control_matrix": (d, m), "initial_density": ()}
-    probe = torch.rand(256, d, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    probe = torch.rand(256, d, generator=fixed_generator(), dtype=torch.float64)
     nodes = grid.nodes()
     for name, shape in shapes.items():
         function = getattr(problem, name)
@@ -74,7 +75,7 @@ def require_solvable(problem: Problem, grid: Grid) -> None:
             moved[:, k] += 1.0
             if float((function(moved) - first).abs().max()) > TOLERANCE * max(size, 1e-12):
                 raise InputError(f"{name} does not have period 1 in x_{k + 1}, but all of a problem on the torus must.")
-    u = 3.0 * torch.randn(64, m, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    u = 3.0 * torch.randn(64, m, generator=fixed_generator(1), dtype=torch.float64)
     if problem.control_limit is not None:
         u = problem.control_limit * u / (1.0 + u.norm(dim=-1, keepdim=True))
     own, power = problem.control_cost.cost(u), running_cost(u, problem.exponent)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 OFFSETS = 4  # nodes of the cubic stencil per coordinate
 
@@ -65,12 +69,10 @@ class Grid:
             columns.append((8.0 * near - far) / (12.0 * self.spacing))
         return torch.stack(columns, dim=-1)
 
-    def matrix(self, index: Tensor, weights: Tensor) -> Tensor:
+    def matrix(self, index: Tensor, weights: Tensor) -> csr_array:
         """The sparse matrix whose row `i` takes ``weights[i]`` at ``index[i]``; both ``(side^d, k)``."""
-        rows = torch.arange(0, index.numel() + 1, index.shape[1], dtype=torch.int32)
-        with warnings.catch_warnings():
-            # PyTorch calls the whole layout a beta; only the product with a vector is used here.
-            warnings.filterwarnings("ignore", message="Sparse CSR")
-            return torch.sparse_csr_tensor(
-                rows, index.flatten().int(), weights.flatten(), size=(self.count, self.count), check_invariants=False
-            )
+        from scipy.sparse import csr_array
+
+        rows = np.arange(0, index.numel() + 1, index.shape[1], dtype=np.int32)
+        columns = index.flatten().int().numpy()
+        return csr_array((weights.flatten().numpy(), columns, rows), shape=(self.count, self.count))

@@ -12,15 +12,18 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.studies.reference.between import look_between
 from ocp_torch.studies.reference.checks import grid_sides, require_solvable
 from ocp_torch.studies.reference.grid import Grid
+from ocp_torch.studies.reference.policy_iteration import GridSolution, solve
 from ocp_torch.studies.reference.richardson import Extrapolation, extrapolate
-from ocp_torch.studies.reference.semi_lagrangian import CLIP, PIECE, GridSolution, SemiLagrangian, minimiser
+from ocp_torch.studies.reference.semi_lagrangian import CLIP, PIECE, SemiLagrangian, minimiser
 
 # The step moves a typical state by this many cells, and is at most this share of 1 / rho on the coarsest grid.
 CELLS, LONGEST = 1.0, 0.25
-# Policy iteration ends where one more policy changes V by less, relative to the oscillation of f.
+# Policy iteration ends where one more policy changes V by less, relative to the oscillation of f; and where it only makes a
+# start for another.
 TOLERANCE, ROUGH = 1e-7, 1e-3
-SPEED_SIDE = {1: 64, 2: 32, 3: 16}
-SPEED_ROUNDS = 3
+# How fast a typical state moves is found on a grid of at most so many nodes per coordinate, by dimension. The optimal speed
+# depends on the step a little, so it is found again with the step it gave, so many times in all.
+SPEED_SIDE, SPEED_ROUNDS = {1: 64, 2: 32, 3: 16}, 3
 
 
 @dataclass(frozen=True)
@@ -79,9 +82,9 @@ def solve_reference(problem: Problem, side: int | None = None, memory: float = 4
             grid = Grid(problem.dim, n)
             value, control = _carried(start, grid)
             # The monotone scheme first: from a rough policy the clipped one may not settle.
-            rough = SemiLagrangian(problem, grid, pace * grid.spacing).solve(value, control, ROUGH)
+            rough = solve(SemiLagrangian(problem, grid, pace * grid.spacing), value, control, ROUGH)
             scheme = SemiLagrangian(problem, grid, pace * grid.spacing, rise)
-            start = scheme.solve(rough.value, rough.control, TOLERANCE)
+            start = solve(scheme, rough.value, rough.control, TOLERANCE)
             solutions.append(start)
         estimates = tuple(_mean(problem, s) for s in solutions)
         between = look_between(problem, start.grid)
@@ -111,7 +114,7 @@ def _speed(problem: Problem, coarsest: int) -> tuple[GridSolution, float]:
     value, control = scheme.f.clone(), scheme.f.new_zeros(grid.count, problem.control_dim)
     for _ in range(SPEED_ROUNDS):
         scheme = SemiLagrangian(problem, grid, step)
-        rough = scheme.solve(value, control, ROUGH)
+        rough = solve(scheme, value, control, ROUGH)
         value, control = rough.value, rough.control
         speed = max(scheme.speed(control), 1e-300)
         step = min(longest, CELLS * grid.spacing / speed)

@@ -11,7 +11,8 @@ ORDER = 2.0
 SAFETY = 3.0
 # What is removed by extrapolation counts as uncertain by this share at least, times SAFETY.
 DOUBT = 0.1
-STEEPEST = 12.0
+# Orders that are looked for: no scheme has one outside.
+ORDERS = (1e-3, 12.0)
 # Numbers that differ by less, relative to their size, are the same.
 ROUNDING = 1e-10
 
@@ -47,17 +48,14 @@ def extrapolate(
 
 
 def observed_order(spacings: tuple[float, float, float], numbers: tuple[float, float, float]) -> float:
-    """`p` with `(Q_1 - Q_2) / (Q_2 - Q_3) = (h_1^p - h_2^p) / (h_2^p - h_3^p)`; NaN if the changes have opposite signs."""
+    """`p` with `(Q_1 - Q_2) / (Q_2 - Q_3) = (h_1^p - h_2^p) / (h_2^p - h_3^p)`, which increases in `p`; NaN if there is none
+    between `ORDERS`, as where the changes have opposite signs."""
+    from scipy.optimize import brentq
+
     (h1, h2, h3), (Q1, Q2, Q3) = spacings, numbers
     if Q2 == Q3 or not (Q1 - Q2) / (Q2 - Q3) > 0.0:
         return math.nan
     ratio = (Q1 - Q2) / (Q2 - Q3)
-    # Increasing in p: bisection between orders no scheme has.
-    change = lambda p: (h1**p - h2**p) / (h2**p - h3**p)
-    low, high = 1e-3, STEEPEST
-    if not change(low) < ratio < change(high):
-        return math.nan
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if change(middle) < ratio else (low, middle)
-    return middle
+    excess = lambda p: (h1**p - h2**p) / (h2**p - h3**p) - ratio
+    low, high = ORDERS
+    return brentq(excess, low, high) if excess(low) < 0.0 < excess(high) else math.nan

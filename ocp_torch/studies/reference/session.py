@@ -63,7 +63,7 @@ def reference_job(config: dict) -> ReferenceJob:
     else:
         # A run names one of the package's problems itself; only a user's own comes from the command line.
         target = str(section.get("_target_", ""))
-        if target.startswith("ocp_torch.") and not target.endswith(".Callable"):
+        if target.startswith("ocp_torch.") and not target.endswith((".Simulator", ".Callable")):
             raise InputError("problem and run are both given, but the run names its problem; leave problem out.")
         controller = load_run({"run": config["run"], "problem": section})
         problem, path = controller.problem, Path(str(config["run"]))

@@ -1,0 +1,102 @@
+"""Cells that cover the torus, and what is proved on each of the HJB slack `Q` and of `W mu0`, for `W = theta V`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from ocp_torch.certificate.proof.box import Box, equal_cells
+from ocp_torch.certificate.proof.enclosures import conjugate_model, enclosure
+from ocp_torch.certificate.proof.network_model import network_model
+from ocp_torch.certificate.proof.taylor import TaylorModel
+from ocp_torch.fields.mlp import PeriodicMLP
+from ocp_torch.maths.jets import Jet
+from ocp_torch.problems.generator import Generator, hjb_slack
+from ocp_torch.problems.problem import Problem
+
+# Degree of the models, by dimension: with a higher one fewer cells are needed, and each takes longer.
+DEGREE = {1: 4, 2: 5}
+# Cells a side to start with, by dimension, and cells evaluated at once, which bounds the memory.
+FIRST_CELLS = {1: 64, 2: 32}
+CHUNK = 256
+# A cell that is longer than so many times its shortest side is bisected along its longest, whatever its models say: without
+# it some would become slivers.
+LONGEST = 4.5
+
+
+@torch.no_grad()
+def cell_models(problem: Problem, value: PeriodicMLP, theta: float, box: Box) -> tuple[TaylorModel, TaylorModel]:
+    """`Q` and `W mu0` for `W = theta V`, both ``(N,)``, over ``box``."""
+    data = enclosure(problem, box)
+    generator, V = Generator(data, problem.discount), Jet(*network_model(value, box)).map(lambda part: part * theta)
+    conjugate = conjugate_model(problem.control_cost, generator.push(V))
+    return hjb_slack(V.value, data.f, generator.transport(V), conjugate), V.value * data.mu0
+
+
+@dataclass
+class Cover:
+    """`N` cells with ``centre`` and half-widths ``half``, both ``(N, d)``, and what is proved on each.
+
+    ``upper`` ``(N,)`` is at least `sup Q`, and ``reached`` at most; ``mean`` and ``radius`` ``(N,)`` enclose the integral of
+    `W mu0` over the cell; ``axis`` ``(N,)`` is the coordinate to bisect it along.
+    """
+
+    centre: Tensor
+    half: Tensor
+    upper: Tensor
+    reached: Tensor
+    mean: Tensor
+    radius: Tensor
+    axis: Tensor
+
+    @classmethod
+    def of(cls, problem: Problem, value: PeriodicMLP, theta: float, centre: Tensor, half: Tensor) -> Cover:
+        """The cells with ``centre`` and ``half``, evaluated."""
+        box = Box(centre, half, DEGREE[problem.dim])
+        Q, initial = cell_models(problem, value, theta, box)
+        _, upper = Q.bounds()
+        mean, radius = initial.mean()
+        volume = (2.0 * half).prod(dim=-1)
+        upper = upper.nan_to_num(nan=math.inf, posinf=math.inf)
+        reached = (Q.coefficients[0] - Q.radius).nan_to_num(nan=-math.inf)
+        return cls(centre, half, upper, reached, mean * volume, radius * volume, _loosest(Q, box))
+
+    @classmethod
+    def first(cls, problem: Problem, value: PeriodicMLP, theta: float) -> Cover:
+        """Equal cells that cover the torus."""
+        cells = equal_cells(problem.dim, FIRST_CELLS[problem.dim], DEGREE[problem.dim])
+        pieces = zip(cells.centre.split(CHUNK), cells.half.split(CHUNK), strict=True)
+        return cls.join([cls.of(problem, value, theta, centre, half) for centre, half in pieces])
+
+    @classmethod
+    def join(cls, parts: list[Cover]) -> Cover:
+        return cls(*(torch.cat(columns) for columns in zip(*(vars(p).values() for p in parts), strict=True)))
+
+    def __len__(self) -> int:
+        return len(self.upper)
+
+    def take(self, index: Tensor) -> Cover:
+        """Those at ``index``, rows or flags."""
+        return Cover(*(column[index] for column in vars(self).values()))
+
+    def halves(self) -> tuple[Tensor, Tensor]:
+        """``centre`` and ``half`` of both halves of each cell along its ``axis``: all first ones, then all second ones."""
+        hot = nn.functional.one_hot(self.axis, self.half.shape[1]).to(self.half)
+        half = self.half * (1.0 - 0.5 * hot)
+        shift = half * hot
+        return torch.cat([self.centre - shift, self.centre + shift]), half.repeat(2, 1)
+
+
+def _loosest(Q: TaylorModel, box: Box) -> Tensor:
+    """The coordinate ``(N,)`` along which the bound of `Q` is loosest: terms of second order and more make it so, by their
+    power of the coordinate, and the radius, most along the longest side."""
+    half = box.half
+    exponents = half.new_tensor(box.basis.exponents)
+    exponents[box.basis.ends[1] : box.basis.ends[2]] = 0.0
+    bent = torch.einsum("kn,ki->ni", Q.coefficients.abs(), exponents)
+    loose = bent + Q.radius.unsqueeze(-1) * half / half.sum(dim=-1, keepdim=True)
+    axis = loose.nan_to_num(nan=math.inf, posinf=math.inf).argmax(dim=-1)
+    return torch.where(half.amax(dim=-1) > LONGEST * half.amin(dim=-1), half.argmax(dim=-1), axis)

@@ -1,0 +1,158 @@
+"""The mass of a density that may be very narrow: sampled evenly first, then where its mass was met."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ocp_torch.errors import ProblemError
+from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import Branch, derive_seed, fixed_generator
+from ocp_torch.problems.checks.functions import Functions
+from ocp_torch.problems.problem import Problem
+
+Density = Callable[[Tensor], Tensor]
+
+# Independent estimates, and Student's t quantile of their mean at the two-sided level 0.9999 (15 degrees of freedom).
+REPLICATES, QUANTILE = 16, 5.2391
+# A half-width of the interval that needs no closer look, and what quadrature and rounding may leave beyond it.
+CLOSE, TOLERANCE = 0.01, 1e-4
+# An interval with a half-width below this part of its value is taken to have met all of the mass; a wider one may owe it to
+# few states, and more may be missing.
+SETTLED = 0.5
+# Closer looks at most, peaks kept, and the part of the states of a look that stays evenly spread.
+LOOKS, PEAKS, EVEN = 4, 8, 0.3
+# A climb to a peak: random steps, the first, smallest and largest length, and what a success and a failure make of it.
+CLIMB, STEP, STEPS, GROWTH, DECAY = 120, 0.05, (1e-9, 0.3), 2.0, 0.8
+# Half-widths of a peak that are told apart: 2^-1 to 2^-NARROWEST. From BROAD on, a peak counts as flat along a coordinate.
+NARROWEST, BROAD = 30, 0.5
+
+
+@dataclass(frozen=True)
+class Mass:
+    """An estimate ``value``, the half-width ``half`` of its interval, and how many ``states`` it took."""
+
+    value: float
+    half: float
+    states: int
+
+    @property
+    def wrong(self) -> bool:
+        """Whether it is certainly not 1. What was not met can only add mass: a value below 1 must be a settled one."""
+        settled = self.half <= SETTLED * self.value
+        return self.value - self.half > 1.0 + TOLERANCE or (settled and self.value + self.half < 1.0 - TOLERANCE)
+
+    @property
+    def right(self) -> bool:
+        """Whether it is 1 as closely as needs be."""
+        return self.half <= CLOSE and abs(self.value - 1.0) <= self.half + TOLERANCE
+
+    @property
+    def sentence(self) -> str:
+        if self.value == 0.0:
+            return f"is 0 at all of {self.states:,} states"
+        return f"integrates to {self.value:.4g} (+- {self.half:.1g}, from {self.states:,} states)"
+
+
+def require_mass(functions: Functions) -> None:
+    """Raise where `mu0` certainly does not integrate to 1."""
+    problem = functions.problem
+    uniform = type(problem).initial_density is Problem.initial_density
+    if uniform or (functions.simulator and not problem._oracle.gives_mu0):
+        return
+    found = sampled_mass(lambda x: functions.ask("initial_density", x), problem.dim, functions.count // 4)
+    if found.wrong:
+        raise ProblemError(
+            f"initial_density of {functions.name} {found.sentence}, but must integrate to 1 over the torus."
+        )
+
+
+def sampled_mass(density: Density, dim: int, count: int) -> Mass:
+    """The integral of ``density`` ``(N, d) -> (N,)`` over the torus.
+
+    From ``REPLICATES * count`` evenly spread states and, where these do not settle it, from as many near its peaks, up to
+    `LOOKS` times: importance sampling from a mixture fitted to the peaks.
+    """
+    sets = [scrambled_sobol(count, dim, derive_seed(0, Branch.MASS, r), torch.float64) for r in range(REPLICATES)]
+    x = torch.cat(sets)
+    share = density(x)  # of the mass, times the number of states
+    found, states = _mass(share, count), len(x)
+    peaks = torch.empty(0, dim, dtype=torch.float64)
+    widths, heights = peaks, torch.empty(0, dtype=torch.float64)
+    for look in range(LOOKS):
+        if found.right:
+            break
+        top, top_widths, top_heights, used = _peaks(density, x, share)
+        peaks, widths, heights = (torch.cat(p) for p in ((peaks, top), (widths, top_widths), (heights, top_heights)))
+        peaks, widths, heights = _distinct(peaks, widths, heights)
+        generator = torch.Generator().manual_seed(derive_seed(0, Branch.MASS, REPLICATES, look))
+        x = _drawn(peaks, widths, REPLICATES * count, generator)
+        share = density(x) / _density(x, peaks, widths)
+        states += used + len(x)
+        found = Mass(**{**vars(_mass(share, count)), "states": states})
+    return found
+
+
+def _mass(share: Tensor, count: int) -> Mass:
+    means = share.reshape(REPLICATES, count).mean(dim=1)
+    se = float(means.std()) / math.sqrt(REPLICATES)
+    return Mass(float(means.mean()), QUANTILE * se, len(share))
+
+
+def _peaks(density: Density, x: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
+    """Peaks climbed to from the states with the largest ``share``, their half-widths along each coordinate, their heights,
+    and how many states that took."""
+    at = x[share.topk(PEAKS).indices].clone()
+    height, step = density(at), torch.full((PEAKS, 1), STEP, dtype=torch.float64)
+    generator = fixed_generator()
+    for _ in range(CLIMB):
+        there = (at + step * torch.randn(at.shape, dtype=torch.float64, generator=generator)).remainder(1.0)
+        reached = density(there)
+        better = (reached > height).unsqueeze(-1)
+        at, height = torch.where(better, there, at), torch.maximum(height, reached)
+        step = (step * torch.where(better, GROWTH, DECAY)).clamp(*STEPS)
+    distances = 2.0 ** -torch.arange(1, NARROWEST + 1, dtype=torch.float64)
+    widths = torch.full_like(at, 1.0)
+    for i in range(at.shape[1]):
+        moved = at.repeat(2 * NARROWEST, 1, 1)  # (2 NARROWEST, PEAKS, d)
+        moved[:, :, i] += torch.cat([distances, -distances]).unsqueeze(-1)
+        half = density(moved.flatten(0, 1)).reshape(2, NARROWEST, PEAKS) < 0.5 * height
+        nearest = torch.where(half, distances.view(1, -1, 1), 1.0).amin(dim=1)  # (2, PEAKS), on either side
+        widths[:, i] = nearest.amax(dim=0)
+    return at, widths, height, PEAKS * (1 + CLIMB + 2 * NARROWEST * at.shape[1])
+
+
+def _distinct(peaks: Tensor, widths: Tensor, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The highest of them, one of each that lie within a width of one another."""
+    kept: list[int] = []
+    for k in heights.argsort(descending=True).tolist():
+        away = lambda j, k=k: ((peaks[j] - peaks[k] + 0.5).remainder(1.0) - 0.5).abs() > widths[j]
+        if all(bool(away(j).any()) for j in kept):
+            kept.append(k)
+    kept = kept[:PEAKS]
+    return peaks[kept], widths[kept], heights[kept]
+
+
+def _drawn(peaks: Tensor, widths: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """States of the mixture `_density`: even ones, and around each peak wrapped Cauchy ones, coordinate by coordinate."""
+    draw = lambda *shape: torch.rand(*shape, dtype=torch.float64, generator=generator)
+    which = torch.randint(len(peaks), (count,), generator=generator)
+    even = draw(count, peaks.shape[1])
+    offset = widths[which] * torch.tan(math.pi * (draw(count, peaks.shape[1]) - 0.5))
+    near = torch.where(widths[which] >= BROAD, even, (peaks[which] + offset).remainder(1.0))
+    return torch.where(draw(count, 1) < EVEN, even, near)
+
+
+def _density(x: Tensor, peaks: Tensor, widths: Tensor) -> Tensor:
+    """Of the mixture, ``(N,)``: sinh g / (cosh g - cos 2 pi t) with g = 2 pi width is the wrapped Cauchy density."""
+    total = torch.zeros_like(x[:, 0])
+    for peak, width in zip(peaks, widths, strict=True):
+        g = 2.0 * math.pi * width
+        # cosh g - cos 2 pi t as a sum of squares, which does not cancel where both are small.
+        gap = 2.0 * ((0.5 * g).sinh().square() + (math.pi * (x - peak)).sin().square())
+        total += torch.where(width >= BROAD, 1.0, g.sinh() / gap).prod(dim=-1)
+    return EVEN + (1.0 - EVEN) * total / len(peaks)

@@ -1,0 +1,18 @@
+"""What a user can say of a problem's data without writing a proof: how fast they vary."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Lipschitz:
+    """`|g(x) - g(y)| <= L |x - y|`, Euclidean in torus units, for each entry `g` of the data; `None` where `L` is unknown.
+
+    A method that is not overridden needs none.
+    """
+
+    state_cost: float | None = None
+    drift: float | None = None
+    control_matrix: float | None = None
+    initial_density: float | None = None

@@ -1,0 +1,157 @@
+"""The exact identities behind the bounds of one closed loop, against prescribed truth and against simulation."""
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+
+from ocp_torch.certificate.estimate import Estimate, replicated_samples
+from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.simulated.simulation import discounted_integral
+from ocp_torch.certificate.upper.lagrangian import Terms, _integrands, best_multiples, closed_loop_bounds
+from ocp_torch.certificate.upper.policy_evaluation import (
+    StageSettings,
+    fit_closed_loop,
+    positive_weight,
+    relative_excess,
+)
+from ocp_torch.control.policies import ValuePolicy
+from ocp_torch.fields import Fields, PeriodicMLP
+from ocp_torch.maths import jets
+from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.problems.generator import Generator
+from ocp_torch.problems.samples import Samples
+from support import zoo
+
+
+def optimal_loop_samples(problem, count=2**13):
+    """The closed loop of the exact controller, whose `V^u` and `mu^u` are the exact `V*` and `mu*`."""
+    loop = ClosedLoop(problem, problem.exact_control)
+    return loop, [Samples.of(loop, s.x) for s in replicated_samples(problem, count, 8, 0, divergences=False)]
+
+
+def bellman_slack(loop, value, samples):
+    V = jets.jet(value, samples.x)
+    return V.value, Generator.of(loop, samples).hjb_slack(V)
+
+
+@zoo.on(zoo.FEW_SMOOTH)
+def test_any_value_function_gives_the_performance_by_its_slack_on_the_occupation_density(problem):
+    """`Perf(u) = E[V mu0] - E_{mu^u}[Q_u]`."""
+    loop, sets = optimal_loop_samples(problem)
+    value = zoo.rough_network(problem.dim, 5, size=0.3)
+
+    def performance(samples):
+        v, slack = bellman_slack(loop, value, samples)
+        return float((v * samples.mu0 - problem.exact_occupation(samples.x) * slack).mean())
+
+    found = Estimate.of([performance(s) for s in sets])
+    assert found.value == pytest.approx(problem.exact_optimum, abs=5.0 * found.se + 1e-9)
+    assert found.se < 1e-2 * problem.exact_optimum
+
+
+@zoo.on(zoo.FEW_SMOOTH)
+def test_any_density_gives_the_performance_once_the_value_of_its_residual_is_added(problem):
+    """`Perf(u) = E[(f + R(u)) mu + V r] + E[(V^u - V) r]`."""
+    loop, sets = optimal_loop_samples(problem)
+    value, log_mu = (zoo.rough_network(problem.dim, seed, size=0.2) for seed in (6, 7))
+
+    def performance(samples):
+        mu, spent = Generator.of(loop, samples).occupation_outflow(log_mu)
+        r, v = samples.mu0 - spent, value(samples.x)
+        lagrangian = samples.f * mu + v * r
+        return float((lagrangian + (problem.exact_value(samples.x) - v) * r).mean())
+
+    found = Estimate.of([performance(s) for s in sets])
+    assert found.value == pytest.approx(problem.exact_optimum, abs=5.0 * found.se + 1e-9)
+    assert found.se < 1e-2 * problem.exact_optimum
+
+
+@zoo.on(zoo.FEW_SMOOTH)
+def test_the_value_differs_from_that_of_the_loop_by_the_slack_met_along_its_trajectories(problem):
+    """`V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt`, state by state."""
+    loop = ClosedLoop(problem, problem.exact_control)
+    value, x = zoo.rough_network(problem.dim, 8, size=0.3), zoo.states(problem, 20)
+    along = lambda y: (loop.drift(y), bellman_slack(loop, value, Samples.of(loop, y, divergences=False))[1])
+    met, _ = discounted_integral(along, x, problem.discount, horizon=14.0 / problem.discount, steps=120)
+    torch.testing.assert_close(value(x) - problem.exact_value(x), met, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.nightly
+@zoo.on(zoo.FEW_SMOOTH)
+def test_the_bounds_of_a_poor_controller_are_above_its_own_performance(problem):
+    """Not only above OPT: a bound speaks of the controller it is given."""
+    bump = zoo.rough_network(problem.dim, 9, size=0.05)
+    value = lambda x: problem.exact_value(x) + bump(x)
+    policy = ValuePolicy(problem, value)
+    loop = ClosedLoop(problem, policy)
+    sets = replicated_samples(problem, 2048, 8, 0, divergences=False)
+    log_mu = lambda x: problem.exact_occupation(x).log() + 0.3 * bump(x)
+    constants = closed_loop_bounds(loop, value, log_mu, [Samples.of(loop, s.x) for s in sets], 8, "value")
+    initial = [float((value(s.x) * s.mu0).mean()) for s in sets]
+    perf = simulate_performance(problem, policy, 64, 8, 0, value=value, initial=initial, tolerance=1e-3).perf
+    assert perf.value - 3.0 * perf.se > problem.exact_optimum
+    for bound in (constants.lagrangian, constants.J):
+        assert bound.value >= perf.value - perf.bias - 4.0 * (perf.se + bound.se)
+
+
+def test_the_stage_takes_another_round_only_while_the_residual_costs_too_much():
+    problem = zoo.build("manufactured 2-d q=2")
+    network = partial(PeriodicMLP, modes=1, width=16, depth=2)
+    fields = Fields.build(problem, ("value",), network, 0)
+    policy = ValuePolicy(problem, problem.exact_value)
+    settings = StageSettings(steps=40, rounds=3, batch=64)
+    fit = lambda **change: fit_closed_loop(
+        problem, policy, fields, network, resolve_constants(problem), replace(settings, **change), seed=0
+    )
+    weights = lambda fitted: torch.cat([p.flatten() for p in fitted.log_occupation.parameters()])
+    once = weights(fit(rounds=1))
+    assert torch.equal(weights(fit(good_excess=1e3)), once)
+    assert not torch.equal(weights(fit(good_excess=1e-12)), once)
+
+
+def test_the_excess_is_what_the_bound_adds_to_its_integral():
+    problem = zoo.build("manufactured 2-d q=2")
+    loop = ClosedLoop(problem, problem.exact_control)
+    value, log_mu = (zoo.rough_network(2, seed, size=0.1) for seed in (1, 2))
+    shifted = lambda x: 1.0 + value(x)
+    samples = Samples.of(loop, zoo.states(problem, 4000))
+    found = closed_loop_bounds(loop, shifted, log_mu, [samples, samples], 1, "value")
+    v, slack = bellman_slack(loop, shifted, samples)
+    mu = log_mu(samples.x).exp()
+    without = float((v * samples.mu0 - mu * slack).mean())
+    excess = relative_excess(loop, shifted, log_mu, samples) * float((v * samples.mu0).mean())
+    # The bound's suprema are climbed, the excess's only sampled.
+    assert without + excess <= found.lagrangian.value + 1e-12
+    assert without + 1.1 * excess >= found.lagrangian.value
+
+
+@pytest.mark.nightly
+@zoo.on(zoo.FEW_SMOOTH)
+def test_the_bounds_do_not_depend_on_the_mass_that_mu_was_given(problem):
+    """Every multiple of `mu` is a candidate, and none is above the bound of `mu` itself by more than chance allows."""
+    loop = ClosedLoop(problem, problem.exact_control)
+    value, bump = (zoo.rough_network(problem.dim, seed, size=0.1) for seed in (3, 4))
+    shifted = lambda x: 1.0 + value(x)
+    log_mu = lambda x: problem.exact_occupation(x).log() + bump(x)
+    sets = [Samples.of(loop, s.x) for s in replicated_samples(problem, 512, 4, 0, divergences=False)]
+    here, heavier = (
+        closed_loop_bounds(loop, shifted, lambda x, c=c: log_mu(x) + c, sets, 1, "value") for c in (0.0, 0.2)
+    )
+    for name in ("lagrangian", "J", "below"):
+        assert getattr(here, name).value == pytest.approx(getattr(heavier, name).value, rel=1e-4)
+    terms = [Terms(s, *parts[:3]) for s in sets for parts in [_integrands(loop, shifted, log_mu, s)]]
+    bound = lambda t, scale: t.lagrangian(scale, 2.0, 0.5)
+    assert sum(best_multiples(terms, bound)) <= sum(bound(t, 1.0) for t in terms) + 1e-3
+
+
+def test_the_weight_of_missing_mass_follows_the_slack():
+    """Deep slack on one side makes that side of the residual weigh more, within limits; a sign turned turns the ratio."""
+    problem = zoo.build("manufactured 2-d q=2")
+    loop = ClosedLoop(problem, problem.exact_control)
+    samples = Samples.of(loop, zoo.states(problem, 4000))
+    low, high = ((lambda x, c=c: problem.exact_value(x) + c) for c in (-0.1, 0.1))
+    assert positive_weight(loop, low, samples) == pytest.approx(4.0)
+    assert positive_weight(loop, high, samples) == pytest.approx(0.25)

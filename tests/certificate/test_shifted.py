@@ -1,0 +1,236 @@
+"""The lower bound that needs no `M`: the best multiple of `V`, shifted by the supremum of its slack."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ocp_torch.certificate.estimate import replicated_samples
+from ocp_torch.certificate.lower.mollified import DIRECTIONS, EVALUATIONS, Mollified
+from ocp_torch.certificate.lower.recombined import Program, recombined
+from ocp_torch.certificate.lower.shifted import TOP, SlackParts, climbed, scaled_by, slack_function
+from ocp_torch.certificate.settings import CertificateSettings
+from ocp_torch.certificate.sides import lower_side
+from ocp_torch.fields import PeriodicMLP
+from ocp_torch.maths.jets import jet
+from ocp_torch.problems import Circle
+from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.problems.generator import Generator
+from ocp_torch.problems.samples import Samples
+from support import zoo
+
+
+def parts_of(problem, value, count: int = 400) -> SlackParts:
+    samples = Samples.of(problem, zoo.states(problem, count))
+    return SlackParts.of(Generator.of(problem, samples), jet(value, samples.x))
+
+
+def near(problem, seed: int, size: float):
+    network = zoo.rough_network(problem.dim, seed, size=size)
+    return lambda x: problem.exact_value(x) + network(x)
+
+
+@zoo.on(zoo.FEW)
+def test_the_slack_of_a_multiple_is_that_of_the_scaled_network(problem):
+    V = near(problem, 2, 0.5)
+    parts = parts_of(problem, V)
+    for theta in (0.0, 0.3, 1.0, 1.4):
+        torch.testing.assert_close(parts.slack(theta), slack_function(problem, lambda x, s=theta: s * V(x))(parts.x))
+
+
+@zoo.on(zoo.FEW)
+def test_the_multiple_is_the_best_on_a_line_of_multiples(problem):
+    parts, initial = parts_of(problem, near(problem, 4, 0.2)), problem.exact_optimum
+    bound = lambda theta: theta * initial - float(parts.slack(theta).max())
+    best = max(bound(theta) for theta in torch.linspace(0.0, TOP, 1501).tolist())
+    assert bound(scaled_by(parts, initial)) >= best - 1e-9
+
+
+case = dict(name=st.sampled_from(zoo.FEW), seed=st.integers(0, 10**6), size=st.sampled_from([1e-2, 0.1, 1.0]))
+
+
+@pytest.mark.nightly
+@settings(max_examples=6)
+@given(**case)
+def test_scaling_never_loses_and_never_passes_the_optimum(name, seed, size):
+    problem = zoo.build(name)
+    V = near(problem, seed, size)
+    sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
+    found = lower_side(problem, V, sets, 1.0, ascents=8)
+    pieces = [
+        SlackParts.of(Generator.of(problem, s), jet(V, s.x)) for s in sets
+    ]  # the multiple 1, as it was before there was a choice
+    plain = climbed(problem, V, SlackParts.join(pieces), 1.0, 8)
+    initial = sum(found.initial) / len(found.initial)
+    assert found.shifted.value >= initial - max(plain.value, 0.0) - 1e-12
+    assert found.shifted.value <= problem.exact_optimum + 6.0 * found.shifted.se + 1e-9
+
+
+@pytest.mark.nightly
+@settings(max_examples=4)
+@given(**case)
+def test_averaging_never_loses_and_never_passes_the_optimum(name, seed, size):
+    problem = zoo.build(name)
+    sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
+    found = lower_side(problem, near(problem, seed, size), sets, 1.0, ascents=8, search=True)
+    assert found.best.bound >= found.own.bound
+    assert found.shifted.value <= problem.exact_optimum + 6.0 * found.shifted.se + 1e-9
+
+
+class Wave:
+    """`cos(2 pi k . x)`; it counts no state outside the unit cell."""
+
+    def __init__(self, wave: list[int]) -> None:
+        self.wave, self.outside = torch.tensor(wave, dtype=torch.float64), 0
+
+    def __call__(self, x):
+        self.outside += int(((x < 0.0) | (x >= 1.0)).sum())
+        return torch.cos(2.0 * math.pi * x @ self.wave)
+
+
+@pytest.mark.parametrize("dim", [1, 3, 12])
+def test_an_average_of_a_plane_wave_is_a_smaller_one(dim):
+    wave = Wave([(3 * i) % 5 - 2 for i in range(dim)])
+    averaged = Mollified(wave, dim, 0.03)
+    neighbours = averaged.offsets[1:]
+    assert len(neighbours) == 2 * min(dim, DIRECTIONS)
+    axes = neighbours[: len(neighbours) // 2]
+    torch.testing.assert_close(axes @ axes.T, 0.03**2 * torch.eye(len(axes), dtype=torch.float64))
+    torch.testing.assert_close(neighbours[len(axes) :], -axes)
+    x = torch.rand(40, dim, generator=torch.Generator().manual_seed(dim), dtype=torch.float64)
+    left = (1.0 + torch.cos(2.0 * math.pi * neighbours @ wave.wave).sum()) / (len(neighbours) + 1)
+    found = jet(averaged, x)
+    value, gradient = found.value, found.gradient
+    torch.testing.assert_close(value, left * wave(x))
+    torch.testing.assert_close(averaged(x), value)
+    slope = -2.0 * math.pi * left * torch.sin(2.0 * math.pi * x @ wave.wave)
+    torch.testing.assert_close(gradient, slope.unsqueeze(-1) * wave.wave)
+    assert wave.outside == 0
+
+
+def test_a_narrow_spike_of_the_slack_is_averaged_out():
+    problem = Circle()
+    at = torch.tensor(0.3, dtype=torch.float64)
+    bump = lambda x: torch.exp(-((x[:, 0] - at) / 2e-3).square())
+    V = lambda x: problem.exact_value(x) + 2e-3 * bump(x)
+    sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
+    plain, averaged = (lower_side(problem, V, sets, 1.0, ascents=8, search=m) for m in (False, True))
+    assert plain.best.radius == 0.0 < averaged.best.radius
+    assert "averaged" in averaged.best.sentence
+    assert "averaged" not in plain.best.sentence
+    lost = problem.exact_optimum - torch.tensor([plain.shifted.value, averaged.shifted.value])
+    assert lost[1] < 0.7 * lost[0]
+    assert lost[1] >= -6.0 * averaged.shifted.se
+
+
+@pytest.mark.parametrize(
+    ("mollify", "unbounded", "expected"),
+    [
+        (None, True, True),
+        (None, False, False),
+        (True, False, True),
+        (False, True, False),
+    ],
+)
+def test_functions_made_of_V_are_tried_where_no_M_will_do_or_somebody_says_so(mollify, unbounded, expected):
+    constants = replace(resolve_constants(Circle()), unbounded=unbounded)
+    assert CertificateSettings(mollify=mollify).searches(constants) is expected
+
+
+def test_large_sets_are_thinned_to_the_budget():
+    problem = zoo.build(zoo.FEW[0])
+    sets = replicated_samples(problem, 2**16, 8, seed=0, divergences=False)
+    averaged = Mollified(problem.exact_value, problem.dim, 0.01)
+    fewer = averaged.fitting(sets)
+    states = sum(len(s) for s in fewer) * len(averaged.offsets)
+    assert EVALUATIONS / 2 < states <= EVALUATIONS
+    assert len(fewer) == 8
+    torch.testing.assert_close(fewer[3].x, sets[3].x[: len(fewer[3])])
+
+
+@zoo.on(zoo.FEW)
+def test_a_value_function_of_the_wrong_size_is_put_right(problem):
+    sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
+    found = lower_side(problem, lambda x: 0.8 * problem.exact_value(x), sets, 1.0)
+    assert found.own.theta == pytest.approx(1.25, abs=0.02)
+    assert found.shifted.value == pytest.approx(problem.exact_optimum, rel=5e-3, abs=6.0 * found.shifted.se)
+
+
+@zoo.on(zoo.FEW)
+def test_a_subsolution_with_room_is_shifted_up(problem):
+    sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
+    found = lower_side(problem, lambda x: problem.exact_value(x) - 5.0, sets, 1.0)
+    assert found.shifted.value == pytest.approx(problem.exact_optimum, rel=5e-3, abs=6.0 * found.shifted.se)
+
+
+def test_a_useless_value_function_still_gives_about_the_smallest_cost():
+    problem = Circle()
+    sets = replicated_samples(problem, 512, 2, seed=0, divergences=False)
+    rough = lower_side(problem, zoo.rough_network(1, 0, size=50.0), sets, 1.0)
+    assert -1e-3 < rough.shifted.value < problem.exact_optimum
+    assert rough.own.theta < 0.1
+
+
+class Negative(Circle):
+    def state_cost(self, x):
+        return super().state_cost(x) - 0.1
+
+
+def test_where_the_cost_is_negative_nothing_is_scaled():
+    problem = Negative()
+    sets = replicated_samples(problem, 512, 2, seed=0, divergences=False)
+    found = lower_side(problem, zoo.rough_network(1, 0), sets, 1.0)
+    assert found.own.theta == 1.0
+    assert found.shifted.value <= problem.exact_optimum - 0.1
+
+
+class Perturbed(PeriodicMLP):
+    """`V*` plus a network: its last layer can take away what it put there."""
+
+    def __init__(self, problem, size: float) -> None:
+        super().__init__(problem.dim, modes=2, width=24, depth=2, activation="tanh", scale=size)
+        self.problem = problem
+        torch.nn.init.normal_(self.head.weight)
+
+    def forward(self, x):
+        return self.problem.exact_value(x) + super().forward(x)
+
+
+def perturbed(problem, size=1e-3, seed=0):
+    torch.manual_seed(seed)
+    return Perturbed(problem, size).double().requires_grad_(False)
+
+
+def test_the_slack_of_a_recombination_is_that_of_its_field():
+    for name in ("manufactured 2-d q=1.5", "circle rho=2"):
+        problem = zoo.build(name)
+        value = perturbed(problem)
+        x = zoo.states(problem, 50)
+        program = Program(problem, value, x)
+        c = 1e-3 * torch.randn(program.basis.shape[1], generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        torch.testing.assert_close(program.slack(c), slack_function(problem, program.field(c))(x).detach())
+        extra = zoo.states(problem, 7, seed=3)
+        program.add(extra)
+        both = torch.cat([x, extra])
+        torch.testing.assert_close(program.slack(c), slack_function(problem, program.field(c))(both).detach())
+
+
+@pytest.mark.parametrize("name", ["manufactured 2-d q=1.5", "manufactured 1-d q=2"])
+def test_a_last_layer_chosen_anew_finds_the_subsolution_that_it_can_represent(name, monkeypatch):
+    monkeypatch.setattr("ocp_torch.certificate.lower.recombined.STATES", 1024)
+    monkeypatch.setattr("ocp_torch.certificate.lower.mollified.RADII", (1.0 / 64.0,))
+    problem = zoo.build(name)
+    value = perturbed(problem)
+    sets = replicated_samples(problem, 1024, 8, seed=0, divergences=False)
+    found = lower_side(problem, value, sets, 1.0, ascents=8, search=True)
+    lost = problem.exact_optimum - found.own.bound, problem.exact_optimum - found.best.bound
+    assert lost[1] < 0.1 * lost[0]
+    assert lost[1] > -6.0 * found.shifted.se - 1e-9
+    assert "recombined" in found.best.sentence
+
+
+def test_a_field_that_shows_no_features_is_not_recombined():
+    assert recombined(Circle(), Circle().exact_value, seed=0) is None

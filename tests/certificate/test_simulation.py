@@ -1,0 +1,146 @@
+"""Simulated closed loops: order of convergence, exact performances, control variates and occupation densities."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from ocp_torch.certificate.checks.assumptions import occupation_along_flow
+from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance
+from ocp_torch.certificate.simulated.simulation import discounted_integral, refined
+from ocp_torch.maths.sampling import evaluation_points
+from support import zoo
+
+TURN = 2.0 * math.pi
+
+
+def test_the_integrator_has_order_four():
+    """`dx/dt = sin(2 pi x)/pi`, so `tan(pi x_t) = e^{2t} tan(pi x_0)`; the rate `W - W' dx/dt / rho` integrates to
+    `W(x_0) - e^{-rho T} W(x_T)`, whatever `W`; here `W = sin(2 pi x) + cos(4 pi x)`."""
+    rho, horizon = 1.5, 2.0
+    W = lambda x: (TURN * x).sin() + (2.0 * TURN * x).cos()
+    slope = lambda x: TURN * (TURN * x).cos() - 2.0 * TURN * (2.0 * TURN * x).sin()
+
+    def dynamics(x):
+        velocity = (TURN * x).sin() / math.pi
+        return velocity, (W(x) - slope(x) * velocity / rho).squeeze(-1)
+
+    x0 = torch.linspace(0.02, 0.45, 20, dtype=torch.float64).unsqueeze(-1)
+    end = torch.atan(math.exp(2.0 * horizon) * torch.tan(math.pi * x0)) / math.pi
+    exact = (W(x0) - math.exp(-rho * horizon) * W(end)).squeeze(-1)
+    steps = np.array([16, 32, 64, 128])
+    errors = []
+    for n in steps:
+        total, reached = discounted_integral(dynamics, x0, rho, horizon, int(n))
+        errors.append([float((total - exact).abs().max()), float((reached - end).abs().max())])
+    for kind in np.array(errors).T:
+        order = -np.polyfit(np.log(steps), np.log(kind), 1)[0]
+        assert order == pytest.approx(4.0, abs=0.25)
+
+
+def test_end_states_are_wrapped_onto_the_torus():
+    x0 = torch.tensor([[0.25], [0.75]], dtype=torch.float64)
+    _, end = discounted_integral(lambda x: (torch.ones_like(x), x[:, 0]), x0, 1.0, 2.5, 10)
+    torch.testing.assert_close(end, torch.tensor([[0.75], [0.25]], dtype=torch.float64))
+
+
+def wrong_policy(problem):
+    """The exact controller with a periodic mistake of size 0.4 in every component."""
+    mistake = lambda x: 0.4 * (TURN * x[:, :1] + torch.arange(problem.control_dim).to(x)).sin()
+    return lambda x: problem.exact_control(x) + mistake(x)
+
+
+@pytest.mark.nightly
+@zoo.on((*zoo.FEW_SMOOTH, "manufactured 1-d q=1.2", "manufactured 2-d q=1.5", "manufactured 3-d interaction=3"))
+def test_the_exact_controller_performs_at_the_optimum(problem):
+    perf = simulate_performance(problem, problem.exact_control, trajectories=64, replicates=8, seed=0).perf
+    assert abs(perf.value - problem.exact_optimum) <= 4.0 * perf.se + perf.bias
+    # An error bar that covers everything proves nothing.
+    assert 4.0 * perf.se + perf.bias < 0.02 * problem.exact_optimum
+
+
+@zoo.on(zoo.KINKED)
+def test_the_exact_controller_performs_at_the_optimum_with_kinks(problem):
+    perf = simulate_performance(problem, problem.exact_control, trajectories=64, replicates=8, seed=0).perf
+    assert abs(perf.value - problem.exact_optimum) <= 4.0 * perf.se + perf.bias
+    assert 4.0 * perf.se + perf.bias < 0.05 * problem.exact_optimum
+
+
+@zoo.on(zoo.SMOOTH)
+def test_the_exact_value_as_control_variate_leaves_nothing_to_simulate(problem):
+    """Its Bellman slack under the exact controller is zero, so `E[V* mu0]` alone is the answer."""
+    simulated = simulate_performance(
+        problem, problem.exact_control, 8, 2, seed=0, value=problem.exact_value, initial=[problem.exact_optimum] * 2
+    )
+    assert simulated.perf.value == pytest.approx(problem.exact_optimum, rel=1e-10)
+    assert simulated.perf.se + simulated.perf.bias < 1e-10
+    starts = torch.cat([evaluation_points(8, problem.dim, SIMULATION_REPLICATE + r, seed=0) for r in range(2)])
+    assert simulated.largest_value == pytest.approx(float(problem.exact_value(starts).max()), rel=1e-10)
+
+
+@pytest.mark.nightly
+@zoo.on(("manufactured 2-d mu0", "swing"))
+def test_a_control_variate_does_not_change_the_answer(problem):
+    """Any smooth value function will do, and any controller: from the same starts nothing but the bias is left."""
+    network = zoo.rough_network(problem.dim, seed=2, size=0.03)
+    policy = wrong_policy(problem) if problem.exact_optimum else lambda x: 0.5 * (TURN * x[:, :1]).sin()
+    starts = [evaluation_points(8, problem.dim, SIMULATION_REPLICATE + r, seed=0) for r in range(2)]
+    initial = [float((network(x) * problem.initial_density(x)).mean()) for x in starts]
+    plain = simulate_performance(problem, policy, trajectories=8, replicates=2, seed=0).perf
+    varied = simulate_performance(problem, policy, 8, 2, seed=0, value=network, initial=initial).perf
+    assert abs(plain.value - varied.value) <= plain.bias + varied.bias
+    assert plain.bias + varied.bias < 1e-3 * plain.value
+    assert varied.se == pytest.approx(plain.se, rel=0.05)
+
+
+@pytest.mark.nightly
+@zoo.on(("manufactured 1-d q=2", "manufactured 2-d mu0", "manufactured 2-d B(x)", "manufactured 3-d m=2"))
+def test_a_controller_loses_half_its_squared_distance_from_the_optimal_one(problem):
+    """`Perf(u) - OPT = E_{mu^u} |u - u*|^2 / 2` for `q = 2` and smooth `V*`; the right side simulated by itself."""
+    policy = wrong_policy(problem)
+    perf = simulate_performance(problem, policy, trajectories=64, replicates=8, seed=0).perf
+    half_square = lambda x: 0.5 * (policy(x) - problem.exact_control(x)).square().sum(dim=-1)
+    x0 = torch.cat([evaluation_points(64, problem.dim, r, seed=7) for r in range(8)])
+    dynamics = lambda x: (problem.velocity(x, policy(x)), half_square(x))
+    losses, _ = discounted_integral(dynamics, x0, problem.discount, 12.0 / problem.discount, 200)
+    per_set = (problem.initial_density(x0) * losses).reshape(8, -1).mean(dim=1)
+    loss, error = float(per_set.mean()), float(per_set.std()) / math.sqrt(8.0)
+    allowed = 4.0 * math.hypot(perf.se, error) + perf.bias
+    assert abs(perf.value - problem.exact_optimum - loss) <= allowed
+    assert allowed < 0.2 * loss
+
+
+@zoo.on(zoo.FEW_SMOOTH)
+def test_the_occupation_density_along_the_exact_flow_is_the_exact_one(problem):
+    """Truncation leaves `e^{-12}`, below 1e-5, of it."""
+    x = zoo.states(problem, 16, seed=4)
+    found = occupation_along_flow(problem, problem.exact_control, x, horizon=12.0 / problem.discount, steps=100)
+    torch.testing.assert_close(found, problem.exact_occupation(x), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("order", [0.5, 1, 2, 4])
+def test_a_standard_error_spares_halvings_and_hides_no_error(order):
+    """Results `1 + c n^-order`, of which the mean's error is known: it stays below the bias, and below the tolerance but
+    for the order 1/2, where halvings run out."""
+    sizes = torch.linspace(0.0, 4.0, 200, dtype=torch.float64)
+    tolerance, taken = 0.1, []
+
+    def integrate(rows, steps):
+        taken.append(len(rows) * steps)
+        return 1.0 + sizes[rows] * steps ** -float(order), torch.zeros(len(rows), 1, dtype=torch.float64)
+
+    def run(standard_error):
+        taken.clear()
+        generator = torch.Generator().manual_seed(0)
+        result, _, bias = refined(
+            integrate, torch.ones_like(sizes), 4, tolerance, generator, lambda results: standard_error
+        )
+        return float(result.mean()) - 1.0, bias, sum(taken)
+
+    (error, bias, work), (noisy_error, noisy_bias, noisy_work) = run(0.0), run(10.0)
+    assert error <= noisy_error
+    assert noisy_error <= tolerance or order < 1
+    assert error <= bias
+    assert noisy_error <= noisy_bias
+    assert noisy_work < work if order == 1 else noisy_work <= work

@@ -1,0 +1,127 @@
+"""Spikes that a few sampled states carry: more states are drawn there, or the interval says that it may be off."""
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import pytest
+import torch
+
+from ocp_torch.certificate import Run, Trained, certify_fields
+from ocp_torch.certificate.checks.tails import rarity, sharpened, widened
+from ocp_torch.certificate.estimate import Estimate, replicated_samples
+from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
+from ocp_torch.control.policies import NETWORK, zero_policy
+from ocp_torch.fields import Fields, PeriodicMLP
+from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.problems.starts import evaluation_distribution
+from support import zoo
+from support.adversarial import Spike, gaussian
+from support.formulas import Field
+from support.honesty import BARE
+
+SPIKES = {
+    "1-d": (1, 0.0025, 0.0),
+    "1-d needle": (1, 2e-5, 0.5),
+    "2-d": (2, 0.0025, 0.0),
+    "2-d on waves": (2, 0.0025, 0.5),
+    "3-d": (3, 0.005, 0.0),
+    "3-d on waves": (3, 0.01, 0.5),
+    "5-d": (5, 0.03, 0.0),
+}
+
+
+def spike(name: str, seed: int = 0, **options) -> Spike:
+    dim, sigma, wavy = SPIKES[name]
+    centre = torch.rand(dim, generator=torch.Generator().manual_seed(seed + 100)).tolist()
+    return Spike(centre, sigma, 0.2, wavy, **options)
+
+
+def assert_covers(estimate: Estimate, truth: float, most: float = 0.05):
+    low, high = estimate.interval(0.999)
+    assert low <= truth <= high
+    assert high - low <= most * truth
+
+
+@pytest.mark.parametrize("name", SPIKES)
+def test_bounds_of_a_closed_loop_know_a_spike_of_the_cost(name):
+    """Doing nothing keeps the uniform law: `J` and the Lagrangian bound are the mean cost."""
+    problem = spike(name)
+    loop = ClosedLoop(problem, zero_policy(problem))
+    zero = lambda x: 0.0 * x[:, 0]
+    judge = lambda sets: closed_loop_bounds(loop, zero, zero, loop.samples_of(sets), 1, "value")
+    found = sharpened(judge, problem, replicated_samples(problem, 2048, 8, 0, divergences=False), 0)
+    for estimate in (found.lagrangian, found.J, found.below):
+        assert_covers(estimate, problem.idle)
+
+
+@pytest.mark.parametrize(("name", "speed"), [("1-d needle", 0.0), ("2-d", 0.0), ("2-d", 0.05), ("3-d", 0.0)])
+def test_a_simulated_cost_knows_a_spike_where_trajectories_start(name, speed):
+    problem = spike(name, speed=speed)
+    low, high = simulate_performance(problem, zero_policy(problem), 64, 8, 0).perf.interval(0.999)
+    assert low <= problem.idle <= high
+
+
+@dataclass(frozen=True)
+class Mean:
+    """The mean of a function that no search of the problem's data would find."""
+
+    estimate: Estimate
+    contributions: list = field(default_factory=list)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_states_are_drawn_where_a_few_carried_the_mean(seed):
+    """A spike of an integrand, such as a fitted density at a sink, not of the data."""
+    problem = zoo.build("manufactured 2-d q=2")
+    centre = torch.rand(2, generator=torch.Generator().manual_seed(seed)).tolist()
+    g = lambda x: 1.0 + 0.3 * gaussian(x, centre, 0.006)
+
+    def judge(sets):
+        values = [s.weight * g(s.x) for s in sets]
+        return Mean(widened(Estimate.of([float(v.mean()) for v in values]), values), [values])
+
+    sets = replicated_samples(problem, 2048, 8, seed, divergences=False)
+    assert rarity(torch.cat(judge(sets).contributions[0]), 1.0) > 0.0
+    found = sharpened(judge, problem, sets, seed)
+    assert rarity(torch.cat(found.contributions[0]), 1.0) == 0.0
+    assert_covers(found.estimate, 1.3, 0.03)
+
+
+@pytest.mark.parametrize("hits", [2.0, 5.0, 15.0])
+def test_an_interval_of_rare_events_covers_as_often_as_it_says(hits):
+    """`N` draws, each with a small chance of a large contribution; wherever one was met at all."""
+    count, generator, missed, met = 16384, torch.Generator().manual_seed(0), 0, 0
+    for _ in range(300):
+        rare = torch.rand(8, count // 8, generator=generator, dtype=torch.float64) < hits / count
+        values = 1.0 + rare * (0.2 * count / hits)
+        if not rare.any():
+            continue
+        low, high = widened(Estimate.of(values.mean(dim=1).tolist()), list(values)).interval(0.95)
+        met, missed = met + 1, missed + (not low <= 1.2 <= high)
+    assert missed <= 0.05 * met
+
+
+def test_what_many_states_carry_is_left_alone():
+    x = torch.randn(16384, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert rarity(x, 1.0) == rarity(x.exp(), 1.0) == rarity(torch.ones(9), 1.0) == 0.0
+    one = torch.cat([torch.ones(16383), torch.tensor([1.01])])
+    assert rarity(one, 1.0) == 0.0  # rare, but nothing beside the answer
+
+
+@zoo.on((*zoo.NATURAL, *zoo.FEW))
+def test_problems_without_spikes_keep_their_states(problem):
+    assert evaluation_distribution(problem).is_uniform
+
+
+@pytest.mark.parametrize("name", ["2-d", "2-d on waves"])
+def test_a_certificate_of_doing_nothing_holds_what_it_costs(name):
+    problem = spike(name)
+    fields = Fields({"control_density": Field(lambda x: 0.0 * x), "log_occupation": Field(lambda x: 0.0 * x[:, 0])})
+    trained = Trained(fields, NETWORK, partial(PeriodicMLP, width=8, depth=1))
+    settings = replace(BARE, points=8192, trajectories=32, tolerance=5e-5)
+    certificate = certify_fields(problem, trained, resolve_constants(problem), settings, Run("spike", "primal"))
+    assert_covers(certificate.upper["J"], problem.idle)
+    low, high = certificate.perf["density"].interval(0.999)
+    assert low <= problem.idle <= high

@@ -1,0 +1,140 @@
+"""Waves found in data: all that are planted, none that are not; and integrals that lose their noise without bias."""
+
+import math
+from functools import partial
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ocp_torch.certificate.simulated.control_variate import integrals
+from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields, PeriodicMLP
+from ocp_torch.fields.waves import prominent_waves
+from ocp_torch.maths.jets import jet
+from ocp_torch.maths.sampling import evaluation_points
+from ocp_torch.problems import Manufactured, Problem, Torus
+from ocp_torch.problems.samples import Samples
+
+TURN = 2.0 * math.pi
+
+
+class Planted(Problem):
+    """`f = 3 + sum_j cos(2 pi k_j . x + j)` with the given waves."""
+
+    def __init__(self, waves: torch.Tensor) -> None:
+        super().__init__(waves.shape[1])
+        self.waves = waves
+
+    def state_cost(self, x):
+        angles = TURN * (x @ self.waves.to(x).T) + torch.arange(len(self.waves)).to(x)
+        return 3.0 + angles.cos().sum(dim=-1)
+
+
+def found_in(problem: Problem, count: int = 32) -> set[tuple]:
+    x = torch.rand(8192, problem.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    waves = prominent_waves(Samples.of(problem, x, divergences=False), count)
+    return {tuple(k) for k in waves.tolist()} | {tuple(-e for e in k) for k in waves.tolist()}
+
+
+@st.composite
+def interactions(draw):
+    """Up to four waves in two to eight dimensions with two or more entries, and a few single coordinates."""
+    dim = draw(st.integers(2, 8))
+    entry = st.sampled_from([-2.0, -1.0, 0.0, 1.0, 2.0])
+    wave = st.lists(entry, min_size=dim, max_size=dim).filter(lambda k: sum(e != 0 for e in k) >= 2)
+    return torch.tensor(draw(st.lists(wave, min_size=1, max_size=4)))
+
+
+@pytest.mark.nightly
+@given(interactions())
+@settings(max_examples=12, deadline=None)
+def test_every_planted_wave_is_found(waves):
+    found = found_in(Planted(waves))
+    assert {tuple(k) for k in waves.tolist()} <= found
+    assert len(found) == 2 * len({tuple(max(k, [-e for e in k])) for k in waves.tolist()})
+
+
+@pytest.mark.parametrize("dim", [16, 40])
+def test_pairs_are_found_in_many_dimensions(dim):
+    waves = torch.zeros(3, dim)
+    waves[0, 0], waves[0, dim - 1] = 1.0, -2.0
+    waves[1, 3], waves[1, 7] = 1.0, 1.0
+    waves[2, 5], waves[2, dim // 2] = 2.0, 1.0
+    assert {tuple(k) for k in waves.tolist()} <= found_in(Planted(waves))
+
+
+def test_nothing_is_found_where_coordinates_do_not_interact():
+    assert found_in(Planted(torch.eye(5))) == set()
+    assert found_in(Flat(4)) == set()
+
+
+class Flat(Problem):
+    def state_cost(self, x):
+        return torch.ones_like(x[:, 0])
+
+
+@pytest.mark.nightly
+def test_what_the_drift_and_the_controls_couple_counts_as_well():
+    problem = Manufactured(dim=6, interaction=5, seed=3)
+    assert {tuple(k) for k in problem.V0.waves.tolist()} <= found_in(problem, 64)
+    assert (0.0, 1.0, 1.0) in found_in(Torus(3))
+
+
+def test_networks_get_the_waves_keep_them_and_stay_periodic():
+    problem = Torus(2)
+    network = partial(PeriodicMLP, width=16, modes=2, waves=4)
+    fields = Fields.build(problem, (VALUE, CONTROL_DENSITY), network, 0).double()
+    assert fields.value.embedding.mixed[0].tolist() == [1.0, 1.0]
+    assert fields.control_density.embedding.mixed[1].tolist() == [2.0, 2.0]
+    again = Fields({VALUE: network(2), CONTROL_DENSITY: network(2, outputs=2)}).double()
+    again.load_state_dict(fields.state_dict())
+    x = torch.randint(2**10, (100, 2), generator=torch.Generator().manual_seed(0)).double() / 2**10
+    for shift in (0.0, 1.0, -7.0):
+        moved, kept = jet(again.value, x + shift), jet(fields.value, x)
+        for one, other in ((moved.value, kept.value), (moved.gradient, kept.gradient)):
+            assert torch.equal(one, other)
+
+
+def polynomial(x):
+    """Mean 2, with waves of one, two and six coordinates."""
+    return 2.0 + (TURN * (x[:, 0] - 2.0 * x[:, 3])).cos() + (TURN * x.sum(dim=-1)).sin() + 0.5 * (TURN * x[:, 1]).cos()
+
+
+def test_integrals_of_waves_are_exact():
+    states = [evaluation_points(1024, 6, r, 0) for r in range(8)]
+    for mean in integrals(states, [polynomial(x) for x in states]):
+        assert mean == pytest.approx(2.0, abs=1e-9)
+
+
+@pytest.mark.nightly
+def test_what_the_fit_takes_off_has_mean_zero():
+    """`exp` of a polynomial is no polynomial: repeated estimates scatter about the mean that one large sample gives."""
+    g = lambda x: polynomial(x).exp()
+    truth = g(evaluation_points(2**20, 6, 0, 99)).mean()
+    repeated = []
+    for seed in range(40):
+        states = [evaluation_points(256, 6, r, seed) for r in range(8)]
+        repeated.append(sum(integrals(states, [g(x) for x in states])) / 8)
+    found = torch.tensor(repeated, dtype=torch.float64)
+    assert abs(found.mean() - truth) < 4.0 * found.std() / math.sqrt(40)
+    plain = torch.tensor(
+        [float(g(torch.cat([evaluation_points(256, 6, r, s) for r in range(8)])).mean()) for s in range(40)]
+    )
+    assert found.std() < 0.5 * plain.std()
+
+
+def test_in_two_coordinates_the_noise_of_sobol_sets_goes_too():
+    f = Manufactured().state_cost
+    states = [evaluation_points(2048, 2, r, 0) for r in range(16)]
+    values = [f(x) for x in states]
+    plain, found = torch.stack([v.mean() for v in values]), torch.tensor(integrals(states, values), dtype=torch.float64)
+    truth = float(f(evaluation_points(2**18, 2, 0, 1)).mean())
+    assert float(found.std()) < 0.3 * float(plain.std())
+    assert abs(float(found.mean()) - truth) < 4.0 * float(found.std()) / 4.0
+
+
+def test_a_single_set_is_averaged_as_it_is():
+    x = evaluation_points(512, 2, 0, 0)
+    values = Manufactured().state_cost(x)
+    assert integrals([x], [values]) == [float(values.mean())]

@@ -1,0 +1,376 @@
+"""A limit `|u| <= c`: closed forms against brute force, gradients against differences, bounds against exact truth."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ocp_torch.certificate import CertificateSettings, StageSettings
+from ocp_torch.certificate.estimate import Estimate, replicated_samples
+from ocp_torch.certificate.external.black_box import BlackBox
+from ocp_torch.certificate.proof.box import Box
+from ocp_torch.certificate.proof.enclosures import conjugate_model
+from ocp_torch.certificate.proof.obstacle import obstacle
+from ocp_torch.certificate.proof.rigorous import rigorous_lower_bound
+from ocp_torch.certificate.sides import lower_side, upper_side
+from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
+from ocp_torch.control.controller import load_controller
+from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, admissible_density, occupation_density, trained_policies
+from ocp_torch.errors import InputError
+from ocp_torch.maths import jets
+from ocp_torch.objectives import Phase
+from ocp_torch.objectives.primal import ClosedPrimal, NetworkPrimal
+from ocp_torch.objectives.saddle import Saddle
+from ocp_torch.problems import Circle, Manufactured, Torus
+from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.problems.control_cost import PowerCost
+from ocp_torch.problems.control_limit import LimitedCost
+from ocp_torch.problems.generator import Generator
+from ocp_torch.problems.samples import Samples
+from ocp_torch.runs.external import certify
+from ocp_torch.runs.finish import controller_of
+from ocp_torch.studies.kernel.rules import DualRule
+from ocp_torch.studies.reference import solve_reference
+from support import zoo
+from support.brute_force import BOUND, central_differences, columns, lowest, two_dimensional, value_and_gradients
+from support.exact import ROUNDING, exact_slack, lattice
+from support.formulas import ERRORS, random_fields
+from support.small import session, small
+
+pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
+
+exponents, limits = st.floats(1.05, 2.0), st.floats(0.05, 5.0)
+# Nothing so small that the brute force would divide 0 by 0.
+lengths = st.floats(0.0, 20.0).map(lambda v: v if v > 1e-50 else 0.0)
+sizes = st.lists(lengths, min_size=1, max_size=20)
+INFINITE = 1e30
+
+
+def column(values) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+@given(sizes, exponents, limits)
+def test_the_conjugate_is_the_supremum_over_the_ball(sizes, q, c):
+    """The best control points along `p`, so a search over its length, up to the limit, suffices."""
+    p = column(sizes)
+    cost = LimitedCost(q, c)
+    brute = torch.maximum(-lowest(lambda r: r**q / q - p.unsqueeze(-1) * r, 1e-80, c), column([0.0]))
+    torch.testing.assert_close(cost.conjugate(two_dimensional(p)), brute, rtol=1e-8, atol=1e-12)
+    best = cost.argmax(two_dimensional(p))
+    assert float(best.norm(dim=-1).max()) <= c * (1.0 + 1e-12)
+    attained = (best * two_dimensional(p)).sum(dim=-1) - cost.cost(best)
+    torch.testing.assert_close(attained, brute, rtol=1e-8, atol=1e-12)
+
+
+@settings(max_examples=30)
+@given(
+    st.lists(st.tuples(lengths, st.floats(0.0, 9.0), st.floats(-4.0, 9.0)), min_size=1, max_size=30), exponents, limits
+)
+def test_the_primal_minimum_is_the_least_value_over_occupations_that_can_carry_the_flux(cases, q, c):
+    size, f, beta = (column(v) for v in zip(*cases, strict=True))
+    cost, w = LimitedCost(q, c), two_dimensional(size)
+    s, cost_, b = (t.unsqueeze(-1) for t in (size, f, beta))
+    running = lambda mu: cost_ * mu + mu * (s / mu) ** q / q + BOUND * torch.relu(b - mu)
+    brute = lowest(lambda mu: torch.where(s <= c * mu * (1.0 + 1e-12), running(mu), math.inf), 1e-14, 1e300)
+    on_the_limit = running(torch.where(s > 0.0, s / c, 1.0)).squeeze(-1)
+    at_zero = torch.where(size == 0.0, BOUND * beta.clamp_min(0.0), on_the_limit)
+    found = cost.primal_minimum(w, f, BOUND, beta)
+    torch.testing.assert_close(found, torch.minimum(brute, at_zero), rtol=1e-7, atol=1e-10)
+    mu = cost.primal_occupation(w, f, BOUND, beta)
+    assert (c * mu >= size * (1.0 - 1e-12)).all()
+    known = torch.isfinite(mu)
+    value = f * mu + cost.perspective(w, mu) + BOUND * torch.relu(beta - mu)
+    torch.testing.assert_close(value[known], found[known], rtol=1e-9, atol=1e-12)
+
+
+@settings(max_examples=30)
+@given(st.lists(st.tuples(lengths, st.floats(-5.0, 9.0)), min_size=1, max_size=30), exponents, limits)
+def test_the_saddle_minimum_is_the_least_value_up_to_the_bound(cases, q, c):
+    size, beta = (column(v) for v in zip(*cases, strict=True))
+    cost, w = LimitedCost(q, c), two_dimensional(size)
+    s, b = size.unsqueeze(-1), beta.unsqueeze(-1)
+    running = lambda mu: b * mu + mu * (s / mu) ** q / q
+    brute = lowest(lambda mu: torch.where(s <= c * mu * (1.0 + 1e-12), running(mu), INFINITE), 1e-14, BOUND)
+    on_the_limit = running(torch.where(s > 0.0, s / c, 1.0)).squeeze(-1)
+    at_zero = torch.where(size == 0.0, 0.0, torch.where(size / c <= BOUND, on_the_limit, INFINITE))
+    expected = torch.minimum(brute, at_zero)
+    found = cost.saddle_minimum(w, beta, BOUND)
+    clear = (size / c / BOUND - 1.0).abs() > 1e-6
+    assert torch.equal(torch.isinf(found)[clear], (expected >= INFINITE)[clear])
+    feasible = size <= c * BOUND * (1.0 - 1e-6)
+    torch.testing.assert_close(found[feasible], expected[feasible], rtol=1e-7, atol=1e-10)
+    mu = cost.saddle_occupation(w, beta, BOUND)
+    value = beta * mu + cost.perspective(w, mu)
+    torch.testing.assert_close(value[feasible], found[feasible], rtol=1e-9, atol=1e-12)
+    # Whatever a network says, shrunk to what M allows, has a finite minimum.
+    assert torch.isfinite(cost.saddle_minimum(cost.within(w, BOUND), beta, BOUND)).all()
+
+
+@pytest.mark.parametrize("q", [1.05, 1.5, 2.0])
+@pytest.mark.parametrize("name", ["conjugate", "perspective", "primal", "saddle", "within"])
+def test_gradients_are_those_of_finite_differences(q, name):
+    cost = LimitedCost(q, 0.4)
+    generator = torch.Generator().manual_seed(1)
+    draw = lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64)
+    # All of them shorter than c M = 1.2, beyond which the minimum of Lemma 3 is infinite.
+    w, positive, signed, f = 1.6 * draw(400, 2) - 0.8, 0.1 + draw(400), 3.0 * draw(400) - 1.0, 2.0 * BOUND * draw(400)
+    inside = 0.35 * positive.unsqueeze(-1) * w / w.norm(dim=-1, keepdim=True)
+    function, inputs = {
+        "conjugate": (cost.conjugate, (w,)),
+        "perspective": (cost.perspective, (inside, positive)),
+        "primal": (lambda w, beta: cost.primal_minimum(w, f, BOUND, beta), (w, signed)),
+        "saddle": (lambda w, beta: cost.saddle_minimum(w, beta, BOUND), (w, signed)),
+        "within": (lambda w, mu: cost.within(w, mu) @ column([0.3, -0.7]), (w, positive)),
+    }[name]
+    found = value_and_gradients(function, *inputs)
+    assert all(torch.isfinite(t).all() for t in found)
+    for exact, differenced in zip(found[1:], central_differences(function, *inputs), strict=True):
+        torch.testing.assert_close(exact, differenced, rtol=1e-5, atol=1e-6)
+
+
+def test_the_gradient_of_the_conjugate_is_the_argmax_also_far_beyond_the_limit_in_single_precision():
+    for q in (1.05, 1.5, 2.0):
+        cost = LimitedCost(q, 0.3)
+        p = (column([0.0, 1e-20, 0.1, 1.0, 1e3, 1e6]).unsqueeze(-1) * column([0.6, -0.8])).float()
+        _, slope = value_and_gradients(cost.conjugate, p)
+        torch.testing.assert_close(slope, cost.argmax(p), rtol=1e-5, atol=1e-12)
+
+
+@given(exponents, st.floats(0.05, 20.0))
+def test_a_limit_nobody_reaches_changes_nothing(q, c):
+    free, limited = PowerCost(q), LimitedCost(q, c)
+    size, f, beta = columns((0.0, 0.01, 0.5), (0.2, 2.0, 7.0), (-1.0, 0.5, 4.0))
+    w, p = two_dimensional(0.01 * c * size), two_dimensional(0.5 * c ** (q - 1.0) * size)
+    assert torch.equal(free.conjugate(p), limited.conjugate(p))
+    assert torch.equal(free.argmax(p), limited.argmax(p))
+    mu = torch.ones_like(size)
+    assert torch.equal(free.perspective(w, mu), limited.perspective(w, mu))
+    assert torch.equal(w, limited.within(w, mu))
+
+
+def test_perspective_is_infinite_beyond_the_limit_and_closed_at_zero():
+    cost = LimitedCost(1.5, 2.0)
+    w, mu = column([[0.0, 0.0], [0.0, 1e-30], [2.0, 0.0], [2.001, 0.0]]), column([0.0, 0.0, 1.0, 1.0])
+    assert cost.perspective(w, mu).tolist() == [0.0, math.inf, pytest.approx(2.0**1.5 / 1.5), math.inf]
+    assert cost.cost(w).tolist()[2:] == [pytest.approx(2.0**1.5 / 1.5), math.inf]
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0, math.inf, math.nan, "1", True])
+def test_limits_that_are_none_are_refused(limit):
+    with pytest.raises(InputError, match="control_limit"):
+        Manufactured(control_limit=limit)
+
+
+@pytest.mark.parametrize("q", [1.2, 1.5, 2.0])
+@pytest.mark.parametrize("dim", [1, 2])
+def test_taylor_models_hold_the_conjugate_below_across_and_beyond_the_limit(q, dim):
+    """Coordinates of the cells themselves stand for `p`; cells of all sizes, within which random points are tried."""
+    cost, generator = LimitedCost(q, 0.5), torch.Generator().manual_seed(0)
+    for half in (0.2, 0.02, 1e-3):
+        centre = 2.0 * torch.rand(300, dim, generator=generator, dtype=torch.float64)
+        box = Box(centre, torch.full_like(centre, half), 4)
+        model = conjugate_model(cost, box.coordinates())
+        low, high = model.bounds()
+        inner = 2.0 * torch.rand(20, 300, dim, generator=generator, dtype=torch.float64) - 1.0
+        # The corner farthest from 0 is where R* exceeds its limited version most.
+        for t in (*inner, torch.ones(300, dim, dtype=torch.float64)):
+            truth = cost.conjugate(centre + half * t)
+            assert ((low <= truth) & (truth <= high)).all()
+            # And state by state: the polynomial there is within its radius of the truth.
+            powers = torch.stack([(t ** t.new_tensor(alpha)).prod(dim=-1) for alpha in box.basis.exponents])
+            off = ((powers * model.coefficients).sum(dim=0) - truth).abs()
+            assert (off <= model.radius + 1e-12 * (1.0 + truth)).all()
+        across = ((centre.norm(dim=-1) - 0.5 ** (q - 1.0)).abs() < half).nonzero()
+        assert len(across) or half < 0.01
+        if half == 1e-3:
+            assert float((high - low).max()) < 0.02  # tight: the slope is at most c, the cell 1e-3 wide
+
+
+@zoo.on(zoo.LIMITED)
+def test_the_exact_truth_solves_its_equations_with_the_limit_reached(problem):
+    x = zoo.states(problem, 4000, seed=1)
+    torch.testing.assert_close(exact_slack(problem, x), torch.zeros(len(x), dtype=x.dtype), **ROUNDING)
+    u = problem.exact_control(x)
+    reached = (u.norm(dim=-1) >= problem.control_limit * (1.0 - 1e-9)).double().mean()
+    assert 0.001 < float(reached) < 0.98
+    assert float(u.norm(dim=-1).max()) <= problem.control_bound * (1.0 + 1e-12)
+    flux = lambda y: problem.exact_occupation(y).unsqueeze(-1) * problem.velocity(y, problem.exact_control(y))
+    outflow = jets.divergence(flux, x) / problem.discount
+    torch.testing.assert_close(problem.initial_density(x), problem.exact_occupation(x) + outflow, **ROUNDING)
+    given, by_autograd = problem.drift_divergence(x), jets.divergence(problem.drift, x)
+    torch.testing.assert_close(given, by_autograd, **ROUNDING)
+    remade = type(problem)(**problem.parameters)
+    assert torch.equal(remade.state_cost(x), problem.state_cost(x))
+
+
+@pytest.mark.nightly
+@zoo.on(zoo.LIMITED)
+def test_the_bounds_at_the_exact_truth_are_the_optimum(problem):
+    grid = lattice(problem.dim)
+    sets = [Samples.of(problem, grid), Samples.of(problem, grid + 0.37)]
+    lower = lower_side(problem, problem.exact_value, sets, problem.occupation_bound)
+    w = lambda x: problem.exact_occupation(x).unsqueeze(-1) * problem.exact_control(x)
+    J, *_ = upper_side(problem, w, problem.exact_occupation, sets, problem.value_bound)
+    for estimate in (lower.F_M, lower.shifted):
+        assert estimate.value == pytest.approx(problem.exact_optimum, rel=1e-9)
+    # Where u* has kinks the integrand of J is only continuous: the lattice is not exact for it.
+    assert J.value == pytest.approx(problem.exact_optimum, rel=5e-3)
+    loop = ClosedLoop(problem, problem.exact_control)
+    own = [Samples.of(loop, s.x) for s in sets]
+    log_mu = lambda x: problem.exact_occupation(x).log()
+    constants = closed_loop_bounds(loop, problem.exact_value, log_mu, own, ascents=4, controller="value")
+    assert constants.lagrangian.value == pytest.approx(problem.exact_optimum, rel=1e-9)
+
+
+@pytest.mark.nightly
+@settings(max_examples=8)
+@given(st.sampled_from(zoo.LIMITED), st.integers(0, 10**6), st.sampled_from([0.1, 1.0, 5.0]))
+def test_random_networks_obey_weak_duality_and_the_limit(name, seed, size):
+    """Networks that say anything: the density player's flux is cut to the limit, its divergence with it."""
+    problem, fields = zoo.build(name), random_fields(zoo.build(name), seed, size)
+    constants = resolve_constants(problem)
+    sets = replicated_samples(problem, 256, 8, seed=seed, divergences=True)
+    lower = lower_side(problem, fields.value, sets, constants.M, ascents=4)
+    for low in (lower.F_M, lower.shifted):
+        assert low.value <= problem.exact_optimum + ERRORS * low.se + 1e-9
+    form = (NETWORK, problem, fields, constants)
+    J, *_ = upper_side(problem, admissible_density(*form), occupation_density(*form), sets, constants.C_V)
+    assert math.isfinite(J.value)
+    assert J.value >= problem.exact_optimum - ERRORS * J.se - 1e-9
+    phase = Phase(constants)
+    losses = [NetworkPrimal(problem).losses(fields, s, phase)["density"].item() for s in sets]
+    assert Estimate.of(losses).value == pytest.approx(J.value, rel=1e-9)
+    x = zoo.states(problem, 200, seed=seed)
+    for kind in (NETWORK, SADDLE):
+        for policy in trained_policies(kind, problem, fields, constants).values():
+            assert float(policy(x).norm(dim=-1).max()) <= problem.control_limit * (1.0 + 1e-9)
+    assert all(torch.isfinite(loss) for loss in Saddle(problem).losses(fields, sets[0], phase).values())
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 10**6), st.sampled_from([0.1, 1.0, 5.0]), st.sampled_from([0.02, 0.1, 0.3]))
+def test_without_drift_the_closed_occupation_carries_any_flux(seed, size, limit):
+    problem = Torus(control_limit=limit, seed=1)
+    fields, constants = random_fields(problem, seed, size), resolve_constants(problem)
+    sets = replicated_samples(problem, 256, 4, seed=seed, divergences=True)
+    form = (CLOSED, problem, fields, constants)
+    J, G, *_ = upper_side(problem, admissible_density(*form), occupation_density(*form), sets, constants.C_V)
+    assert J.value == pytest.approx(G.value, rel=1e-9)
+    phase = Phase(constants)
+    mean = Estimate.of([float(ClosedPrimal(problem).losses(fields, s, phase)["density"]) for s in sets]).value
+    assert mean == pytest.approx(G.value, rel=1e-9)
+    # A tighter limit costs more, never less.
+    free = Torus(seed=1)
+    unlimited = [float(ClosedPrimal(free).losses(fields, s, phase)["density"]) for s in sets]
+    assert mean >= Estimate.of(unlimited).value - 1e-12
+
+
+def test_exact_truth_is_claimed_only_where_the_limit_is_out_of_reach():
+    near = Circle().control_bound
+    assert Circle(control_limit=1.01 * near).exact_optimum == Circle().exact_optimum
+    tight = Circle(control_limit=0.5 * near)
+    x = column([[0.3]])
+    told = (
+        tight.exact_optimum,
+        tight.value_bound,
+        tight.occupation_bound,
+        tight.exact_value(x),
+        tight.exact_control(x),
+    )
+    assert told == (None,) * 5
+    assert tight.exact_occupation(x) is None
+    assert tight.control_bound == resolve_constants(tight).C_u == 0.5 * near
+    assert resolve_constants(tight, control_bound=9.0).C_u == 0.5 * near
+
+
+def test_rigorous_bounds_stand_with_a_limit_or_are_refused():
+    network = zoo.rough_network(1, 3, size=0.05)
+    free, tight = Circle(), Circle(control_limit=0.1)
+    without, within = (rigorous_lower_bound(p, network, cells=2000) for p in (free, tight))
+    assert within.value >= without.value - 1e-9  # R_c* <= R*
+    x = torch.linspace(0.0, 1.0, 4001, dtype=torch.float64).unsqueeze(-1)
+    met = Generator.of(tight, Samples.of(tight, x)).hjb_slack(jets.jet(lambda y: within.theta * network(y), x))
+    assert float(met.max()) <= within.slack
+    assert "enclosure" in obstacle(Manufactured(dim=1, control_limit=0.5), network)
+
+
+def test_the_kernel_methods_refuse_a_limit():
+    problem = Circle(control_limit=0.1)
+    with pytest.raises(InputError, match=r"control_limit is 0\.1, but the kernel methods"):
+        DualRule(problem, resolve_constants(problem))
+
+
+@pytest.mark.parametrize("problem", [Manufactured(dim=1, control_limit=0.5, exponent=1.5), Circle(control_limit=0.1)])
+def test_the_grid_knows_the_limit(problem):
+    """Against exact truth, or against an upper and a lower bound that are easy to have."""
+    reference = solve_reference(problem, side=128)
+    assert float(reference.control.norm(dim=-1).max()) <= problem.control_limit * (1.0 + 1e-9)
+    if problem.exact_optimum is not None:
+        assert abs(reference.optimum - problem.exact_optimum) <= max(reference.error, 1e-6)
+    else:
+        free = Circle().exact_optimum
+        assert free + 1e-4 < reference.optimum < 1.0 / 12.0  # doing nothing costs the mean of f
+
+
+def test_a_given_controller_that_breaks_the_limit_is_refused_with_its_state_and_size():
+    problem = Manufactured(control_limit=0.5)
+    too_much = lambda x: 0.6 * torch.ones(len(x), 2)
+    with pytest.raises(InputError, match=r"size 0\.848528 at x = \[.*control_limit is 0\.5"):
+        BlackBox(too_much, problem)(zoo.states(problem, 3))
+    rounded = BlackBox(lambda x: torch.full((len(x), 2), 0.5 / math.sqrt(2.0) * (1.0 + 1e-6)), problem)
+    assert float(rounded(zoo.states(problem, 5)).norm(dim=-1).max()) <= 0.5 * (1.0 + 1e-12)
+    settings = CertificateSettings(points=64, replicates=2, trajectories=2, stage=StageSettings(steps=0))
+    with pytest.raises(InputError, match="control_limit"):
+        certify(problem, too_much, settings=settings, train_steps=0)
+
+
+def test_one_trained_under_another_limit_is_held_against_this_one():
+    trainer = small("problem=manufactured", "method=dual")
+    certificate = SimpleNamespace(to_dict=dict)
+    free = controller_of(trainer, certificate, "value", trainer.averaged_fields)
+    for parameter in free.fields.parameters():
+        parameter.data.mul_(3.0)
+    settings = CertificateSettings(points=64, replicates=2, trajectories=2, stage=StageSettings(steps=0))
+    with pytest.raises(InputError, match=r"control_limit is 0\.0001"):
+        certify(Manufactured(control_limit=1e-4), free, settings=settings, train_steps=0)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("overrides", [("method=primal",), ("method=pd",), ("method=pd", "method.augmentation=0")])
+def test_every_method_trains_with_a_limit_and_hands_out_a_controller_that_obeys(overrides, tmp_path):
+    quick = ("certificate.points=256", "certificate.trajectories=4", "certificate.ascents=2", "trainer.figures=false")
+    trainer = small("problem=manufactured", "problem.dim=1", "problem.control_limit=0.02", *quick, *overrides)
+    certificate = session(trainer, tmp_path)
+    u = load_controller(tmp_path / "controller.safetensors")
+    assert u.problem.control_limit == 0.02
+    assert float(u(torch.rand(500, 1)).norm(dim=-1).max()) <= 0.02 * (1.0 + 1e-5)
+    exact = certificate.exact
+    for low in certificate.lower.values():
+        assert low is None or low.interval(0.99999)[0] <= exact
+    for high in (*certificate.upper.values(), *certificate.perf.values()):
+        assert high is None or high.interval(0.99999)[1] >= exact
+
+
+@pytest.mark.nightly
+def test_a_short_run_certifies_near_the_exact_optimum(tmp_path):
+    overrides = (
+        "problem=manufactured",
+        "problem.dim=1",
+        "problem.control_limit=0.5",
+        "method=dual",
+        "trainer.steps=400",
+    )
+    overrides += ("trainer.batch=128", "model.width=48", "optimizer.lr=0.01", "trainer.evaluate_every=0")
+    effort = ("certificate.points=2048", "certificate.stage.steps=200", "certificate.trajectories=8")
+    trainer = small(*overrides, *effort)
+    certificate = session(trainer, tmp_path)
+    exact = trainer.problem.exact_optimum
+    (_, low), (_, high) = certificate.best_lower, certificate.best_upper
+    assert 0.97 * exact <= low <= exact * (1.0 + 1e-4)
+    assert exact * (1.0 - 1e-4) <= high <= 1.03 * exact
+    assert certificate.assumptions.hold, certificate.warnings

@@ -1,0 +1,78 @@
+"""A problem is checked once, before anything is trained: each slip is one sentence, and nothing legal is refused."""
+
+import pytest
+import torch
+
+from ocp_torch.errors import InputError
+from ocp_torch.problems import Simulator
+from ocp_torch.problems.checks import check_once
+from ocp_torch.problems.checks.mass import sampled_mass
+from ocp_torch.runs.build import build_problem
+from support import hostile_problems
+from support.hostile_problems import LEGAL, REFUSED, Good, with_
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_slip_is_one_sentence_that_says_where(name):
+    make, words = REFUSED[name]
+    with pytest.raises(InputError, match=words) as caught:
+        check_once(make())
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).endswith(".")
+
+
+@pytest.mark.parametrize("name", LEGAL)
+def test_what_is_legal_is_let_through(name):
+    check_once(LEGAL[name]())
+
+
+def test_the_check_leaves_random_numbers_as_they_were():
+    problem = Good()
+    before = torch.get_rng_state()
+    check_once(problem)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_what_a_constructor_raises_is_told_with_the_line():
+    with pytest.raises(
+        InputError, match=r"__init__ of .*BrokenInit raised KeyError: 'missing' \(.*hostile_problems.py, line"
+    ):
+        build_problem({"_target_": "support.hostile_problems.BrokenInit"})
+
+
+def test_a_simulator_is_held_against_the_same():
+    import numpy as np
+
+    def oracle(x):
+        return np.cos(2.0 * np.pi * x[:, 0]), None, np.ones((len(x), 2, 1))
+
+    with pytest.raises(InputError, match="state_cost .* must be at least 0"):
+        check_once(Simulator(oracle, dim=2, control_dim=1))
+
+
+@pytest.mark.parametrize(("dim", "width"), [(1, 0.004), (2, 0.004), (3, 0.03), (5, 0.03)])
+def test_the_mass_of_a_narrow_density_is_found(dim, width):
+    problem = with_(dim, initial_density=hostile_problems.gaussian(width, dim))
+    for factor in (0.3, 1.0, 3.0):
+        found = sampled_mass(lambda x, k=factor: k * problem.initial_density(x), dim, 1024)
+        assert abs(found.value - factor) <= found.half
+        assert found.half < 0.4 * factor
+        assert found.wrong == (factor != 1.0)
+
+
+MODULES = {
+    "syntax": ("def f(:\n", r"SyntaxError: .*\(.*broken_syntax.py, line 1\)"),
+    "name": ("import math\nx = maths.pi\n", r"NameError: name 'maths' is not defined.*\(.*broken_name.py, line 2\)"),
+    "exit": ("import sys\nsys.exit(0)\n", r"SystemExit: 0 \(.*broken_exit.py, line 2\)"),
+    "needs": ("import no_such_package\n", r"No module named 'no_such_package'.*\(.*broken_needs.py, line 1\)"),
+}
+
+
+@pytest.mark.parametrize("kind", MODULES)
+def test_a_module_that_cannot_be_imported_is_told_with_the_line(kind, tmp_path, monkeypatch):
+    text, words = MODULES[kind]
+    (tmp_path / f"broken_{kind}.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(InputError, match=words) as caught:
+        build_problem({"_target_": f"broken_{kind}.Mine"})
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,230 @@
+"""Problems as users write them: with every slip the check must name, and rough but legal ones it must let through."""
+
+import math
+import sys
+
+import numpy as np
+import torch
+
+from ocp_torch import Problem
+
+TURN = 2.0 * math.pi
+
+
+class Good(Problem):
+    """Legal in every respect, with a `B` and a drift of its own."""
+
+    def __init__(self, dim: int = 2, control_dim: int | None = None) -> None:
+        super().__init__(dim=dim, control_dim=control_dim)
+
+    def state_cost(self, x):
+        return 1.0 + torch.cos(TURN * x[:, 0])
+
+    def drift(self, x):
+        return 0.3 * torch.sin(TURN * x)
+
+    def control_matrix(self, x):
+        size = 1.0 + 0.2 * torch.cos(TURN * x[:, 0])
+        return size[:, None, None] * super().control_matrix(x)
+
+
+def with_(dim: int = 2, **functions) -> Problem:
+    """`Good` in ``dim`` dimensions with ``functions`` of (self, x) in place of its own."""
+    return type("Mine", (Good,), functions)(dim)
+
+
+class NoSuper(Problem):
+    def __init__(self) -> None:
+        self.weight = 1.0
+
+    def state_cost(self, x):
+        return torch.ones_like(x[:, 0])
+
+
+class TooLate(Good):
+    def __init__(self) -> None:
+        super().__init__()
+        self.exponent = 1.5
+
+
+class Bounded(Good):
+    def __init__(self) -> None:
+        super().__init__()
+        self.state_cost_bound = 1.5
+
+
+class BrokenInit(Good):
+    def __init__(self) -> None:
+        super().__init__()
+        self.table = {}["missing"]
+
+
+class Moody(Good):
+    calls = 0
+
+    def state_cost(self, x):
+        self.calls += 1
+        return super().state_cost(x) + 0.1 * self.calls
+
+
+class Remembers(Good):
+    """The drift looks at what the state cost was asked last."""
+
+    def state_cost(self, x):
+        self.last = torch.cos(TURN * x[:, 0])
+        return 1.0 + self.last
+
+    def drift(self, x):
+        return self.last[:, None] * torch.sin(TURN * x)
+
+
+class OneBuffer(Good):
+    def state_cost(self, x):
+        kept = self.__dict__.setdefault("buffers", {})
+        buffer = kept.setdefault((len(x), x.dtype), torch.empty(len(x), dtype=x.dtype))
+        return buffer.copy_(1.0 + torch.cos(TURN * x[:, 0]))
+
+
+def inplace(self, x):
+    x.mul_(TURN)
+    return 1.0 + x[:, 0].cos()
+
+
+def raises(self, x):
+    if (x[:, 0] > 0.97).any():
+        raise KeyError("no table")
+    return 1.0 + torch.cos(TURN * x[:, 0])
+
+
+def near(x, centre=0.3):
+    """Displacement from ``centre`` on the torus."""
+    return (x - centre + 0.5).remainder(1.0) - 0.5
+
+
+def bump(width, centre=0.3):
+    return lambda self, x: torch.exp(-near(x, centre).square().sum(-1) / (2.0 * width**2))
+
+
+def gaussian(width, dim, centre=0.3):
+    return lambda self, x: bump(width, centre)(self, x) / (math.sqrt(TURN) * width) ** dim
+
+
+def correlated(self, x):
+    A = 0.01 * torch.tensor([[1.0, 0.0], [0.95, 0.3]], dtype=x.dtype)
+    z = torch.linalg.solve(A, near(x).T).T
+    return torch.exp(-0.5 * z.square().sum(-1)) / (TURN * float(torch.det(A).abs()))
+
+
+def box(side, dim):
+    return lambda self, x: (near(x, 0.412).abs() < 0.5 * side).all(-1).to(x) / side**dim
+
+
+def ring(self, x):
+    r = near(x, 0.5).norm(dim=-1)
+    return torch.exp(-0.5 * ((r - 0.3) / 0.005).square()) / (math.sqrt(TURN) * 0.005) / (TURN * 0.3)
+
+
+def wobbly(self, x):
+    return 4.0 + sum(0.7**k * torch.cos(TURN * 3**k * x[:, 0]) for k in range(12))
+
+
+def steps_of(self, x):
+    return torch.where(x[:, :1].remainder(1.0) < 0.3, 0.5, 1.0).to(x)
+
+
+plain_cost = Good.state_cost
+# Name -> the problem (made when called) and what the sentence must hold.
+REFUSED = {
+    "B for one control": (lambda: with_(control_matrix=lambda self, x: x.new_ones(len(x), 2, 1)),
+                          r"control_matrix of .*Mine gave shape \(7, 2, 1\) .* \(N, d, m\) = \(7, 2, 2\)"),
+    "f a column": (lambda: with_(state_cost=lambda self, x: torch.cos(TURN * x[:, :1]) + 1.0),
+                   r"state_cost .* gave shape \(7, 1\) .* \(N,\) = \(7,\)"),
+    "a a column": (lambda: with_(drift=lambda self, x: 0.1 * torch.sin(TURN * x[:, :1])),
+                   r"drift .* gave shape \(7, 1\) .* \(N, d\) = \(7, 2\)"),
+    "f a number": (lambda: with_(state_cost=lambda self, x: torch.cos(TURN * x).square().sum()), r"gave shape \(\)"),
+    "squeezed": (lambda: with_(1, state_cost=lambda self, x: (1.0 + torch.cos(TURN * x)).squeeze()),
+                 r"gave shape \(\) for states of shape \(1, 1\)"),
+    "div B a column": (lambda: with_(control_divergence=lambda self, x: x.new_zeros(len(x), 1)),
+                       r"control_divergence .* \(N, m\) = \(7, 2\)"),
+    "V* a column": (lambda: with_(exact_value=lambda self, x: x[:, :1]), r"exact_value .* \(N,\)"),
+    "arrays": (lambda: with_(state_cost=lambda self, x: np.ones(len(x))), "gave a numpy.ndarray .* torch tensor"),
+    "arrays inside": (lambda: with_(state_cost=lambda self, x: torch.from_numpy(1.0 + np.cos(TURN * x.numpy()[:, 0]))),
+                      "state_cost .* raised RuntimeError: Can't call numpy"),
+    "a float": (lambda: with_(state_cost=lambda self, x: 1.0), "gave a float"),
+    "nothing": (lambda: with_(drift=lambda self, x: None), "drift .* gave a NoneType"),
+    "always double": (lambda: with_(state_cost=lambda self, x: 1.0 + torch.cos(TURN * x[:, 0].double())),
+                      "gave torch.float64 on cpu for states in torch.float32"),
+    "always single": (lambda: with_(control_matrix=lambda self, x: torch.eye(2).expand(len(x), 2, 2)),
+                      "gave torch.float32 on cpu for states in torch.float64"),
+    "whole numbers": (lambda: with_(initial_density=lambda self, x: torch.ones(len(x), dtype=torch.int64)), "torch.int64"),
+    "elsewhere": (lambda: with_(state_cost=lambda self, x: torch.ones(len(x), dtype=x.dtype, device="meta")), "on meta"),
+    "in place": (lambda: with_(state_cost=inplace), "state_cost .* changes its argument x in place"),
+    "no super": (NoSuper, r"NoSuper has no dim: its __init__ must call super\(\).__init__"),
+    "too late": (TooLate, "TooLate changes exponent or control_limit after super"),
+    "NaN": (lambda: with_(drift=lambda self, x: torch.where(x.remainder(1.0) > 0.9, math.nan, x * 0.0)),
+            r"drift .* gives \[.*nan.*\] at x = \[.*0\.9"),
+    "infinite at 0": (lambda: with_(state_cost=lambda self, x: 1.0 / (1.0 - torch.cos(TURN * x[:, 0]))),
+                      r"gives inf at x = \[0, 0\]"),
+    "too large for float32": (lambda: with_(state_cost=lambda self, x: (1e30 * torch.cos(TURN * x[:, 0])).square() / 1e60),
+                              "gives nan in single precision"),
+    "no period": (lambda: with_(state_cost=lambda self, x: x[:, 0].square()), "state_cost .* is not periodic: at x ="),
+    "no period of B": (lambda: with_(control_matrix=lambda self, x: (1.0 + x[:, :, None]) * torch.eye(2, dtype=x.dtype)),
+                       "control_matrix .* is not periodic"),
+    "negative": (lambda: with_(state_cost=lambda self, x: 0.9 + torch.cos(TURN * x[:, 0])), "state_cost .* at least 0"),
+    "negative in a dip": (lambda: with_(state_cost=lambda self, x: 1.0 - 1.5 * bump(0.03)(self, x)), "is -0.49"),
+    "above its bound": (Bounded, "above its state_cost_bound = 1.5"),
+    "mu0 negative": (lambda: with_(initial_density=lambda self, x: 1.0 + 1.5 * torch.cos(TURN * x[:, 0])),
+                     "initial_density .* at least 0"),
+    "mass 1.5": (lambda: with_(initial_density=lambda self, x: 1.5 * torch.ones_like(x[:, 0])), "integrates to 1.5"),
+    "mass 1/2": (
+        lambda: with_(initial_density=lambda self, x: 0.5 + 0.5 * torch.cos(TURN * x[:, 0])),
+        "integrates to 0.(49|5)",
+    ),
+    "mass 0": (lambda: with_(initial_density=lambda self, x: 0.0 * x[:, 0]), "is 0 at all of"),
+    "mass of a bump": (lambda: with_(initial_density=bump(0.1)), "integrates to 0.06"),
+    "mass of a needle": (lambda: with_(initial_density=bump(0.004)), "integrates to 0.0001|integrates to 9.*e-05"),
+    "mass 2.5": (lambda: with_(initial_density=lambda self, x: 2.5 * gaussian(0.004, 2)(self, x)), "integrates to 2"),
+    "counts calls": (Moody, "state_cost .* is no function of the state alone"),
+    "random": (lambda: with_(state_cost=lambda self, x: 1.0 + 0.1 * torch.rand(len(x), dtype=x.dtype)), "no function of"),
+    "the batch": (lambda: with_(drift=lambda self, x: torch.sin(TURN * (x - x.mean(0)))), "drift .* no function of"),
+    "the largest of a batch": (lambda: with_(state_cost=lambda self, x: plain_cost(self, x) / plain_cost(self, x).max()),
+                               "no function of the state alone"),
+    "remembers": (Remembers, "drift .* no function of the state alone"),
+    "one buffer": (OneBuffer, "state_cost .* overwrites an answer"),
+    "raises": (lambda: with_(state_cost=raises), r"state_cost .* KeyError: .no table. at x = \[0\.9.*s.py, line"),
+    "raises always": (lambda: with_(drift=lambda self, x: math.sqrt(-1.0)), r"raised ValueError: .*problems.py, line"),
+    "exits": (lambda: with_(drift=lambda self, x: sys.exit(3)), "drift .* raised SystemExit: 3"),
+    "div a": (lambda: with_(drift_divergence=lambda self, x: 0.0 * x[:, 0]), "drift_divergence .* by differences of drift"),
+    "detached": (lambda: with_(control_matrix=lambda self, x: Good.control_matrix(self, x.detach())),
+                 "control_divergence .* by differences of control_matrix"),
+    "wide units": (lambda: with_(state_cost=lambda self, x: 1e12 * plain_cost(self, x)), "units of .* are too far apart"),
+}  # fmt: skip
+LEGAL = {
+    "plain": lambda: with_(),
+    "one control": lambda: Good(3, 1),
+    "forty coordinates": lambda: Good(40),
+    "f jumps": lambda: with_(state_cost=lambda self, x: (8.0 * x.remainder(1.0)).floor().sum(-1)),
+    "f jumps at 0 and 1/2": lambda: with_(state_cost=lambda self, x: 1.0 + torch.sign(torch.sin(TURN * x[:, 0]))),
+    "f jumps at the seam": lambda: with_(state_cost=lambda self, x: x[:, 0].remainder(1.0)),
+    "a jumps": lambda: with_(drift=lambda self, x: steps_of(self, x).expand_as(x)),
+    "B jumps": lambda: with_(control_matrix=lambda self, x: steps_of(self, x)[:, :, None] * torch.eye(2, dtype=x.dtype)),
+    "rough": lambda: with_(state_cost=wobbly),
+    "kinks": lambda: with_(drift=lambda self, x: torch.sin(TURN * x).abs().sqrt()),
+    "flat": lambda: with_(state_cost=lambda self, x: torch.zeros_like(x[:, 0])),
+    "a hole": lambda: with_(state_cost=lambda self, x: 1.0 - bump(0.0025, 0.5)(self, x)),
+    "a spike": lambda: with_(state_cost=lambda self, x: 5000.0 * bump(0.0025, 0.5)(self, x)),
+    "single inside": lambda: with_(state_cost=lambda self, x: 1.0 + torch.cos(TURN * x[:, 0].float()).to(x)),
+    "no divergences": lambda: with_(drift_divergence=lambda self, x: None, control_divergence=lambda self, x: None),
+    "small units": lambda: with_(state_cost=lambda self, x: 1e-12 * plain_cost(self, x)),
+    **{f"mu0 of width {s} in {d}-d": lambda s=s, d=d: with_(d, initial_density=gaussian(s, d))
+       for s in (0.1, 0.004) for d in (1, 2, 3, 5)},
+    "mu0 across the seam": lambda: with_(initial_density=gaussian(0.004, 2, 0.0)),
+    "mu0 correlated": lambda: with_(initial_density=correlated),
+    "mu0 in one coordinate": lambda: with_(initial_density=lambda self, x: gaussian(0.003, 1)(self, x[:, :1])),
+    "mu0 half a needle": lambda: with_(initial_density=lambda self, x: 0.5 + 0.5 * gaussian(0.004, 2)(self, x)),
+    "mu0 two needles": lambda: with_(
+        initial_density=lambda self, x: 0.5 * gaussian(0.004, 2)(self, x) + 0.5 * gaussian(0.01, 2, 0.8)(self, x)),
+    "mu0 a box": lambda: with_(initial_density=box(0.01, 2)),
+    "mu0 a box in 4-d": lambda: with_(4, initial_density=box(0.2, 4)),
+    "mu0 a ring": lambda: with_(initial_density=ring),
+}  # fmt: skip
