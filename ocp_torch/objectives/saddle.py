@@ -114,7 +114,7 @@ def saddle(
     augmentation: float = 0.25,
     coupling: float = 0.0,
     residual: float = 0.3,
-    warm_start: float = 0.6,
+    warm_start: float = 0.75,
     density_batch: int | None = None,
 ) -> Objective:
     """The paper's saddle for ``augmentation = 0``, the augmented one otherwise.

@@ -32,7 +32,8 @@ from ocp_torch.problems.blame import in_their_words, origin, words
 from ocp_torch.problems.checks import check_once
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.problem import MOST_COORDINATES
-from ocp_torch.runs.process import prepare
+from ocp_torch.problems.renamed import current_target
+from ocp_torch.runs.process import use_threads
 from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.budgets import fill
@@ -52,7 +53,7 @@ def problem_class(target: object) -> type[Problem]:
     """The `Problem` subclass that ``target``, as in my_module.MyProblem, names."""
     if not isinstance(target, str) or not re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+", target):
         raise InputError(f"problem._target_ is {target!r}, but must be a class, as in my_module.MyProblem.")
-    module_name, _, class_name = target.rpartition(".")
+    module_name, _, class_name = current_target(target).rpartition(".")
     try:
         module = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:  # whatever a stranger's module may raise
@@ -92,7 +93,7 @@ def build_trainer(config: dict) -> Trainer:
     problem = build_problem(config["problem"])
     config = fill(config, problem)
     settings = call(TrainerSettings, "trainer", require_section("trainer", config["trainer"]))
-    prepare(settings.threads)
+    use_threads(settings.threads)
     method = require_section("method", config["method"])
     name = require_choice("method.name", method.pop("name", None), METHODS)
     constants = resolve_constants(problem, **{field: method.pop(field, None) for field in BOUND_FIELDS})

@@ -20,7 +20,7 @@ def _sgd(parameters: list[Tensor], lr: float, momentum: float = 0.0) -> Optimize
     return torch.optim.SGD(parameters, lr=lr, momentum=require_number("optimizer.momentum", momentum, at_least=0.0))
 
 
-def _adam(parameters: list[Tensor], lr: float, betas=(0.9, 0.999)) -> Optimizer:
+def _adam(parameters: list[Tensor], lr: float, betas=(0.9, 0.99)) -> Optimizer:
     return torch.optim.Adam(parameters, lr=lr, betas=_betas(betas))
 
 

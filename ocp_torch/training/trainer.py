@@ -175,12 +175,16 @@ class Trainer:
         self.evaluator.forget()
         self.state.load_state_dict(saved, self.rounds)
 
-    def resume(self, checkpoint: Path) -> None:
-        """Go on from ``checkpoint`` exactly where it was saved. Raises `InputError` when it is damaged or does not fit."""
+    def resume(self, checkpoint: Path, state: dict | None = None) -> None:
+        """Go on from ``checkpoint`` exactly where it was saved; ``state`` is what it holds, where that has been read already.
+
+        Raises `InputError` when it is damaged or does not fit.
+        """
         try:
-            self.load_state_dict(load_checkpoint(checkpoint))
+            state = load_checkpoint(checkpoint) if state is None else state
+            self.load_state_dict(state)
             self._try_step()
-            self.load_state_dict(load_checkpoint(checkpoint))
+            self.load_state_dict(state)
         except Exception as error:  # a crafted state raises whatever its odd part leads to
             if isinstance(error, InputError):
                 raise

@@ -32,7 +32,7 @@ from ocp_torch.problems.control_limit import LimitedCost
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.external import certify
-from ocp_torch.runs.run import controller_of
+from ocp_torch.runs.finish import controller_of
 from ocp_torch.studies.kernel.rules import DualRule
 from ocp_torch.studies.reference import solve_reference
 from support import zoo

@@ -13,9 +13,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ocp_torch.cli.compose import composed
 from ocp_torch.errors import InputError
 from ocp_torch.runs.build import build_trainer
-from ocp_torch.runs.resume import find_run, saved_configuration
-from ocp_torch.runs.start import prepare
-from ocp_torch.runs.start import train as start
+from ocp_torch.runs.configuration import saved_configuration
+from ocp_torch.runs.resume import find_run
+from ocp_torch.runs.run import train as start
+from ocp_torch.runs.training_run import training_run
 from ocp_torch.training.checkpoint import load_checkpoint, save_checkpoint
 from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.monitor import Silent
@@ -152,7 +153,7 @@ def finished(tmp_path_factory):
 def resuming(folder, *overrides: str):
     """What `prepare` makes of a resume of ``folder``, or the sentence it is refused with."""
     try:
-        return prepare(composed("train", [f"resume={folder}", *overrides])).trainer
+        return training_run(composed("train", [f"resume={folder}", *overrides])).trainer
     except InputError as error:
         return str(error)
 
@@ -191,7 +192,7 @@ def test_sizes_by_dimension_are_those_the_run_began_with(tmp_path, monkeypatch):
 
     rest = [o for o in TINY if not o.startswith(("model.width", "trainer.batch"))]
     config = composed("train", [*rest, "trainer.steps=2"])
-    run = prepare(config)
+    run = training_run(config)
     run.trainer.fit(Silent(), tmp_path / "run" / "checkpoints" / "last.pt")
     (tmp_path / "run" / ".hydra").mkdir()
     (tmp_path / "run" / ".hydra" / "config.yaml").write_text(yaml.safe_dump(config))
@@ -232,7 +233,7 @@ def test_auto_finds_the_last_run_of_this_configuration_or_starts_it(finished, tm
     again = train(*way, cwd=tmp_path)
     assert "going on from step 5" in again.stdout
     assert [p.name for p in (tmp_path / "runs").iterdir()] == ["mine"]
-    other = prepare(composed("train", [*way[:-2], "resume=auto", "trainer.batch=17"], roots=(folder,)))
+    other = training_run(composed("train", [*way[:-2], "resume=auto", "trainer.batch=17"], roots=(folder,)))
     assert other.trainer.step == 0
 
 
@@ -251,7 +252,7 @@ def test_a_start_killed_while_its_configuration_was_written_is_no_obstacle(tmp_p
     for file, size in ((first, len(text) // 2), (second, len(text))):
         file.parent.mkdir(parents=True)
         file.write_text(text[:size])
-    start(dict(config), folder)
+    start(training_run(dict(config)), folder)
     assert saved_configuration(folder) == config
     third.parent.mkdir()
     asked = yaml.safe_dump({**config, "resume": str(folder)}, sort_keys=False)

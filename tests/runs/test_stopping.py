@@ -12,7 +12,7 @@ from ocp_torch.objectives import Objective
 from ocp_torch.problems import Circle
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
-from ocp_torch.runs.run import run_session
+from ocp_torch.runs.run import run_to_end
 from ocp_torch.steppers import NonFiniteError
 from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.health import Evaluation, Health, best_constant
@@ -37,7 +37,7 @@ def run(trainer, folder, monkeypatch, gap, certified=lambda trainer: None, **res
         return certificate(trainer.run, gap(trainer), certified(trainer), **rest)
 
     monkeypatch.setattr(Trainer, "certify", certify)
-    return tried, run_session(trainer, build_certificate_settings(trainer.config), folder)
+    return tried, run_to_end(trainer, build_certificate_settings(trainer.config), folder)
 
 
 def test_a_target_gap_stops_the_run_once_a_certificate_has_it(tmp_path, monkeypatch):

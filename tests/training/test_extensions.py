@@ -10,7 +10,7 @@ from ocp_torch import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.fields import MODELS
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
-from ocp_torch.runs.run import run_session
+from ocp_torch.runs.run import run_to_end
 from ocp_torch.steppers import STEPPERS, Stepper, StepReport
 from ocp_torch.training.monitor import Silent
 from support.bits import differences
@@ -81,7 +81,7 @@ def test_an_architecture_of_ones_own_brings_its_sizes_and_leaves_all_that_a_run_
     config["model"] = {"name": "ripples", "count": None}
     trainer = build_trainer(config)
     assert trainer.config["model"] == {"name": "ripples", "count": count}
-    certificate = run_session(trainer, build_certificate_settings(trainer.config), tmp_path)
+    certificate = run_to_end(trainer, build_certificate_settings(trainer.config), tmp_path)
     assert json.loads((tmp_path / "certificate.json").read_text())["step"] == 4
     assert certificate.lower["shifted"] is not None
     loaded = load_controller(tmp_path / "controller.safetensors")
