@@ -13,6 +13,7 @@ from ocp_torch.control.controller import Controller
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.studies.reference.reference import Reference
 
+# States along a curve, along each side of a map, and arrows along each side of it.
 LINE_POINTS, MAP_POINTS, ARROWS = 400, 96, 16
 
 
