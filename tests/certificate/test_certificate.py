@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 import torch
 
-from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
+from ocp_torch.certificate import Run, Trained, certify_fields
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.policies import ValuePolicy
@@ -19,33 +19,15 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_trainer
 from ocp_torch.training.monitor import Silent
 from support import zoo
+from support.formulas import Field
+from support.honesty import BARE
 from support.small import configured
 
-CHEAP = CertificateSettings(
-    points=512,
-    replicates=2,
-    trajectories=8,
-    ascents=4,
-    occupation_states=36,
-    mollify=False,
-    stage=StageSettings(steps=0),
-)
-
-
-def fields_near_the_truth(problem) -> Fields:
-    class Near(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.weight = torch.nn.Parameter(torch.zeros(()))
-
-        def forward(self, x):
-            return problem.exact_value(x) + self.weight
-
-    return Fields({"value": Near()})
+CHEAP = replace(BARE, replicates=2, ascents=4, occupation_states=36, mollify=False, tolerance=5e-5)
 
 
 def certificate_of(problem, constants=None, settings=CHEAP):
-    trained = Trained(fields_near_the_truth(problem), None, partial(PeriodicMLP, width=8, depth=1))
+    trained = Trained(Fields({"value": Field(problem.exact_value)}), None, partial(PeriodicMLP, width=8, depth=1))
     return certify_fields(problem, trained, constants or resolve_constants(problem), settings, Run("test", "dual"))
 
 

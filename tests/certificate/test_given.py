@@ -8,25 +8,18 @@ import pytest
 import torch
 
 from ocp_torch import InputError, certify
-from ocp_torch.certificate import CertificateSettings, StageSettings, table
+from ocp_torch.certificate import StageSettings, table
 from ocp_torch.certificate.external.black_box import BlackBox
 from ocp_torch.problems import Circle, Manufactured
 from ocp_torch.runs.loading import load_policy
 from support.controllers import controllers
 from support.forked import assert_succeeded, certificate_in, script
+from support.honesty import BARE
 from support.switching import cost_of_switching
 
 TURN = 2.0 * math.pi
-CHEAP = CertificateSettings(
-    points=512,
-    replicates=8,
-    trajectories=8,
-    ascents=4,
-    occupation_states=0,
-    tolerance=1e-2,
-    stage=StageSettings(steps=100, rounds=1, batch=128),
-)
-UNFITTED = replace(CHEAP, stage=StageSettings(steps=0))
+UNFITTED = replace(BARE, tolerance=1e-2)
+CHEAP = replace(UNFITTED, stage=StageSettings(steps=100, rounds=1, batch=128))
 
 
 def cost_by_itself(u, rho: float = 2.0, starts: int = 500, h: float = 0.01, horizon: float = 7.0) -> float:

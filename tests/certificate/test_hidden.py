@@ -1,11 +1,12 @@
 """Jumps and layers of the data inside the torus: found, or seen by what they hide; what takes a divergence then falls."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 
-from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
+from ocp_torch.certificate import Run, Trained, certify_fields
 from ocp_torch.certificate.checks.hidden import Flux, hidden_divergence
 from ocp_torch.certificate.checks.regularity import largest_jump
 from ocp_torch.certificate.estimate import replicated_samples
@@ -20,6 +21,7 @@ from ocp_torch.problems.samples import Samples
 from support import zoo
 from support.adversarial import JumpingMatrix, JumpSink
 from support.formulas import Exactly
+from support.honesty import BARE
 from support.recorded import certificate_of, record
 
 
@@ -131,15 +133,7 @@ def test_chance_alone_raises_no_alarm():
     assert alarms == 0
 
 
-CHEAP = CertificateSettings(
-    points=4096,
-    replicates=8,
-    trajectories=8,
-    ascents=8,
-    occupation_states=0,
-    tolerance=5e-3,
-    stage=StageSettings(steps=0),
-)
+CHEAP = replace(BARE, points=4096)
 
 
 def certified(problem, occupation, settings=CHEAP):

@@ -12,7 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields, table
+from ocp_torch.certificate import CertificateSettings, Run, Trained, certify_fields, table
 from ocp_torch.certificate.lower.shifted import slack_function
 from ocp_torch.certificate.proof.activation_model import activate
 from ocp_torch.certificate.proof.activations import SERIES
@@ -32,6 +32,7 @@ from ocp_torch.maths.jets import jet
 from ocp_torch.problems import Circle, Lipschitz, Manufactured, Problem, Torus
 from ocp_torch.problems.constants import resolve_constants
 from support import zoo
+from support.honesty import BARE
 
 # Every problem of the zoo in at most two dimensions that encloses its data, and a few odd ones.
 TURN = 2.0 * math.pi
@@ -469,9 +470,7 @@ def test_declared_lipschitz_constants_are_enough():
 
 
 def certificate_of(problem, V, rigorous):
-    settings = CertificateSettings(
-        points=256, replicates=2, trajectories=0, ascents=4, rigorous=rigorous, stage=StageSettings(steps=0)
-    )
+    settings = replace(BARE, points=256, replicates=2, trajectories=0, rigorous=rigorous)
     trained = Trained(Fields({"value": V.requires_grad_(True)}), None, PeriodicMLP)
     return certify_fields(problem, trained, resolve_constants(problem), settings, Run("test", "dual"))
 

@@ -1,12 +1,12 @@
 """Spikes that a few sampled states carry: more states are drawn there, or the interval says that it may be off."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import pytest
 import torch
 
-from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
+from ocp_torch.certificate import Run, Trained, certify_fields
 from ocp_torch.certificate.checks.tails import rarity, sharpened, widened
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.simulated.performance import simulate_performance
@@ -19,6 +19,7 @@ from ocp_torch.problems.starts import evaluation_distribution
 from support import zoo
 from support.adversarial import Spike, gaussian
 from support.formulas import Field
+from support.honesty import BARE
 
 SPIKES = {
     "1-d": (1, 0.0025, 0.0),
@@ -119,9 +120,7 @@ def test_a_certificate_of_doing_nothing_holds_what_it_costs(name):
     problem = spike(name)
     fields = Fields({"control_density": Field(lambda x: 0.0 * x), "log_occupation": Field(lambda x: 0.0 * x[:, 0])})
     trained = Trained(fields, NETWORK, partial(PeriodicMLP, width=8, depth=1))
-    settings = CertificateSettings(
-        points=8192, replicates=8, trajectories=32, ascents=8, occupation_states=0, stage=StageSettings(steps=0)
-    )
+    settings = replace(BARE, points=8192, trajectories=32, tolerance=5e-5)
     certificate = certify_fields(problem, trained, resolve_constants(problem), settings, Run("spike", "primal"))
     assert_covers(certificate.upper["J"], problem.idle)
     low, high = certificate.perf["density"].interval(0.999)

@@ -6,7 +6,6 @@ from functools import partial
 import pytest
 import torch
 
-from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.checks.wellposed import check_problem
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.control.policies import NETWORK
@@ -14,30 +13,15 @@ from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems import Circle, Manufactured
 from ocp_torch.problems.constants import resolve_constants
-from support import zoo
-from support.formulas import Field
+from support import honesty, zoo
+from support.honesty import BARE
 
-# Bounds must be true whatever is spent: here few starts, steps that are large, and nothing fitted.
-CHEAP = CertificateSettings(
-    points=256,
-    replicates=4,
-    trajectories=8,
-    ascents=8,
-    occupation_states=0,
-    tolerance=5e-3,
-    stage=StageSettings(steps=0),
-)
-
-
+CHEAP = replace(BARE, points=256, replicates=4)
 LOOKING = replace(CHEAP, occupation_states=24)  # for the density, too
 
 
 def certified(problem, occupation=None, constants=None, seed=0, settings=CHEAP, **formulas):
-    fields = Fields({name: f if isinstance(f, torch.nn.Module) else Field(f) for name, f in formulas.items()})
-    trained = Trained(fields.float(), occupation, partial(PeriodicMLP, width=8, depth=1))
-    return certify_fields(
-        problem, trained, constants or resolve_constants(problem), settings, Run("trap", "trap", seed)
-    )
+    return honesty.certified(problem, settings, seed, constants, occupation, **formulas)
 
 
 def assert_true(certificate, optimum):

@@ -1,39 +1,18 @@
 """Generated command lines that are wrong: always one clear sentence and a status, never a traceback or a file."""
 
-import contextlib
-import io
 import os
-import sys
 
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from ocp_torch.cli.launch import CONFIGS, launch
-from ocp_torch.runs.start import prepare
-from support.scripted import leaves
+from ocp_torch.cli.launch import CONFIGS
+from support.scripted import entered, leaves
 
 pytestmark = pytest.mark.usefixtures("quick_composition")
 EXAMPLES = int(os.environ.get("OCP_TORCH_EXAMPLES", "200"))
-
-
-def entered(*arguments: str) -> tuple[int, str, str]:
-    """Exit status and output of `scripts/train.py` with ``arguments``, where the run itself would only say so."""
-    out, err = io.StringIO(), io.StringIO()
-    argv, path = sys.argv, list(sys.path)
-    sys.argv = ["train.py", *arguments]
-    try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            launch(lambda: print("trained"), "train", prepare)
-        return 0, out.getvalue(), err.getvalue()
-    except SystemExit as end:
-        return end.code, out.getvalue(), err.getvalue()
-    finally:
-        sys.argv, sys.path[:] = argv, path
-        torch.set_num_threads(1)
 
 
 GROUPS = {group.name: sorted(p.stem for p in group.glob("*.yaml")) for group in CONFIGS.iterdir() if group.is_dir()}
@@ -124,7 +103,7 @@ def test_a_bad_configuration_ends_in_one_sentence_and_leaves_nothing(arguments, 
     here = os.getcwd()
     os.chdir(cwd)
     try:
-        status, out, err = entered(*arguments, f"hydra.run.dir={cwd / 'run'}")
+        status, out, err = entered("train", *arguments, f"hydra.run.dir={cwd / 'run'}")
     finally:
         os.chdir(here)
     assert status == 2, (arguments, out, err)
@@ -151,7 +130,7 @@ def test_a_bad_configuration_ends_in_one_sentence_and_leaves_nothing(arguments, 
 )
 def test_a_slip_in_a_sweep_is_told_in_one_sentence_before_anything_starts(arguments, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    status, out, err = entered(*arguments)
+    status, out, err = entered("train", *arguments)
     assert status == 2, (out, err)
     (line,) = err.splitlines()
     assert all(word in line for word in words), line
@@ -160,6 +139,6 @@ def test_a_slip_in_a_sweep_is_told_in_one_sentence_before_anything_starts(argume
 
 def test_what_is_right_is_let_through(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert entered("seed=1", "trainer.steps=5") == (0, "trained\n", "")
-    assert entered("-m", "seed=0,1", "problem.discount=-1,2") == (0, "trained\n", "")
-    assert entered("--help")[0] == 0
+    assert entered("train", "seed=1", "trainer.steps=5") == (0, "begun\n", "")
+    assert entered("train", "-m", "seed=0,1", "problem.discount=-1,2") == (0, "begun\n", "")
+    assert entered("train", "--help")[0] == 0

@@ -16,7 +16,7 @@ from ocp_torch.runs.build import build_problem, build_trainer
 from ocp_torch.runs.compare import performance
 from ocp_torch.training.monitor import Silent
 from support import own_problems
-from support.forked import TINY, command, train
+from support.forked import TINY, command, completed, train
 
 pytestmark = pytest.mark.usefixtures("cheap_looks")
 
@@ -39,8 +39,7 @@ def finished(module):
     folder, name = module
     run = folder / "run"
     mine = (f"problem._target_={name}.Pendula", "+problem.coupling=0.2")
-    ended = train(*SMALL, *mine, "trainer.steps=4", f"hydra.run.dir={run}", cwd=folder)
-    assert ended.status == 0, ended
+    completed(*SMALL, *mine, "trainer.steps=4", f"hydra.run.dir={run}", cwd=folder)
     return run
 
 
@@ -154,8 +153,7 @@ def test_a_run_goes_on_with_the_arguments_it_has(finished, module):
     said = train(*words[2:], "+problem.coupling=0.3", cwd=module[0]).sentence
     assert "problem.coupling is 0.3" in said
     assert "0.2" in said
-    ended = train(*words[2:], cwd=module[0])
-    assert ended.status == 0, ended
+    completed(*words[2:], cwd=module[0])
     assert json.loads((finished / "certificate.json").read_text())["step"] == 6
 
 

@@ -11,7 +11,7 @@ import torch
 from ocp_torch.cli.launch import isolated
 from ocp_torch.training.checkpoint import load_checkpoint
 from support.bits import differences
-from support.forked import TINY, train
+from support.forked import TINY, completed, train
 
 # Problems that misbehave: one fails in the middle of training, the other leaves the process changed.
 MODULE = """
@@ -82,8 +82,7 @@ def test_whatever_a_job_does_the_others_run_as_if_alone_and_it_is_named(mine, tm
     assert not (folders["1"] / "certificate.json").exists()
     assert "RuntimeError: two lines" in (folders["1"] / "train.log").read_text()
     alone = tmp_path / "alone"
-    ended = train(*way[:-1], "+problem.mood=good", f"hydra.run.dir={alone}", cwd=tmp_path)
-    assert ended.status == 0, ended
+    completed(*way[:-1], "+problem.mood=good", f"hydra.run.dir={alone}", cwd=tmp_path)
     states = [load_checkpoint(f / "checkpoints" / "last.pt") for f in (folders["2"], alone)]
     assert differences(*([s[k] for k in ("fields", "average", "generators")] for s in states)) == []
     # The same sweep again: what is finished stays, what failed is tried again.
@@ -99,11 +98,10 @@ def test_whatever_a_job_does_the_others_run_as_if_alone_and_it_is_named(mine, tm
 def test_a_sweep_of_resumes_goes_on_in_each_runs_own_folder(tmp_path):
     runs = [tmp_path / "runs" / name for name in "ab"]
     for run in runs:
-        assert train(*TINY, "trainer.steps=4", f"hydra.run.dir={run}", cwd=tmp_path).status == 0
+        completed(*TINY, "trainer.steps=4", f"hydra.run.dir={run}", cwd=tmp_path)
     sweep = tmp_path / "sweep"
     several = ",".join(map(str, runs))
-    ended = train("-m", f"resume={several}", "trainer.steps=6", f"hydra.sweep.dir={sweep}", cwd=tmp_path)
-    assert ended.status == 0, ended
+    completed("-m", f"resume={several}", "trainer.steps=6", f"hydra.sweep.dir={sweep}", cwd=tmp_path)
     for run in runs:
         assert certificate_in(run)["step"] == 6
         assert (run / ".hydra" / "resume_1" / "config.yaml").exists()

@@ -1,7 +1,6 @@
 """Runs of every method, and of a simulator with its processes, killed at random moments and at each step of their end: what
 they leave is what an uninterrupted run leaves, to the bit, and no process outlives them."""
 
-import json
 import os
 import random
 import signal
@@ -10,13 +9,10 @@ import time
 
 import pytest
 from PIL import Image
-from safetensors.torch import load_file
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ocp_torch.training.checkpoint import load_checkpoint
-from support.bits import differences
-from support.forked import TINY, Command, slowly, train
+from support.forked import TINY, Command, completed, slowly, train
 from support.processes import alive, descendants, linux, wait_until
+from support.run_folders import assert_same_run
 
 # How many chains of kills for each kind of run.
 KILLS = int(os.environ.get("OCP_TORCH_KILLS", "1"))
@@ -41,41 +37,13 @@ WAYS = {
     "a simulator": (*RUN, "problem=callable", "problem.target=swings:swing", "problem.dim=1", "problem.workers=2"),
     "numbers of its own": (*RUN, "problem=arm", "trainer.evaluate_every=0", "trainer.steps=20"),
 }
-TIMED = ("train_seconds",)
-
-
-def outcome(folder) -> dict:
-    """Everything a run leaves, but for the clock."""
-    saved = load_checkpoint(folder / "checkpoints" / "last.pt")
-    events = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 0})
-    events.Reload()
-    curves = {t: [(e.step, e.value) for e in events.Scalars(t)] for t in events.Tags()["scalars"]}
-    metrics = folder / "metrics.json"
-    return {
-        "state": {k: v for k, v in saved.items() if k not in ("seconds", "elapsed")},
-        "certificate": {
-            k: v for k, v in json.loads((folder / "certificate.json").read_text()).items() if k not in TIMED
-        },
-        "weights": load_file(folder / "controller.safetensors"),
-        "metrics": json.loads(metrics.read_text()) if metrics.exists() else None,
-        "figures": sorted(p.name for p in folder.glob("figures/*")),
-        "scalars": {t: c for t, c in curves.items() if not t.startswith(("throughput/", "hparam/"))},
-        "images": {t: [e.step for e in events.Images(t)] for t in events.Tags()["images"]},
-        "unfinished": (folder / "checkpoints" / "unfinished").exists(),
-        "leftovers": [p.name for p in folder.rglob("*") if p.name.startswith(".") and p.name != ".hydra"],
-    }
 
 
 def assert_same(folder, whole) -> None:
-    one, other = outcome(folder), outcome(whole)
-    for part in ("state", "weights"):
-        assert differences(one.pop(part), other.pop(part)) == []
-    for part in one:
-        assert one[part] == other[part], part
-    assert not one["unfinished"]
-    assert one["leftovers"] == []
-    assert one["figures"]
-    for file in folder.glob("figures/*.png"):
+    assert_same_run(folder, whole)
+    figures = list(folder.glob("figures/*.png"))
+    assert figures
+    for file in figures:
         Image.open(file).verify()
     assert "is finished" in train(f"resume={folder}", *own(folder), cwd=folder.parent).stdout
 
@@ -96,8 +64,7 @@ def wholes(tmp_path_factory):
             folder = tmp_path_factory.mktemp("whole") / "run"
             (folder.parent / "swings.py").write_text(textwrap.dedent(SIMULATOR))
             start = time.monotonic()
-            ended = train(*WAYS[way], f"hydra.run.dir={folder}", cwd=folder.parent, before=slowly)
-            assert ended.status == 0, ended
+            completed(*WAYS[way], f"hydra.run.dir={folder}", cwd=folder.parent, before=slowly)
             made[way] = folder, time.monotonic() - start
         return made[way]
 
@@ -136,8 +103,7 @@ def killed_in(name: str):
     """In the child: no further than the middle of this step of the end."""
 
     def before():
-        from ocp_torch.runs import figures
-        from ocp_torch.runs import run as session
+        from ocp_torch.runs import completion, figures, finish, run
         from ocp_torch.training import monitor
 
         def die(*_, **__):
@@ -156,9 +122,9 @@ def killed_in(name: str):
         where, what, how = {
             "figures": (figures, "save", half_a_figure),
             "points": (monitor, "record", half_the_points),
-            "metrics": (session, "write_metrics", die),
-            "the last of it": (session.closing, "complete", die),
-            "the controller": (session, "controller_of", die),
+            "metrics": (run, "write_metrics", die),
+            "the last of it": (completion, "complete", die),
+            "the controller": (finish, "controller_of", die),
         }[name]
         setattr(where, what, how)
 
@@ -173,8 +139,7 @@ def test_killed_while_its_last_files_are_written_a_resume_makes_what_is_missing(
     way = WAYS["numbers of its own"]
     assert train(*way, f"hydra.run.dir={folder}", cwd=tmp_path, before=killed_in(step)).status == 137
     assert (folder / "certificate.json").exists() == (step != "the controller")
-    ended = train(f"resume={folder}", cwd=tmp_path)
-    assert ended.status == 0, ended
+    ended = completed(f"resume={folder}", cwd=tmp_path)
     assert "is finished" not in ended.stdout
     assert_same(folder, whole)
 
@@ -187,7 +152,6 @@ def test_what_was_lost_of_a_finished_run_is_made_again(lost, wholes, tmp_path):
     whole, _ = wholes("numbers of its own")
     before = (whole / lost).stat().st_size
     (whole / lost).unlink()
-    ended = train(f"resume={whole}", cwd=tmp_path)
-    assert ended.status == 0, ended
+    ended = completed(f"resume={whole}", cwd=tmp_path)
     assert f"lacks {lost}; what is missing is made" in ended.stdout
     assert (whole / lost).stat().st_size == before

@@ -1,6 +1,5 @@
 """Runs stopped by real signals at any moment: nothing is lost, the status is the conventional one, and the end the same."""
 
-import json
 import math
 import os
 import random
@@ -8,40 +7,14 @@ import signal
 import time
 
 import pytest
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ocp_torch.training.checkpoint import load_checkpoint, newest
-from support.bits import differences
-from support.forked import TINY, Command, slowly, train
+from support.forked import TINY, Command, completed, slowly, train
+from support.run_folders import assert_same_run
 
 # How many kills at random moments; the few of every run of the tests can be made many.
 KILLS = int(os.environ.get("OCP_TORCH_KILLS", "2"))
 RUN = (*TINY, "sampler=sobol", "stepper=extragradient")
-
-
-def state(folder) -> dict:
-    """What must be the same to the bit; the clock is not."""
-    saved = load_checkpoint(folder / "checkpoints" / "last.pt")
-    return {k: v for k, v in saved.items() if k not in ("seconds", "elapsed")}
-
-
-def certificate(folder) -> dict:
-    return {k: v for k, v in json.loads((folder / "certificate.json").read_text()).items() if k != "train_seconds"}
-
-
-def assert_same_run(folder, whole) -> None:
-    """State, certificate and curves of ``folder`` are those of ``whole``."""
-    assert differences(state(folder), state(whole)) == []
-    assert certificate(folder) == certificate(whole)
-    curves = []
-    for place in (folder, whole):
-        events = EventAccumulator(str(place))
-        events.Reload()
-        curves.append({t: [(e.step, e.value) for e in events.Scalars(t)] for t in events.Tags()["scalars"]})
-        curves[-1] = {t: c for t, c in curves[-1].items() if not t.startswith(("throughput/", "hparam/"))}
-    assert curves[0] == curves[1]
-    leftovers = [p.name for p in folder.rglob("*") if p.name.startswith(".") and p.name != ".hydra"]
-    assert leftovers == []
 
 
 def patiently():
@@ -71,8 +44,7 @@ def whole(tmp_path_factory):
     """The uninterrupted run, and how long it took."""
     folder = tmp_path_factory.mktemp("whole") / "run"
     start = time.monotonic()
-    ended = train(*RUN, f"hydra.run.dir={folder}", cwd=folder.parent, before=slowly)
-    assert ended.status == 0, ended
+    completed(*RUN, f"hydra.run.dir={folder}", cwd=folder.parent, before=slowly)
     return folder, time.monotonic() - start
 
 
@@ -93,8 +65,7 @@ def test_a_signal_ends_the_step_saves_and_says_how_to_go_on(number, status, whol
     assert signal.Signals(number).name in line
     assert "resume=" in line
     assert not (folder / "certificate.json").exists()
-    ended = train(f"resume='{quoted}'", cwd=tmp_path)
-    assert ended.status == 0, ended
+    completed(f"resume='{quoted}'", cwd=tmp_path)
     assert_same_run(folder, whole[0])
 
 
@@ -107,7 +78,7 @@ def test_a_signal_during_certification_finds_the_training_saved(whole, tmp_path)
     assert command.wait().status == 143
     assert not (folder / "certificate.json").exists()
     assert load_checkpoint(folder / "checkpoints" / "last.pt")["step"] == 60
-    assert train(f"resume={folder}", cwd=tmp_path).status == 0
+    completed(f"resume={folder}", cwd=tmp_path)
     assert_same_run(folder, whole[0])
 
 
@@ -137,7 +108,7 @@ def test_a_second_signal_stops_at_once_and_costs_no_more_than_the_time_since_the
     command.send(signal.SIGTERM)
     assert command.wait().status == 143
     assert load_checkpoint(folder / "checkpoints" / "last.pt")["step"] == 10
-    assert train(f"resume={folder}", cwd=tmp_path).status == 0
+    completed(f"resume={folder}", cwd=tmp_path)
     assert_same_run(folder, whole[0])
 
 

@@ -13,14 +13,15 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ocp_torch.cli.compose import composed
 from ocp_torch.errors import InputError
 from ocp_torch.runs.build import build_trainer
-from ocp_torch.runs.resume import find_run, saved_configuration
-from ocp_torch.runs.start import prepare
-from ocp_torch.runs.start import train as start
-from ocp_torch.training import trainer as trainer_module
+from ocp_torch.runs.configuration import saved_configuration
+from ocp_torch.runs.resume import find_run
+from ocp_torch.runs.run import train as start
+from ocp_torch.runs.training_run import training_run
 from ocp_torch.training.checkpoint import load_checkpoint, save_checkpoint
+from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.monitor import Silent
 from support.bits import differences
-from support.forked import TINY, train
+from support.forked import TINY, completed, finished_run, train
 from support.looks import quick
 from support.small import METHODS, SMALL, configured, small, state_of
 
@@ -67,7 +68,7 @@ def test_from_any_step_a_resumed_run_reaches_the_same_bits(way, tmp_path):
 
 
 def test_the_looks_so_far_are_part_of_the_state(monkeypatch, tmp_path):
-    monkeypatch.setattr(trainer_module.Trainer, "look", quick(lambda t: abs(t.step - 10.0) / 100.0))
+    monkeypatch.setattr(Evaluator, "evaluate", quick(lambda t: abs(t.step - 10.0) / 100.0))
     way = ("method=dual", "trainer.evaluate_every=4")
     whole = small(*way)
     whole.fit(Recorder(tmp_path, 6, 13), tmp_path / "run" / "last.pt")
@@ -102,7 +103,7 @@ def test_with_other_steps_a_run_is_one_of_the_new_length(method, schedule, tmp_p
     """Learning rates and the warm start are, at every step, those of a run that had that length from the start."""
     way = (f"method={method}", f"schedule={schedule}", *(["schedule.every=3"] if schedule == "decay" else []))
     rates = lambda seen: type("Rates", (Silent,), {"stepped": lambda _, t, r, log: seen.__setitem__(t.step, told(t))})()
-    told = lambda t: (t.stepper.learning_rates(), t.objective.needs_divergences)
+    told = lambda t: (t.stepper.learning_rates(), t.objective.needs_divergences(t.phase))
     made = maker(*way)
     made(steps=10).fit(Recorder(tmp_path, 8, 10))
     wanted = {steps: {} for steps in (24, 9, 6)}
@@ -122,12 +123,12 @@ def test_with_other_steps_a_run_is_one_of_the_new_length(method, schedule, tmp_p
 def test_the_round_follows_the_new_length(tmp_path):
     made = maker("method=dual")
     trainer = made(rounds=2, steps=4)
-    trainer.round, trainer.step = 1, 10
+    trainer.state.round, trainer.state.step = 1, 10
     save_checkpoint(tmp_path / "a.pt", trainer.state_dict())
     for steps, rounds, wanted in ((4, 2, 1), (5, 2, 1), (20, 2, 0), (3, 3, 2), (2, 1, 0)):
         other = made(rounds=rounds, steps=steps)
         other.resume(tmp_path / "a.pt")
-        assert other.round == wanted
+        assert other.state.round == wanted
 
 
 def test_an_optimisers_settings_can_change_at_a_resume_and_its_moments_stay(tmp_path):
@@ -146,16 +147,13 @@ def test_an_optimisers_settings_can_change_at_a_resume_and_its_moments_stay(tmp_
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A finished run from the command line."""
-    folder = tmp_path_factory.mktemp("finished") / "run"
-    ended = train(*TINY, f"hydra.run.dir={folder}", cwd=folder.parent)
-    assert ended.status == 0, ended
-    return folder
+    return finished_run(tmp_path_factory.mktemp("finished") / "run", *TINY)
 
 
 def resuming(folder, *overrides: str):
     """What `prepare` makes of a resume of ``folder``, or the sentence it is refused with."""
     try:
-        return prepare(composed("train", [f"resume={folder}", *overrides])).trainer
+        return training_run(composed("train", [f"resume={folder}", *overrides])).trainer
     except InputError as error:
         return str(error)
 
@@ -189,16 +187,18 @@ def test_sizes_by_dimension_are_those_the_run_began_with(tmp_path, monkeypatch):
     """Defaults may change between two versions; a run does not."""
     import dataclasses
 
+    from ocp_torch.fields import mlp
     from ocp_torch.training import budgets
 
     rest = [o for o in TINY if not o.startswith(("model.width", "trainer.batch"))]
     config = composed("train", [*rest, "trainer.steps=2"])
-    run = prepare(config)
+    run = training_run(config)
     run.trainer.fit(Silent(), tmp_path / "run" / "checkpoints" / "last.pt")
     (tmp_path / "run" / ".hydra").mkdir()
     (tmp_path / "run" / ".hydra" / "config.yaml").write_text(yaml.safe_dump(config))
-    others = tuple(dataclasses.replace(b, width=b.width + 8, batch=2 * b.batch) for b in budgets.BUDGETS)
+    others = tuple(dataclasses.replace(b, batch=2 * b.batch) for b in budgets.BUDGETS)
     monkeypatch.setattr(budgets, "BUDGETS", others)
+    monkeypatch.setattr(mlp, "SIZES", {dim: {**sizes, "width": sizes["width"] + 8} for dim, sizes in mlp.SIZES.items()})
     trainer = resuming(tmp_path / "run")
     assert trainer.config == run.trainer.config
 
@@ -206,12 +206,10 @@ def test_sizes_by_dimension_are_those_the_run_began_with(tmp_path, monkeypatch):
 def test_a_finished_run_says_so_and_more_steps_go_on_in_its_own_folder(finished, tmp_path):
     first = {p.name: p.read_bytes() for p in (finished / ".hydra").iterdir() if p.is_file()}
     before = (finished / "certificate.json").read_bytes()
-    ended = train(f"resume={finished}", cwd=tmp_path)
-    assert ended.status == 0
+    ended = completed(f"resume={finished}", cwd=tmp_path)
     assert "is finished" in ended.stdout
     assert (finished / "certificate.json").read_bytes() == before
-    ended = train(f"resume={finished}/checkpoints/last.pt", "trainer.steps=70", cwd=tmp_path)
-    assert ended.status == 0, ended
+    ended = completed(f"resume={finished}/checkpoints/last.pt", "trainer.steps=70", cwd=tmp_path)
     assert "going on from step 60" in ended.stdout
     assert json.loads((finished / "certificate.json").read_text())["step"] == 70
     assert {p.name: p.read_bytes() for p in (finished / ".hydra").iterdir() if p.is_file()} == first
@@ -227,16 +225,15 @@ def test_a_finished_run_says_so_and_more_steps_go_on_in_its_own_folder(finished,
 def test_auto_finds_the_last_run_of_this_configuration_or_starts_it(finished, tmp_path):
     folder = tmp_path / "runs" / "mine"
     way = (*TINY, "seed=7", "trainer.steps=5", f"hydra.run.dir={folder}", "resume=auto")
-    assert train(*way, cwd=tmp_path).status == 0
+    completed(*way, cwd=tmp_path)
     assert json.loads((folder / "certificate.json").read_text())["step"] == 5
-    again = train(*way, cwd=tmp_path)
-    assert again.status == 0
+    again = completed(*way, cwd=tmp_path)
     assert "is finished" in again.stdout
     os.remove(folder / "certificate.json")
     again = train(*way, cwd=tmp_path)
     assert "going on from step 5" in again.stdout
     assert [p.name for p in (tmp_path / "runs").iterdir()] == ["mine"]
-    other = prepare(composed("train", [*way[:-2], "resume=auto", "trainer.batch=17"], roots=(folder,)))
+    other = training_run(composed("train", [*way[:-2], "resume=auto", "trainer.batch=17"], roots=(folder,)))
     assert other.trainer.step == 0
 
 
@@ -255,7 +252,7 @@ def test_a_start_killed_while_its_configuration_was_written_is_no_obstacle(tmp_p
     for file, size in ((first, len(text) // 2), (second, len(text))):
         file.parent.mkdir(parents=True)
         file.write_text(text[:size])
-    start(dict(config), folder)
+    start(training_run(dict(config)), folder)
     assert saved_configuration(folder) == config
     third.parent.mkdir()
     asked = yaml.safe_dump({**config, "resume": str(folder)}, sort_keys=False)
@@ -288,14 +285,12 @@ def test_a_problem_of_your_own_is_not_imported_for_a_file_but_must_be_named_agai
     name = f"own_{time.monotonic_ns()}"
     (tmp_path / f"{name}.py").write_text(OWN.format(canary=str(canary)))
     mine = f"problem._target_={name}.Mine"
-    ended = train(*TINY, mine, "+problem.height=0.25", "trainer.steps=4", f"hydra.run.dir={folder}", cwd=tmp_path)
-    assert ended.status == 0, ended
+    completed(*TINY, mine, "+problem.height=0.25", "trainer.steps=4", f"hydra.run.dir={folder}", cwd=tmp_path)
     canary.unlink()
     refused = train(f"resume={folder}", "trainer.steps=6", cwd=tmp_path)
     assert f"{name}.Mine" in refused.sentence
     assert "problem._target_=my_module.MyProblem" in refused.sentence
     assert not canary.exists()
-    ended = train(f"resume={folder}", "trainer.steps=6", mine, cwd=tmp_path)
-    assert ended.status == 0, ended
+    completed(f"resume={folder}", "trainer.steps=6", mine, cwd=tmp_path)
     assert canary.exists()
     assert json.loads((folder / "certificate.json").read_text())["step"] == 6

@@ -7,9 +7,9 @@ import pytest
 import yaml
 
 from ocp_torch.cli import compose as composition
-from ocp_torch.runs.resume import read_configuration, saved_configuration
+from ocp_torch.runs.configuration import read_configuration, saved_configuration
 from ocp_torch.training.checkpoint import load_checkpoint
-from support.forked import TINY, train
+from support.forked import TINY, completed, finished_run, train
 
 # Everything but the defaults: what a command line of `resume` alone would compose is another run.
 OTHER = ("problem=torus", "problem.dim=2", "problem.shear=none", "seed=3", *TINY[1:])
@@ -17,10 +17,7 @@ OTHER = ("problem=torus", "problem.dim=2", "problem.shear=none", "seed=3", *TINY
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("bare") / "run"
-    ended = train(*OTHER, f"hydra.run.dir={folder}", cwd=folder.parent)
-    assert ended.status == 0, ended
-    return folder
+    return finished_run(tmp_path_factory.mktemp("bare") / "run", *OTHER)
 
 
 @pytest.fixture
@@ -49,21 +46,18 @@ def agrees(config: dict, made: dict) -> bool:
 def test_a_folder_without_configuration_goes_on_with_that_of_its_checkpoint(lost, run, tmp_path):
     shutil.rmtree(run / lost) if (run / lost).is_dir() else (run / lost).unlink()
     made = own(run)
-    ended = train(f"resume={run}", "trainer.steps=70", cwd=tmp_path)
-    assert ended.status == 0, ended
+    completed(f"resume={run}", "trainer.steps=70", cwd=tmp_path)
     assert own(run) == {**made, "trainer": {**made["trainer"], "steps": 70}}
     assert left_behind(run)
     assert all(agrees(config, made) for config in left_behind(run))
-    ended = train(f"resume={run}", cwd=tmp_path)  # and again, from what that left
-    assert ended.status == 0, ended
+    completed(f"resume={run}", cwd=tmp_path)  # and again, from what that left
     assert own(run)["trainer"]["steps"] == 70
     assert all(agrees(config, made) for config in left_behind(run))
 
 
 def test_a_finished_run_without_configuration_is_left_with_its_own(run, tmp_path):
     shutil.rmtree(run / ".hydra")
-    ended = train(f"resume={run}", cwd=tmp_path)
-    assert ended.status == 0, ended
+    ended = completed(f"resume={run}", cwd=tmp_path)
     assert "is finished" in ended.stdout
     assert all(agrees(config, own(run)) for config in left_behind(run))
     assert saved_configuration(run)["problem"]["_target_"].endswith("Torus")
@@ -82,8 +76,7 @@ def test_what_a_killed_resume_wrote_is_not_taken_for_the_runs(run, tmp_path):
     asked = {"resume": str(run), "problem": {"_target_": "ocp_torch.problems.Circle"}, "seed": 0}
     (run / ".hydra" / "config.yaml").write_text(yaml.safe_dump(asked))
     assert saved_configuration(run)["seed"] == 3
-    ended = train(f"resume={run}", "trainer.steps=65", cwd=tmp_path)
-    assert ended.status == 0, ended
+    completed(f"resume={run}", "trainer.steps=65", cwd=tmp_path)
     assert all(agrees(c, own(run)) for c in [saved_configuration(run)])
 
 
@@ -91,8 +84,7 @@ def test_a_bare_checkpoint_goes_on_in_a_folder_of_its_own_name(run, tmp_path):
     bare = tmp_path / "somewhere.pt"
     shutil.copy(run / "checkpoints" / "last.pt", bare)
     elsewhere = lambda: setattr(composition, "CHECKOUT", tmp_path)
-    ended = train(f"resume={bare}", "trainer.steps=70", cwd=tmp_path, before=elsewhere)
-    assert ended.status == 0, ended
+    completed(f"resume={bare}", "trainer.steps=70", cwd=tmp_path, before=elsewhere)
     (group,) = (tmp_path / "outputs").iterdir()
     assert group.name == "torus_dual"
     (folder,) = group.iterdir()

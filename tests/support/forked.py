@@ -16,7 +16,7 @@ from pathlib import Path
 import pytorch_optimizer  # noqa: F401 (so that no child has to import it)
 import torch
 
-import ocp_torch.runs.start  # noqa: F401 (as above)
+import ocp_torch.runs.run  # noqa: F401 (as above)
 from ocp_torch.cli.launch import CHECKOUT
 
 torch.optim.SGD([torch.zeros(1, requires_grad=True)])  # the first optimiser of a process imports much more
@@ -104,6 +104,19 @@ def command(name: str, *arguments: str, cwd: Path, before=None) -> Ended:
 
 def train(*arguments: str, cwd: Path, before=None) -> Ended:
     return command("train", *arguments, cwd=cwd, before=before)
+
+
+def completed(*arguments: str, cwd: Path, before=None) -> Ended:
+    """The same, of a run that must end well."""
+    ended = train(*arguments, cwd=cwd, before=before)
+    assert ended.status == 0, ended
+    return ended
+
+
+def finished_run(folder: Path, *arguments: str) -> Path:
+    """A finished run in ``folder``."""
+    completed(*arguments, f"hydra.run.dir={folder}", cwd=folder.parent)
+    return folder
 
 
 def script(name: str, *arguments: str, cwd: Path) -> subprocess.CompletedProcess:

@@ -23,12 +23,12 @@ PIECE = 2**13
 NEAR_STARTS = 2**10
 # Ascents from the states that stand out most, and steps of each.
 ASCENTS, STEPS = 32, 60
-# A feature that no node shows, of this part of a function's oscillation, makes the error unknown; so does as much missing mass
-# of mu0.
+# A feature that no node shows, of this part of a function's oscillation, makes the error unknown; so does as much mass of mu0
+# that the nodes miss.
 UNSEEN = 0.02
 # Oscillations below that part of the largest value are rounding.
 FLAT = 1e-9
-# Beside a kink the nodes around differ, and its tip rises above them by less than this part of what they differ by: not counted.
+# Beside a kink the nodes around differ, and its tip rises above them by less than this part of that: such tips do not count.
 KINK = 0.5
 
 
