@@ -46,7 +46,7 @@ def jet(field: Field, x: Tensor) -> Jet:
     try:
         at = x if x.requires_grad else x.detach().requires_grad_(True)
     except RuntimeError:  # inside a transform of torch.func, where only its own derivatives work; they cost more
-        value, pullback = torch.func.vjp(field, x)
+        value, pullback = torch.func.vjp(field, x)[:2]
         return Jet(value, pullback(torch.ones_like(value))[0])
     with torch.enable_grad():
         value = field(at)
@@ -64,7 +64,7 @@ def chunked_jet(field: Field, x: Tensor, chunk: int = CHUNK) -> Jet:
 
 def value_and_jacobian(field: Field, x: Tensor) -> tuple[Tensor, Tensor]:
     """`w(x)` ``(N, m)`` and its Jacobian ``(m, N, d)``."""
-    value, pullback = torch.func.vjp(field, x)
+    value, pullback = torch.func.vjp(field, x)[:2]
     basis = torch.eye(value.shape[1], dtype=value.dtype, device=value.device).unsqueeze(1).expand(-1, len(x), -1)
     (jacobian,) = torch.func.vmap(pullback)(basis)
     return value, jacobian

@@ -65,10 +65,9 @@ class Dataset(Problem):
             constant_matrix = first[0].tolist() if same else None
         if discount is None:
             raise InputError("problem.discount is missing: the file does not hold it; give problem.discount=...")
-        super().__init__(
-            dim=dim, control_dim=control_dim, discount=discount, exponent=exponent, control_limit=control_limit
-        )
+        super().__init__(dim, control_dim, discount, exponent, control_limit)  # type: ignore[arg-type] # refused there
         self._B = None if constant_matrix is None else torch.tensor(constant_matrix, dtype=torch.float64)
+        self.knows_control_matrix = self._B is not None
         if self._B is not None and self._B.shape != (self.dim, self.control_dim):
             raise InputError(f"problem.constant_matrix has shape {tuple(self._B.shape)}, but must be (d, m).")
         if self._recording is not None:
@@ -103,7 +102,7 @@ class Dataset(Problem):
         return self._recording
 
     def _split(self) -> None:
-        samples = self._recording.samples
+        samples = self.recording.samples
         zero, constant = torch.zeros_like(samples.f), self._B is not None
         if samples.div_a is None and not samples.a.any():
             samples = Samples(**{**vars(samples), "div_a": zero})
@@ -165,10 +164,6 @@ class Dataset(Problem):
     @property
     def gives_divergences(self) -> bool:
         return self.training.div_a is not None and self.training.div_B is not None
-
-    @property
-    def knows_control_matrix(self) -> bool:
-        return self._B is not None
 
     def control_matrix(self, x: Tensor) -> Tensor:
         if self._B is None:

@@ -3,6 +3,7 @@ r"""What arms of turning joints share, in the plane and in space: a tip that is 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -27,8 +28,8 @@ class Linkage(Problem):
         self,
         dim: int,
         space: int,
-        target: list[float],
-        obstacles: list[list[float]],
+        target: Sequence[float],
+        obstacles: Sequence[Sequence[float]],
         clearance: float,
         target_weight: float,
         obstacle_weight: float,
