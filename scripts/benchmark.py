@@ -11,8 +11,8 @@ from ocp_torch.studies.benchmark.contest import build, contest
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="benchmark")
 def main(config: DictConfig) -> None:
-    job(contest, config)
+    job(build, contest, config)
 
 
 if __name__ == "__main__":
-    launch(main, "benchmark", build)
+    launch(main, "benchmark", build, contest)

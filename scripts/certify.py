@@ -6,17 +6,13 @@ import hydra
 from omegaconf import DictConfig
 
 from ocp_torch.cli.launch import job, launch
-from ocp_torch.runs.external import certify_configured, read
-
-
-def certify(config: dict, folder) -> None:
-    certify_configured(config, folder)
+from ocp_torch.runs.external import arguments, certify_in
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="certify")
 def main(config: DictConfig) -> None:
-    job(certify, config)
+    job(arguments, certify_in, config)
 
 
 if __name__ == "__main__":
-    launch(main, "certify", read)
+    launch(main, "certify", arguments, certify_in)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ocp_torch.cli.launch import fail
+from ocp_torch.cli.outcome import fail
 from ocp_torch.errors import InputError, nearest, shown
 from ocp_torch.files.reading import kind
 from ocp_torch.runs.compare import compare

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import hydra
 from omegaconf import DictConfig
 
 from ocp_torch.cli.launch import job, launch
-from ocp_torch.runs.record import prepare
+from ocp_torch.runs.record import Recorder, recorder
 
 
-def record(config: dict, folder) -> None:
-    prepare(config).run()
+def record(made: Recorder, folder: Path) -> None:
+    made.run()
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="record")
 def main(config: DictConfig) -> None:
-    job(record, config)
+    job(recorder, record, config)
 
 
 if __name__ == "__main__":
-    launch(main, "record", prepare)
+    launch(main, "record", recorder, record)

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import hydra
 from omegaconf import DictConfig
 
 from ocp_torch.cli.launch import job, launch
-from ocp_torch.studies.reference.session import prepare
+from ocp_torch.studies.reference.session import ReferenceJob, reference_job
 
 
-def refer(config: dict, folder) -> None:
-    prepare(config).run()
+def refer(made: ReferenceJob, folder: Path) -> None:
+    made.run()
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="reference")
 def main(config: DictConfig) -> None:
-    job(refer, config)
+    job(reference_job, refer, config)
 
 
 if __name__ == "__main__":
-    launch(main, "reference", prepare)
+    launch(main, "reference", reference_job, refer)

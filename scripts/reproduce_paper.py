@@ -11,8 +11,8 @@ from ocp_torch.studies.paper.reproduce import check, reproduce
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="reproduce_paper")
 def main(config: DictConfig) -> None:
-    job(reproduce, config)
+    job(check, reproduce, config)
 
 
 if __name__ == "__main__":
-    launch(main, "reproduce_paper", check)
+    launch(main, "reproduce_paper", check, reproduce)

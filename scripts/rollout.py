@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import hydra
 from omegaconf import DictConfig
 
 from ocp_torch.cli.launch import job, launch
-from ocp_torch.gym.rollout import prepare
+from ocp_torch.gym.rollout import RolloutJob, rollout_job
 
 
-def rollout(config: dict, folder) -> None:
-    prepare(config).run()
+def rollout(made: RolloutJob, folder: Path) -> None:
+    made.run()
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="rollout")
 def main(config: DictConfig) -> None:
-    job(rollout, config)
+    job(rollout_job, rollout, config)
 
 
 if __name__ == "__main__":
-    launch(main, "rollout", prepare)
+    launch(main, "rollout", rollout_job, rollout)

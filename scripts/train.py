@@ -10,14 +10,15 @@ import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
 from ocp_torch.cli.launch import job, launch  # noqa: E402
-from ocp_torch.runs.start import prepare, train  # noqa: E402
+from ocp_torch.runs.run import train  # noqa: E402
+from ocp_torch.runs.training_run import training_run  # noqa: E402
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="train")
 def main(config: DictConfig) -> None:
-    job(train, config)
+    job(training_run, train, config)
 
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    launch(main, "train", prepare)
+    launch(main, "train", training_run, train)

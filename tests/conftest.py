@@ -33,11 +33,11 @@ def quick_composition():
 @pytest.fixture(scope="module")
 def cheap_looks():
     """For modules whose looks on the way need not say much."""
-    from ocp_torch.training import trainer
+    from ocp_torch.training import evaluator
 
-    little = replace(trainer.QUICK, points=64, replicates=2, trajectories=2, ascents=1, tolerance=0.01)
+    little = replace(evaluator.QUICK, points=64, replicates=2, trajectories=2, ascents=1, tolerance=0.01)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer, "QUICK", little)
+        patch.setattr(evaluator, "QUICK", little)
         yield
 
 

@@ -20,6 +20,7 @@ from ocp_torch.problems import PROBLEMS, Problem
 from ocp_torch.problems.checks import check_once
 from ocp_torch.problems.commands import ForeignProblem, made_by, naming
 from ocp_torch.problems.constants import Constants
+from ocp_torch.problems.renamed import current_name, current_section
 
 SCHEMA = 1
 FIELDS = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION)
@@ -175,9 +176,10 @@ def _rebuild(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
 
 def _section(saved: dict, config: dict) -> dict:
     """The problem of a run as its configuration names it, or as its parameters do where that is of something else."""
-    section = config.get("problem")
+    section = current_section(config.get("problem"))
     target = str(section.get("_target_")) if isinstance(section, dict) else ""
-    if target.rpartition(".")[2].lower() == str(saved["name"]).rpartition(".")[2]:
+    name = str(current_name(saved["name"], config.get("problem")))
+    if target.rpartition(".")[2].lower() == name.rpartition(".")[2]:
         return section
     return saved["parameters"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from math import inf
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +13,18 @@ from ocp_torch.fields.embedding import FourierEmbedding
 
 # Smooth activations only: the gradient of a field is part of every loss.
 ACTIVATIONS = {"gelu": nn.GELU, "silu": nn.SiLU, "tanh": nn.Tanh, "softplus": nn.Softplus}
+# Sizes up to so many coordinates. Kinks want Fourier modes, affordable in one and two dimensions; in many dimensions products
+# of tanh learn terms that couple coordinates several times faster.
+SIZES = {
+    1: dict(modes=6, waves=0, width=96, gated=False),
+    2: dict(modes=6, waves=16, width=96, gated=False),
+    4: dict(modes=3, waves=32, width=128, gated=False),
+    8: dict(modes=1, waves=64, width=128, gated=True),
+    inf: dict(modes=1, waves=128, width=128, gated=True),
+}
+# Where the worst state counts: waves at least, for an error that is small everywhere and not on average. And gelu leaves
+# fewer steep spots than tanh.
+MANY_WAVES = 64
 
 
 class Gated(nn.Module):
@@ -67,6 +80,15 @@ class PeriodicMLP(nn.Module):
         self.scalar = outputs is None
         self.register_buffer("shift", torch.tensor(float(shift)))
         self.register_buffer("scale", torch.tensor(float(scale)))
+
+    @classmethod
+    def defaults(cls, dim: int, worst_state: bool = False) -> dict:
+        """What won in measurements in dimension ``dim``, by the name of the argument; with ``worst_state`` where the bound
+        is decided by the worst state and not by an average."""
+        sizes = next(sizes for largest, sizes in SIZES.items() if dim <= largest)
+        gentle = worst_state and not sizes["gated"]
+        waves = max(sizes["waves"], MANY_WAVES) if worst_state else sizes["waves"]
+        return {**sizes, "waves": waves, "activation": "gelu" if gentle else "tanh"}
 
     def forward(self, x: Tensor) -> Tensor:
         out = self.shift + self.scale * self.head(self.body(self.embedding(x)))

@@ -141,6 +141,11 @@ class SobolevField(nn.Module):
         self._make(SobolevFeatures(dim, regularity, kernel, modes), outputs, shift, scale, scaled)
 
     @classmethod
+    def defaults(cls, dim: int, worst_state: bool = False) -> dict:
+        """None: where ``modes`` is `None` the features choose."""
+        return {}
+
+    @classmethod
     def of(cls, features: SobolevFeatures, outputs: int | None) -> SobolevField:
         """The zero field on ``features`` that are there already, in units of 1."""
         field = cls.__new__(cls)

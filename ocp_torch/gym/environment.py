@@ -7,14 +7,13 @@ from functools import cache
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from ocp_torch.errors import InputError, require_choice, require_number
 from ocp_torch.maths.seeds import Branch, derive_seed, fixed_generator
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import drawn_starts, starts_narrowly
+from ocp_torch.runs.canvas import blank_figure
 
 # Rejections at most for one start: `mu0` has mean 1, so that a bound of its supremum is met soon.
 MOST_TRIES = 10_000
@@ -146,8 +145,7 @@ def clocks(x: torch.Tensor) -> np.ndarray:
     count = min(len(x), MOST_CLOCKS)
     columns = math.ceil(math.sqrt(count))
     rows = math.ceil(count / columns)
-    figure = Figure(figsize=(1.6 * columns, 1.6 * rows), dpi=80, layout="tight")
-    canvas = FigureCanvasAgg(figure)
+    figure = blank_figure(1.6 * columns, 1.6 * rows, dpi=80, layout="tight")
     turn = np.linspace(0.0, 2.0 * np.pi, 100)
     for i, axis in enumerate(figure.subplots(rows, columns, squeeze=False).flat):
         axis.set_axis_off()
@@ -157,5 +155,5 @@ def clocks(x: torch.Tensor) -> np.ndarray:
         axis.plot(np.cos(turn), np.sin(turn), "C7", linewidth=1.0)
         axis.plot([0.0, math.cos(angle)], [0.0, math.sin(angle)], "C0", linewidth=3.0)
         axis.set(aspect="equal", title=f"$x_{{{i + 1}}}$", xlim=(-1.1, 1.1), ylim=(-1.1, 1.1))
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()

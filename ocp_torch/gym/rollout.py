@@ -171,7 +171,7 @@ def save_gif(path: Path, frames: list[np.ndarray], rate: float) -> None:
     write_atomically(path, lambda temporary: images[0].save(temporary, duration=round(1000.0 / rate), **options))
 
 
-def prepare(config: dict) -> RolloutJob:
+def rollout_job(config: dict) -> RolloutJob:
     """Check every field. Raises `InputError` for a wrong one."""
     controller = load_run(config)
     video = None if config["video"] is None else Path(str(config["video"]))

@@ -42,18 +42,26 @@ def jet(field: Field, x: Tensor) -> Jet:
     own = getattr(field, "jet", None)
     if own is not None:
         return own(x)
-    again = torch.is_grad_enabled()
-    try:
-        at = x if x.requires_grad else x.detach().requires_grad_(True)
-    except RuntimeError:  # inside a transform of torch.func, where only its own derivatives work; they cost more
+    again, at = torch.is_grad_enabled(), _differentiable(x)
+    if at is None:
         value, pullback = torch.func.vjp(field, x)[:2]
         return Jet(value, pullback(torch.ones_like(value))[0])
     with torch.enable_grad():
         value = field(at)
         if not value.requires_grad:
             return Jet(value, torch.zeros_like(x))
-        gradient = torch.autograd.grad(value, at, torch.ones_like(value), create_graph=again, materialize_grads=True)[0]
+        # The gradient of a sum, as rows do not depend on one another: to be handed one PyTorch would import SymPy.
+        gradient = torch.autograd.grad(value.sum(), at, create_graph=again, materialize_grads=True)[0]
     return Jet(value if again else value.detach(), gradient)
+
+
+def _differentiable(x: Tensor) -> Tensor | None:
+    """``x`` to differentiate by; `None` inside a transform of `torch.func`, where only its own derivatives work, at a higher
+    cost."""
+    try:
+        return x if x.requires_grad else x.detach().requires_grad_(True)
+    except RuntimeError:
+        return None
 
 
 @torch.no_grad()
@@ -64,10 +72,22 @@ def chunked_jet(field: Field, x: Tensor, chunk: int = CHUNK) -> Jet:
 
 def value_and_jacobian(field: Field, x: Tensor) -> tuple[Tensor, Tensor]:
     """`w(x)` ``(N, m)`` and its Jacobian ``(m, N, d)``."""
-    value, pullback = torch.func.vjp(field, x)[:2]
-    basis = torch.eye(value.shape[1], dtype=value.dtype, device=value.device).unsqueeze(1).expand(-1, len(x), -1)
-    (jacobian,) = torch.func.vmap(pullback)(basis)
-    return value, jacobian
+    again, at = torch.is_grad_enabled(), _differentiable(x)
+    basis = lambda w: torch.eye(w.shape[1], dtype=w.dtype, device=w.device).unsqueeze(1).expand(-1, len(x), -1)
+    if at is None:
+        value, pullback = torch.func.vjp(field, x)[:2]
+        return value, torch.func.vmap(pullback)(basis(value))[0]
+    with torch.enable_grad():
+        value = field(at)
+        if not value.requires_grad:
+            return value, x.new_zeros(value.shape[1], *x.shape)
+        options = {"create_graph": again, "retain_graph": True, "materialize_grads": True}
+        if value.shape[1] == 1:
+            jacobian = torch.autograd.grad(value.sum(), at, **options)[0].unsqueeze(0)
+        else:
+            row = lambda direction: torch.autograd.grad(value, at, direction, **options)[0]
+            jacobian = torch.func.vmap(row)(basis(value))
+    return (value, jacobian) if again else (value.detach(), jacobian)
 
 
 def control_flux_divergence(control_density: Field, x: Tensor, B: Tensor, div_B: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,11 +8,12 @@ from ocp_torch.errors import require_number
 from ocp_torch.fields.fields import VALUE, Fields
 from ocp_torch.maths import jets
 from ocp_torch.objectives.objective import Objective
-from ocp_torch.problems.constants import Constants
+from ocp_torch.objectives.phase import Phase
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# Where no `M` is known: the part of `M` that a round starts with, and the part of the round in which it grows.
+# Where no `M` is known, its weight grows geometrically from this part of `M` to all of it, over this part of each round. A
+# heavier start leaves `V` stuck far below `V*`; a longer growth leaves it less of the round to become feasible.
 LEAST_WEIGHT, GROWTH = 1.0 / 20.0, 0.7
 
 
@@ -30,23 +31,21 @@ class Dual(Objective):
 
     players = {"value": (VALUE,)}
 
-    def __init__(self, problem: Problem, constants: Constants, residual: float = 0.3) -> None:
-        super().__init__(problem, constants)
+    def __init__(self, problem: Problem, residual: float = 0.3) -> None:
+        super().__init__(problem)
         self.residual = require_number("method.residual", residual, at_least=0.0)
 
-    def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
+    def losses(self, fields: Fields, samples: Samples, phase: Phase) -> dict[str, Tensor]:
         V = jets.jet(fields.value, samples.x)
         slack = self.generator(samples).hjb_slack(V)
-        return {"value": value_loss(self, fields, samples, V.value, slack, self.residual)}
+        return {"value": value_loss(phase, fields, samples, V.value, slack, self.residual)}
 
 
-def value_loss(
-    objective: Objective, fields: Fields, samples: Samples, value: Tensor, slack: Tensor, residual: float
-) -> Tensor:
+def value_loss(phase: Phase, fields: Fields, samples: Samples, value: Tensor, slack: Tensor, residual: float) -> Tensor:
     """What a value player on its own minimises: `E[M max(Q, 0) + (residual / s) Q^2 - V mu0]`."""
-    M = objective.constants.M
-    if objective.constants.unbounded:
-        M = M * LEAST_WEIGHT ** max(0.0, 1.0 - objective.progress / GROWTH)
+    M = phase.constants.M
+    if phase.constants.unbounded:
+        M = M * LEAST_WEIGHT ** max(0.0, 1.0 - phase.progress / GROWTH)
     violation = M * slack.clamp_min(0.0)
     if residual > 0.0:
         violation = violation + residual / getattr(fields.value, "scale", 1.0) * slack.square()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from torch import Tensor
 from ocp_torch.fields.fields import Fields
 from ocp_torch.maths import jets
 from ocp_torch.maths.jets import Field
-from ocp_torch.problems.constants import Constants
+from ocp_torch.objectives.phase import Phase
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
@@ -22,20 +23,18 @@ CLOSED, SADDLE, NETWORK = "closed", "saddle", "network"
 class Objective(ABC):
     """A one-player objective is minimised; a two-player one is a game in which each player minimises its own loss.
 
-    ``players`` maps a player to the fields it moves; ``needs_divergences`` says whether `losses` reads `div a`, `div B`;
-    ``occupation`` says how the fields give `mu` (see `trained_policies`), `None` where they do not; ``notes`` is what a user
-    should be told of the form that was chosen.
+    ``players`` maps a player to the fields it moves; ``delays`` maps a player to the part of each round it waits for before
+    its first move, where that is not 0; ``occupation`` says how the fields give `mu` (see `trained_policies`), `None` where
+    they do not; ``notes`` is what a user should be told of the form that was chosen. An objective is not changed by a run:
+    what changes is in the `Phase`.
     """
 
-    players: dict[str, tuple[str, ...]]
-    needs_divergences: bool = False
+    players: Mapping[str, tuple[str, ...]]
+    delays: Mapping[str, float] = {}
     occupation: str | None = None
-    notes: tuple[str, ...] = ()
-    resting: dict[str, float] = {}  # player -> the part of the run it rests at the start
-    progress: float = 1.0  # the part of the run that is done, kept up to date by the trainer
 
-    def __init__(self, problem: Problem, constants: Constants) -> None:
-        self.rho, self.cost, self.constants = problem.discount, problem.control_cost, constants
+    def __init__(self, problem: Problem, notes: tuple[str, ...] = ()) -> None:
+        self.rho, self.cost, self.notes = problem.discount, problem.control_cost, notes
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -50,9 +49,13 @@ class Objective(ABC):
         """`w` within what a limit on the control and the network for `mu` allow."""
         return self.cost.admissible(fields.control_density, lambda x: fields.log_occupation(x).exp())
 
+    def needs_divergences(self, phase: Phase) -> bool:
+        """Whether `losses` reads `div a` and `div B` at ``phase``."""
+        return False
+
     @abstractmethod
-    def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        """One scalar loss per player, each a mean over ``samples``; a player without one rests."""
+    def losses(self, fields: Fields, samples: Samples, phase: Phase) -> dict[str, Tensor]:
+        """One scalar loss per player, each a mean over ``samples``; a player without one does not move at ``phase``."""
 
     @torch.no_grad()
     def diagnostics(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fiel
 from ocp_torch.maths import jets
 from ocp_torch.objectives.dual import value_loss
 from ocp_torch.objectives.objective import NETWORK, SADDLE, Objective
-from ocp_torch.problems.constants import Constants
+from ocp_torch.objectives.phase import Phase
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -28,18 +28,18 @@ class Saddle(Objective):
     players = {"value": (VALUE,), "density": (CONTROL_DENSITY,)}
     occupation = SADDLE
 
-    def __init__(self, problem: Problem, constants: Constants, augmentation: float = 0.0) -> None:
-        super().__init__(problem, constants)
+    def __init__(self, problem: Problem, augmentation: float = 0.0, notes: tuple[str, ...] = ()) -> None:
+        super().__init__(problem, notes)
         self.augmentation = augmentation
 
-    def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
+    def losses(self, fields: Fields, samples: Samples, phase: Phase) -> dict[str, Tensor]:
         generator, V = self.generator(samples), jets.jet(fields.value, samples.x)
-        w = self.cost.within(fields.control_density(samples.x), self.constants.M)
+        w = self.cost.within(fields.control_density(samples.x), phase.constants.M)
         pushed, beta = generator.controlled(V, w) / self.rho, generator.reduced_cost(V)
-        psi = samples.mean(V.value * samples.mu0 + pushed + self.cost.saddle_minimum(w, beta, self.constants.M))
+        psi = samples.mean(V.value * samples.mu0 + pushed + self.cost.saddle_minimum(w, beta, phase.constants.M))
         if self.augmentation == 0.0:
             return {"value": -psi, "density": psi}
-        own = value_loss(self, fields, samples, V.value, generator.hjb_slack(V), residual=0.0)
+        own = value_loss(phase, fields, samples, V.value, generator.hjb_slack(V), residual=0.0)
         return {"value": -psi + self.augmentation * own, "density": psi}
 
 
@@ -73,28 +73,26 @@ class AugmentedSaddle(Objective):
     def __init__(
         self,
         problem: Problem,
-        constants: Constants,
         augmentation: float,
         coupling: float,
         residual: float,
         warm_start: float,
         density_batch: int | None,
     ) -> None:
-        super().__init__(problem, constants)
+        super().__init__(problem)
         self.augmentation, self.coupling, self.residual = augmentation, coupling, residual
         self.density_batch = density_batch
-        self.resting = {"density": warm_start if coupling == 0.0 else 0.0}
+        self.delays = {"density": warm_start if coupling == 0.0 else 0.0}
 
-    @property
-    def needs_divergences(self) -> bool:
+    def needs_divergences(self, phase: Phase) -> bool:
         """Only once the density player moves."""
-        return self.progress >= self.resting["density"]
+        return phase.progress >= self.delays["density"]
 
-    def losses(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        k, C_V = self.augmentation, self.constants.C_V
+    def losses(self, fields: Fields, samples: Samples, phase: Phase) -> dict[str, Tensor]:
+        k, C_V = self.augmentation, phase.constants.C_V
         generator, V = self.generator(samples), jets.jet(fields.value, samples.x)
-        of_value = k * value_loss(self, fields, samples, V.value, generator.hjb_slack(V), self.residual)
-        if not self.needs_divergences:
+        of_value = k * value_loss(phase, fields, samples, V.value, generator.hjb_slack(V), self.residual)
+        if not self.needs_divergences(phase):
             return {"value": of_value}
         if self.coupling == 0.0:
             samples, rows = samples.take_weighted(self.density_batch)
@@ -113,11 +111,10 @@ class AugmentedSaddle(Objective):
 
 def saddle(
     problem: Problem,
-    constants: Constants,
     augmentation: float = 0.25,
     coupling: float = 0.0,
     residual: float = 0.3,
-    warm_start: float = 0.6,
+    warm_start: float = 0.75,
     density_batch: int | None = None,
 ) -> Objective:
     """The paper's saddle for ``augmentation = 0``, the augmented one otherwise.
@@ -132,9 +129,8 @@ def saddle(
     residual = require_number("method.residual", residual, at_least=0.0)
     warm_start = require_number("method.warm_start", warm_start, at_least=0.0, at_most=1.0)
     if weight == 0.0:
-        return Saddle(problem, constants)
+        return Saddle(problem)
     if problem.gives_divergences:
-        return AugmentedSaddle(problem, constants, weight, coupling, residual, warm_start, density_batch)
-    objective = Saddle(problem, constants, weight)
-    objective.notes = ("this problem gives no divergences of a and B: pd trains w alone, with mu in closed form.",)
-    return objective
+        return AugmentedSaddle(problem, weight, coupling, residual, warm_start, density_batch)
+    note = "this problem gives no divergences of a and B: pd trains w alone, with mu in closed form."
+    return Saddle(problem, weight, notes=(note,))

@@ -20,8 +20,8 @@ class Samples:
     """A problem's data at `N` states.
 
     `weight` is one over the density the states were drawn from, so that a weighted mean estimates an integral over the
-    torus. `attention` is what a violated inequality weighs at each state, `None` for as much as `weight`; it may look where
-    `weight` is 0. The divergences are `None` where the problem cannot give them.
+    torus. `penalty_weight` is what a violated inequality weighs at each state, `None` for as much as `weight`; it may be
+    above 0 where `weight` is 0. The divergences are `None` where the problem cannot give them.
     """
 
     x: Tensor  # (N, d) states
@@ -32,7 +32,7 @@ class Samples:
     weight: Tensor  # (N,) importance weight
     div_a: Tensor | None = None  # (N,) divergence of the drift
     div_B: Tensor | None = None  # (N, m) divergence of each column of B
-    attention: Tensor | None = None  # (N,) weight in penalties
+    penalty_weight: Tensor | None = None  # (N,)
 
     @classmethod
     @torch.no_grad()
@@ -57,8 +57,8 @@ class Samples:
         return (self.weight * integrand).mean()
 
     def penalty(self, violation: Tensor) -> Tensor:
-        """The mean of ``violation`` ``(N,)`` as `attention` weighs it."""
-        return ((self.weight if self.attention is None else self.attention) * violation).mean()
+        """The mean of ``violation`` ``(N,)``, weighed by `penalty_weight`."""
+        return ((self.weight if self.penalty_weight is None else self.penalty_weight) * violation).mean()
 
     def require_divergences(self, who: str) -> tuple[Tensor, Tensor]:
         """`div a` and `div B`, or an `InputError` that names ``who`` needs them."""
@@ -75,7 +75,7 @@ class Samples:
         rows = self.weight.nonzero().squeeze(-1)
         part = len(rows) / len(self)
         chosen = self.take(rows[:most])
-        return replace(chosen, weight=part * chosen.weight, attention=None), rows[:most]
+        return replace(chosen, weight=part * chosen.weight, penalty_weight=None), rows[:most]
 
     def to(self, like: Tensor) -> Samples:
         """The samples in the precision and on the device of ``like``."""

@@ -32,11 +32,14 @@ from ocp_torch.problems.blame import in_their_words, origin, words
 from ocp_torch.problems.checks import check_once
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.problem import MOST_COORDINATES
-from ocp_torch.runs.process import prepare
+from ocp_torch.problems.renamed import current_target
+from ocp_torch.runs.process import use_threads
 from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.budgets import fill
+from ocp_torch.training.health import Health
 from ocp_torch.training.settings import TrainerSettings
+from ocp_torch.training.state import TrainState
 from ocp_torch.training.trainer import Trainer
 
 # Numbers that a step keeps per unit of a network and state: 6 to 10 were measured, in one and in four dimensions.
@@ -50,7 +53,7 @@ def problem_class(target: object) -> type[Problem]:
     """The `Problem` subclass that ``target``, as in my_module.MyProblem, names."""
     if not isinstance(target, str) or not re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+", target):
         raise InputError(f"problem._target_ is {target!r}, but must be a class, as in my_module.MyProblem.")
-    module_name, _, class_name = target.rpartition(".")
+    module_name, _, class_name = current_target(target).rpartition(".")
     try:
         module = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:  # whatever a stranger's module may raise
@@ -90,11 +93,11 @@ def build_trainer(config: dict) -> Trainer:
     problem = build_problem(config["problem"])
     config = fill(config, problem)
     settings = call(TrainerSettings, "trainer", require_section("trainer", config["trainer"]))
-    prepare(settings.threads)
+    use_threads(settings.threads)
     method = require_section("method", config["method"])
     name = require_choice("method.name", method.pop("name", None), METHODS)
     constants = resolve_constants(problem, **{field: method.pop(field, None) for field in BOUND_FIELDS})
-    objective = call(METHODS[name], "method", method, problem=problem, constants=constants)
+    objective = call(METHODS[name], "method", method, problem=problem)
     if settings.target_gap is not None and VALUE not in objective.fields:
         raise InputError(
             f"trainer.target_gap is {settings.target_gap:g}, but {name} gives no lower bound to measure a gap by; "
@@ -118,9 +121,8 @@ def build_trainer(config: dict) -> Trainer:
         sampler = RowSampler(problem.rows, seed, problem.recording.digest)
     batches = Batches(problem, fields, objective, sampler, settings.batch, seed, visited)
     names = (problem_name(problem), name)
-    return Trainer(
-        problem, fields, objective, constants, stepper, average, batches, settings, network, seed, names, config
-    )
+    state = TrainState(names, config, fields, average, stepper, batches, Health.of(problem), constants)
+    return Trainer(problem, objective, settings, network, seed, state)
 
 
 def _bytes_per_state(problem: Problem, fields: Fields, settings: TrainerSettings) -> float:

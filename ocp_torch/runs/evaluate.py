@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields, table
 from ocp_torch.certificate.certify import in_float64
+from ocp_torch.certificate.checks.possible import require_possible
 from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.control.policies import Policy, trained_policies
 from ocp_torch.errors import InputError, require_integer, require_section
@@ -16,11 +17,42 @@ from ocp_torch.files.reading import FOLDER, kind
 from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem
 from ocp_torch.runs.metrics import write_metrics
 from ocp_torch.runs.pictures import animate, require_gif
-from ocp_torch.runs.process import prepare
+from ocp_torch.runs.process import use_threads
 from ocp_torch.training.health import sanity_warnings
 from ocp_torch.training.settings import MOST_THREADS
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Recertification:
+    """What was asked for, checked: the certificate of a saved ``controller`` again, on states of ``seed`` (`None`: of its own
+    run's), and a GIF of its motion in the file ``animation``."""
+
+    controller: Controller
+    settings: CertificateSettings
+    seed: int | None
+    animation: Path | None
+
+    def run(self) -> Certificate:
+        """Certify, print and draw."""
+        certificate = certify_saved(self.controller, self.settings, self.seed)
+        if self.animation is not None:
+            animate(self.controller.problem, policy_of(self.controller), self.animation, self.seed or 0)
+            log.info("animated in %s", self.animation)
+        return certificate
+
+
+def recertification(config: dict) -> Recertification:
+    """Check every field of ``config``. Raises `InputError` for a wrong one."""
+    controller, seed, animation = load_run(config), config["seed"], config["animation"]
+    if seed is not None:
+        require_integer("seed", seed, 0)
+    if animation is not None:
+        animation = require_gif(controller.problem, animation)
+    settings = settings_for(controller, config)
+    require_possible(controller.problem, settings, trains_value=controller.fields.value is not None)
+    return Recertification(controller, settings, seed, animation)
 
 
 def load_run(config: dict) -> Controller:
@@ -55,7 +87,7 @@ def settings_for(controller: Controller, config: dict) -> CertificateSettings:
 def certify_saved(controller: Controller, settings: CertificateSettings, seed: int | None = None) -> Certificate:
     """Print and return the certificate of ``controller``; with its own ``seed`` the numbers are those of its run."""
     threads = controller.config.get("trainer", {}).get("threads", 1)
-    prepare(require_integer("trainer.threads", threads, 1, maximum=MOST_THREADS))
+    use_threads(require_integer("trainer.threads", threads, 1, maximum=MOST_THREADS))
     run = Run.read(controller.certificate)
     if seed is not None:
         run = Run(**{**vars(run), "seed": require_integer("seed", seed, 0)})
@@ -76,9 +108,3 @@ def policy_of(controller: Controller) -> Policy:
         controller.occupation, controller.problem, in_float64(controller.fields), controller.constants
     )
     return policies[controller.kind]
-
-
-def animated(controller: Controller, file: object, seed: int | None = None) -> None:
-    """Write the motion under ``controller`` as the GIF ``file``. Raises `InputError` for anything else."""
-    animate(controller.problem, policy_of(controller), require_gif(controller.problem, file), seed or 0)
-    log.info("animated in %s", file)

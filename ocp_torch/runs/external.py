@@ -21,14 +21,15 @@ from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import SAMPLERS, scrambled_sobol
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import batched
-from ocp_torch.objectives import Dual
+from ocp_torch.objectives import Dual, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.runs import figures
 from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem
+from ocp_torch.runs.interval import interval_figure
 from ocp_torch.runs.loading import load_policy, load_saved
-from ocp_torch.runs.process import prepare
-from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
+from ocp_torch.runs.process import use_threads
+from ocp_torch.steppers import advance, short_fit
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.budgets import fill
 
@@ -36,7 +37,8 @@ log = logging.getLogger(__name__)
 
 # States at which a controller trained under another limit is held against the problem's.
 LIMIT_PROBES = 2**14
-MODEL = {"name": "mlp", "modes": None, "waves": None, "width": None, "depth": 3, "activation": None, "gated": None}
+# The model whose own sizes the networks have that are trained for a given controller.
+MODEL = {"name": "mlp"}
 
 
 def certify(
@@ -87,15 +89,12 @@ def train_value(
 ) -> Fields:
     """A `V` by the dual, with the defaults of a run."""
     fields = Fields.build(problem, (VALUE,), network, derive_seed(seed, Branch.EXTERNAL_VALUE, 0))
-    objective = Dual(problem, constants)
+    objective = Dual(problem)
     states = SAMPLERS[sampler](problem.dim, derive_seed(seed, Branch.EXTERNAL_VALUE, 1), torch.float32)
     batches = Batches(problem, fields, objective, states, batch, derive_seed(seed, Branch.EXTERNAL_VALUE, 2))
-    makers = {player: optimizer_maker("soap", lr, betas=(0.95, 0.95)) for player in objective.players}
-    stepper = Simultaneous(fields, objective, makers, schedule_maker("cosine", steps), unit=cost_unit(problem))
-    average = averaged(fields, decay=0.98)
+    stepper, average = short_fit(fields, objective, lr, steps, cost_unit(problem))
     for step in range(steps):
-        objective.progress = step / steps
-        stepper.step(batches.draw, lambda: average.update_parameters(fields))
+        advance(stepper, average, batches.draw, Phase(constants, step / steps))
     return average.module
 
 
@@ -136,8 +135,9 @@ def value_of(value: Field | Controller, problem: Problem) -> Field:
     return value
 
 
-def read(config: dict) -> dict:
+def arguments(config: dict) -> dict:
     """The arguments of `certify` that the plain ``config`` of the command line names; only it may name code to run."""
+    use_threads(1)
     problem = build_problem(config["problem"])
     filled = fill({"model": dict(MODEL), "trainer": {}, "optimizer": {}, "certificate": config["certificate"]}, problem)
     train = require_flag("train", config["train"])
@@ -158,12 +158,11 @@ def read(config: dict) -> dict:
     }
 
 
-def certify_configured(config: dict, folder: Path) -> Certificate:
-    """Certify what ``config`` names; print the table and leave `certificate.json` and its figure in ``folder``."""
-    prepare(1)
-    certificate = certify(**read(config))
+def certify_in(given: dict, folder: Path) -> Certificate:
+    """Certify what `arguments` gave; print the table and leave `certificate.json` and its figure in ``folder``."""
+    certificate = certify(**given)
     certificate.save(folder / "certificate.json")
-    figures.save({"certificate": figures.interval(certificate.to_dict())}, folder / "figures")
+    figures.save({"certificate": interval_figure(certificate.to_dict())}, folder / "figures")
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
     log.info("in %s", folder)
     return certificate

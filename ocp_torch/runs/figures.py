@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from torch import Tensor
 
-from ocp_torch.certificate.certificate import LONGEST_NAME
 from ocp_torch.certificate.certify import in_float64
 from ocp_torch.certificate.lower.shifted import slack_function
 from ocp_torch.certificate.simulated.simulation import rate_at
 from ocp_torch.control.policies import NETWORK, occupation_density, trained_policies
-from ocp_torch.errors import visible
 from ocp_torch.fields import Fields
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.maths.seeds import Branch, derive_seed
@@ -23,6 +20,10 @@ from ocp_torch.maths.supremum import batched
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.starts import initial_points
+from ocp_torch.runs.canvas import blank_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 LINE_POINTS, MAP_POINTS = 400, 80
 # Of the simulated occupation density: bins a coordinate by dimension, starts, steps of a trajectory.
@@ -82,49 +83,6 @@ def draw(problem: Problem, fields: Fields, constants: Constants, occupation: str
     return {name: plot(problem.dim, TITLES[name], *functions) for name, functions in drawn.items()}
 
 
-def interval(certificate: dict) -> Figure:
-    """The certificate (as a dict of its schema) on a line: bounds, `OPT` where known and performances, with their intervals.
-
-    What is much farther from the tightest of them than they are from one another is cut off, with an arrow and its value.
-    """
-    rows = [(f"{n} ≤ OPT", e, "C0") for n, e in certificate["lower"].items() if e]
-    rows += [(f"Perf, {n}", e, "C2") for n, e in certificate["perf"].items() if e]
-    rows += [(f"{n} ≤ Perf", e, "C4") for n, e in certificate.get("perf_lower", {}).items() if e]
-    rows += [(f"≤ {n}", e, "C3") for n, e in certificate["upper"].items() if e]
-    rows += [("doing nothing", e, "C7") for e in certificate["baseline"].values() if e]
-    figure = Figure(figsize=(7.0, 1.2 + 0.32 * max(len(rows), 1)), layout="constrained")
-    FigureCanvasAgg(figure)
-    axis = figure.subplots()
-    lows, highs = ([e["value"] for e in certificate[side].values() if e] for side in ("lower", "perf"))
-    highs = highs or [e["value"] for e in certificate["upper"].values() if e]
-    ends = ([max(lows)] if lows else []) + ([min(highs)] if highs else [])
-    ends += [certificate["exact"]] if certificate["exact"] is not None else []
-    ends += [end for name, e, _ in rows if name.startswith("Perf") for end in e["interval"]]
-    left, right = min(ends, default=0.0), max(ends, default=1.0)
-    room = max(2.0 * (right - left), 1e-3 * max(abs(left), abs(right)), 1e-12)
-    left, right = left - room, right + room
-    axis.set_xlim(left, right)
-    for y, (_, e, color) in enumerate(rows):
-        outside = min(max(e["value"], left), right)
-        if outside != e["value"]:
-            marker, side = ("<", 1) if outside == left else (">", -1)
-            axis.plot(outside, y, marker, color=color, clip_on=False)
-            offset = {"xytext": (8 * side, 0), "textcoords": "offset points"}
-            at = "left" if side > 0 else "right"
-            axis.annotate(f"{e['value']:.5g}", (outside, y), va="center", ha=at, **offset)
-            continue
-        axis.errorbar(e["value"], y, xerr=0.5 * (e["interval"][1] - e["interval"][0]), fmt="o", capsize=3, color=color)
-    if certificate["exact"] is not None:
-        axis.axvline(certificate["exact"], color="k", linestyle=":", label="OPT")
-        axis.legend(loc="upper right")
-    # A name may come from a file: its signs are not a formula.
-    axis.set_yticks(range(len(rows)), [visible(name, LONGEST_NAME) for name, *_ in rows], parse_math=False)
-    axis.invert_yaxis()
-    title = f"{visible(certificate['problem'], LONGEST_NAME)}, {100 * certificate['confidence']:.4g} % intervals"
-    axis.set_title(title, parse_math=False)
-    return figure
-
-
 def save(figures: dict[str, Figure], folder: Path) -> None:
     """Write `figures/<name>.png`."""
     for name, figure in figures.items():
@@ -134,8 +92,7 @@ def save(figures: dict[str, Figure], folder: Path) -> None:
 
 
 def _figure(columns: int):
-    figure = Figure(figsize=(5.2 * columns, 4.0), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(5.2 * columns, 4.0)
     return figure, figure.subplots(1, columns, squeeze=False)[0]
 
 

@@ -1,4 +1,4 @@
-"""What is set once per process, before any work: CPU threads, and memory that is kept instead of given back."""
+"""What is set once in a process, before any work: CPU threads, and memory that is kept instead of given back."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 LARGEST_TRIM, LARGEST_MMAP = 2**31 - 1, 2**25
 
 
-def prepare(threads: int) -> None:
+def use_threads(threads: int) -> None:
     """Use ``threads`` CPU threads, and keep freed memory for the next tensor.
 
     By default glibc returns large blocks to the system at once, and the page faults of getting them back can cost as much as

@@ -66,7 +66,7 @@ class Recorder:
         return x
 
 
-def prepare(config: dict) -> Recorder:
+def recorder(config: dict) -> Recorder:
     """Check every field. Raises `InputError` for a wrong one."""
     problem = build_problem(config["problem"])
     if not problem.has_simulator:

@@ -1,101 +1,48 @@
-"""What a resumed run is made of: its folder, its configuration as plain data, and what may change.
+"""What a resumed run is made of: its own configuration, and what the command line may change in it.
 
-Files may come from strangers: the configuration is read as data, and a problem that is not the package's own is never
-imported because a file names it.
+A problem that is not the package's own is never imported because a file names it.
 """
 
 from __future__ import annotations
 
-import contextlib
 import copy
-import os
-import re
 from collections.abc import Iterable
 from pathlib import Path
-
-import yaml
 
 from ocp_torch.certificate import table
 from ocp_torch.errors import InputError
 from ocp_torch.files.limits import require_modest_problem, require_modest_run
-from ocp_torch.files.reading import FOLDER, kind, read_json, read_yaml
-from ocp_torch.files.storage import write_atomically
+from ocp_torch.files.reading import read_json
 from ocp_torch.problems import PROBLEMS
 from ocp_torch.problems.commands import UNKNOWN, ForeignProblem, naming
-from ocp_torch.training.checkpoint import LAST, load_checkpoint, newest
+from ocp_torch.problems.renamed import PACKAGE
+from ocp_torch.runs.configuration import current, saved_configuration
+from ocp_torch.training.checkpoint import LAST
 
-CONFIG, AUTO = "config.yaml", "auto"
-OWN_TARGETS = {f"ocp_torch.problems.{c.__name__}" for c in PROBLEMS.values()}
-OWN_TARGETS |= {f"{c.__module__}.{c.__name__}" for c in PROBLEMS.values()}
+# Classes that a file may name; those of earlier versions are read by their present names.
+OWN_TARGETS = {f"{PACKAGE}.{c.__name__}" for c in PROBLEMS.values()}
 # What a checkpoint's tensors belong to; everything else may be set anew at a resume.
 FIXED = ("problem", "method", "model", "averaging", "sampler", "seed", "optimizer.name", "trainer.dtype")
 
 
-def locate(path: Path) -> tuple[Path | None, Path | None]:
-    """The run's folder and the checkpoint that ``path`` names: a folder stands for its newest good checkpoint (`None`),
-    and a checkpoint that lies in no run's folder has none."""
-    if "${" in str(path):
-        raise InputError(f"resume is {str(path)!r}, which Hydra would take for an interpolation; rename the folder.")
-    found = kind(path)
-    if found == FOLDER:
-        return path, None
-    if found is None:
-        raise InputError(f"resume is {str(path)!r}, which does not exist; give a run's folder or a checkpoint.")
-    return (path.absolute().parent.parent if path.absolute().parent.name == "checkpoints" else None), path
+def find_run(composed: dict, roots: Iterable[Path]) -> Path | None:
+    """The last run below ``roots`` of the configuration ``composed`` that has a checkpoint to go on from."""
+    found: dict[Path, float] = {}
+    for root in roots:
+        for depth in ("", "*/", "*/*/", "*/*/*/"):
+            for file in root.glob(f"{depth}checkpoints/{LAST}"):
+                folder = file.parent.parent
+                try:
+                    if same(saved_configuration(folder), composed):
+                        found[folder] = file.stat().st_mtime
+                except (InputError, OSError):
+                    continue
+    return max(found, key=found.get, default=None)
 
 
-def load_state(path: Path) -> tuple[dict, Path, list[str]]:
-    """The state that ``path`` names, the file it came from, and a sentence on each damaged newer one."""
-    folder, checkpoint = locate(path)
-    if checkpoint is not None:
-        return load_checkpoint(checkpoint), checkpoint, []
-    return newest(folder / "checkpoints")
-
-
-def latest_subfolder(folder: Path) -> Path:
-    """Where the newest start's configuration lies: `.hydra`, or `.hydra/resume_<n>` after `n` resumes."""
-    return max((folder / ".hydra").glob("resume_*"), key=_number, default=folder / ".hydra")
-
-
-def next_subfolder(folder: Path) -> str:
-    """Where the next start's configuration goes: `.hydra` is the first start's, and stays."""
-    if not (folder / ".hydra" / CONFIG).exists():
-        return ".hydra"
-    return f".hydra/resume_{_number(latest_subfolder(folder)) + 1}"
-
-
-def _number(path: Path) -> int:
-    found = re.fullmatch(r"resume_(\d{1,9})", path.name)
-    return int(found.group(1)) if found else 0
-
-
-def saved_configuration(path: Path) -> dict:
-    """The configuration of the run that ``path`` names, as plain data: that of its newest start that got going, or, for
-    a checkpoint without a run's folder, its own copy."""
-    folder, checkpoint = locate(path)
-    starts = sorted((folder / ".hydra").glob("resume_*"), key=_number, reverse=True) if folder else []
-    for start in starts:
-        # Until a start has been checked, its file is what was asked for, names a run, and may be half written.
-        with contextlib.suppress(InputError, OSError):
-            config = read_configuration(start / CONFIG)
-            if config.get("resume", "") is None and (start / CONFIG).read_bytes().endswith(b"\n"):
-                return config
-    if folder is not None and kind(folder / ".hydra" / CONFIG) is not None:
-        config = read_configuration(folder / ".hydra" / CONFIG)
-        # One that names a run to go on with is that of a resume too: the folder had no configuration before.
-        if config.get("resume") in (None, AUTO):
-            return {**config, "resume": None}
-    config = load_state(path)[0].get("config")
-    if not isinstance(config, dict):
-        raise InputError(f"{path} holds no configuration.")
-    return {**config, "resume": None}
-
-
-def read_configuration(file: Path) -> dict:
-    """A configuration file as plain nested data; runs nothing. Raises `InputError` when it is damaged or crafted."""
-    data = read_yaml(file)
-    data.pop("hydra", None)
-    return data
+def same(one: dict, other: dict) -> bool:
+    """Whether two configurations are those of the same run."""
+    return {**current(one), "resume": None} == {**current(other), "resume": None}
 
 
 def resumed_configuration(composed: dict, named: Iterable[str]) -> dict:
@@ -140,26 +87,6 @@ def _transplant(result: dict, source: dict, keys: list[str]) -> None:
         result[last] = copy.deepcopy(source[last])
     else:
         result.pop(last, None)
-
-
-def same(one: dict, other: dict) -> bool:
-    """Whether two configurations are those of the same run."""
-    return {**one, "resume": None} == {**other, "resume": None}
-
-
-def find_run(composed: dict, roots: Iterable[Path]) -> Path | None:
-    """The last run below ``roots`` of the configuration ``composed`` that has a checkpoint to go on from."""
-    found: dict[Path, float] = {}
-    for root in roots:
-        for depth in ("", "*/", "*/*/", "*/*/*/"):
-            for file in root.glob(f"{depth}checkpoints/{LAST}"):
-                folder = file.parent.parent
-                try:
-                    if same(saved_configuration(folder), composed):
-                        found[folder] = file.stat().st_mtime
-                except (InputError, OSError):
-                    continue
-    return max(found, key=found.get, default=None)
 
 
 def filled_from(config: dict, made: object) -> dict:
@@ -209,22 +136,3 @@ def result_of(folder: Path, state: dict, config: dict) -> str | None:
         return table(certificate) if done else None
     except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError):
         return None  # what cannot be read is made again
-
-
-def keep_configuration(folder: Path, config: dict) -> None:
-    """Write the configuration with which a run goes on, or begins again, beside its first start's."""
-    file = latest_subfolder(folder) / CONFIG
-    text = yaml.safe_dump({**config, "resume": None}, sort_keys=False, allow_unicode=True)
-    write_atomically(file, lambda temporary: temporary.write_text(text))
-
-
-def adopt(stub: Path, folder: Path) -> None:
-    """Move what Hydra wrote into the fresh ``stub`` to the run's own ``folder``, and remove the stub."""
-    target = folder / next_subfolder(folder)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    os.replace(stub / ".hydra", target)
-    for log in stub.glob("*.log"):
-        if log.stat().st_size == 0:
-            log.unlink()
-    if not any(stub.iterdir()):
-        stub.rmdir()

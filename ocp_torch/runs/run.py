@@ -1,45 +1,59 @@
-"""One run from start to finish: train, certify, draw, save."""
+"""One run in its folder, from wherever it is to its end: it begins or goes on, trains, and is finished."""
 
 from __future__ import annotations
 
-import contextlib
-import json
 import logging
 import shutil
 import time
-from dataclasses import replace
 from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings, table
-from ocp_torch.certificate.certify import in_float64
-from ocp_torch.control.controller import Controller
-from ocp_torch.control.policies import trained_policies
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.fields import Fields
-from ocp_torch.files.storage import sweep_temporaries, write_atomically
-from ocp_torch.problems.blame import blamed
-from ocp_torch.runs import closing, figures
-from ocp_torch.runs.metrics import practical_figures, write_metrics
-from ocp_torch.steppers import NonFiniteError
-from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM
+from ocp_torch.files.reading import require_unlinked
+from ocp_torch.files.storage import sweep_temporaries
+from ocp_torch.runs import completion
+from ocp_torch.runs.configuration import keep_configuration, latest_subfolder
+from ocp_torch.runs.finish import failure_of, hand_out, salvaged, unless_it_failed, with_warnings
+from ocp_torch.runs.metrics import write_metrics
+from ocp_torch.runs.resume import result_of
+from ocp_torch.runs.training_run import TrainingRun
 from ocp_torch.training.checkpoint import LAST
 from ocp_torch.training.generators import seed_generators
-from ocp_torch.training.health import sanity_warnings
 from ocp_torch.training.monitor import Monitor
 from ocp_torch.training.signals import Signals
-from ocp_torch.training.trainer import FAILED, NOT_FINITE, TARGET_GAP, Trainer
+from ocp_torch.training.stopping import TARGET_GAP, postpone
+from ocp_torch.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
 
 
-def run_session(trainer: Trainer, certificate_settings: CertificateSettings, folder: Path) -> Certificate:
+def train(run: TrainingRun, folder: Path) -> None:
+    """``run`` in ``folder`` to its end; one that is finished already says so, and what is missing of it is made."""
+    require_unlinked(folder)
+    for note in run.notes:
+        log.warning("warning: %s", note)
+    # What Hydra wrote is what was asked for, not what the run is.
+    if run.state is not None or latest_subfolder(folder) != folder / ".hydra":
+        keep_configuration(folder, run.config)
+    if run.state is not None:
+        result = result_of(folder, run.state, run.trainer.config)
+        lacking = completion.missing(folder, run.trainer, run.certificate_settings)
+        if result is not None and lacking is not None:
+            log.info("%s lacks %s; what is missing is made.", folder, lacking)
+        elif result is not None:
+            log.info("\n%s\n%s is finished; a larger trainer.steps would go on.", result, folder)
+            return
+    run_to_end(run.trainer, run.certificate_settings, folder)
+
+
+def run_to_end(trainer: Trainer, certificate_settings: CertificateSettings, folder: Path) -> Certificate:
     """Fill ``folder`` with a run: events, `checkpoints/`, `certificate.json`, `controller.safetensors`, figures, and
     `metrics.json` for problems with numbers of their own.
 
     A trainer that was resumed goes on where it is. SIGTERM and Ctrl-C raise `Preempted` once the state is saved. Raises
     `InputError` when a loss stops being finite or the user's problem fails (what the best look so far gives is handed out
-    first), and `StorageError`
-    when a file cannot be written.
+    first), and `StorageError` when a file cannot be written.
     """
     started = time.perf_counter()
     last = folder / "checkpoints" / LAST
@@ -52,33 +66,20 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, fol
         with Signals() as signals, Monitor(folder, trainer) as monitor:
             trainer.tell, failure = monitor.certifying, None
             try:
-                certificate, fields = _train(trainer, certificate_settings, monitor, last, signals)
+                certificate, fields = _trained(trainer, certificate_settings, monitor, last, signals)
             except (Exception, SystemExit) as error:
-                failure = _failure(trainer, error)
+                failure = failure_of(trainer, error)
                 if failure is None:
                     raise
-                certificate, fields = _salvage(trainer, certificate_settings, failure, monitor)
-            closing.begin(folder)
-            kind = _hand_out(trainer, certificate, fields, folder)
-            policy = trained_policies(
-                trainer.objective.occupation, trainer.problem, in_float64(fields), trainer.constants
-            )[kind]
-            drawn = {}
-            if trainer.settings.figures:
-                monitor.stages("figures")
-                drawn = {"certificate": figures.interval(certificate.to_dict())}
-                with _unless(failure, trainer):
-                    drawn |= figures.draw(trainer.problem, fields, trainer.constants, trainer.objective.occupation)
-                    drawn |= practical_figures(trainer.problem, policy, trainer.seed)
-                figures.save(drawn, folder / "figures")
-            monitor.finish(certificate, drawn, flatten(trainer.config), trainer.step)
+                certificate, fields = salvaged(trainer, certificate_settings, failure, monitor)
+            kind, policy = hand_out(trainer, certificate, fields, folder, monitor, failure)
     except OSError as error:
         raise StorageError(f"{folder} cannot be written to: {error.strerror or error}.") from None
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
     if certificate_settings.trajectories:
-        with _unless(failure, trainer):
+        with unless_it_failed(failure, trainer):
             write_metrics(trainer.problem, policy, trainer.seed, folder)
-    closing.complete(folder)
+    completion.complete(folder)
     log.info("controller from %s, %.0f s in all, in %s", kind, time.perf_counter() - started, folder)
     if failure is not None:
         which = "the best look before" if trainer.health.best else f"step {trainer.step}, without any look"
@@ -86,7 +87,7 @@ def run_session(trainer: Trainer, certificate_settings: CertificateSettings, fol
     return certificate
 
 
-def _train(
+def _trained(
     trainer: Trainer, settings: CertificateSettings, monitor: Monitor, last: Path, signals: Signals
 ) -> tuple[Certificate, Fields]:
     """Train to the end; the certificate, and the fields it is of. A target gap is reached when the certificate says so."""
@@ -97,98 +98,13 @@ def _train(
         signals.saved = True  # from here on a signal need not wait
         signals.take()
         monitor.stopped(trainer, f"Training stopped: {trainer.why_stopped}", settings)
-        fields, note = trainer.choose()
+        fields, note = trainer.evaluator.choose(trainer.run)
         certificate = trainer.certify(settings, fields)
         gap = certificate.gap["certified"]
         if reason != TARGET_GAP or (gap is not None and gap <= target):
             return with_warnings(trainer, certificate, [note] if note else []), fields
         log.info("step %d: the certified gap is not %g yet; training goes on.", trainer.step, target)
-        trainer.go_on()
-
-
-def _failure(trainer: Trainer, error: BaseException) -> str | None:
-    """Why the run cannot go on, where a loss or the user's problem failed; `None` for any other ``error``."""
-    if isinstance(error, NonFiniteError):
-        trainer.stopped = NOT_FINITE
-        failure = f"Training stopped at step {trainer.step}, before the update: {error}"
-        if trainer.health.best is None and BROKEN_PROBLEM not in failure:
-            raise InputError(failure) from None  # nobody knows how long it has diverged
-        return failure
-    told = blamed(error, type(trainer.problem))
-    if told is None:
-        return None
-    trainer.stopped = FAILED
-    return f"Training stopped at step {trainer.step}: {told}"
-
-
-@contextlib.contextmanager
-def _unless(failure: str | None, trainer: Trainer):
-    """What is done with a problem that failed before may fail again, and is then left out."""
-    try:
-        yield
-    except (Exception, SystemExit) as error:
-        told = blamed(error, type(trainer.problem))
-        if told is None or isinstance(error, StorageError):
-            raise
-        if failure is None:
-            raise told from None
-
-
-def _salvage(
-    trainer: Trainer, settings: CertificateSettings, failure: str, monitor: Monitor
-) -> tuple[Certificate, Fields]:
-    """What a run that cannot go on still gives: the certificate of its best look made anew, or, where the problem fails there
-    as well, as it was seen then; without any look that of the fields as they are. `InputError` when nothing."""
-    best, seen = trainer.health.best, trainer.health.certificate
-    if best is None and trainer.step == 0:
-        raise InputError(failure)
-    fields = trainer.averaged_fields if best is None else trainer.best_fields()
-    step = trainer.step if best is None else best.step
-    notes = [f"handed out are the averaged fields of step {step}. {failure}"]
-    monitor.stopped(trainer, failure, settings)
-    with _unless(failure, trainer):
-        return with_warnings(trainer, trainer.certify(settings, fields), notes), fields
-    if seen is None:
-        raise InputError(failure)
-    notes.append(
-        f"the numbers are those of the quick look at step {step}: the problem failed again when they were refined."
-    )
-    certificate = replace(seen, run=replace(trainer.run, step=step))
-    return replace(certificate, warnings=[*seen.warnings, *trainer.health.notes, *notes]), fields
-
-
-def with_warnings(trainer: Trainer, certificate: Certificate, notes: list[str]) -> Certificate:
-    """``certificate`` with what else a user should know of the run."""
-    found = sanity_warnings(trainer.problem, trainer.constants, certificate, trainer.seed)
-    fresh = [note for note in (*notes, *trainer.health.notes, *found) if note not in certificate.warnings]
-    return replace(certificate, warnings=[*certificate.warnings, *fresh])
-
-
-def _hand_out(trainer: Trainer, certificate: Certificate, fields: Fields, folder: Path) -> str:
-    """Write `controller.safetensors` and `certificate.json`; the policy that the controller follows."""
-    if certificate.controller is not None:
-        kind = certificate.controller
-    elif certificate.subject is not None:
-        kind = certificate.subject
-    else:
-        kind = "value" if fields.value is not None else "density"
-    controller_of(trainer, certificate, kind, fields).save(folder / "controller.safetensors")
-    write_atomically(folder / "certificate.json", certificate.save)
-    return kind
-
-
-def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields: Fields) -> Controller:
-    """The controller of policy ``kind`` that ``trainer`` hands out, from its averaged ``fields``."""
-    return Controller(
-        problem=trainer.problem,
-        fields=fields,
-        constants=trainer.constants,
-        occupation=trainer.objective.occupation,
-        kind=kind,
-        model=trainer.config["model"],
-        certificate=certificate.to_dict(),
-        config=trainer.config,
-    )
+        postpone(trainer.state)
 
 
 def summary(trainer: Trainer) -> str:
@@ -207,16 +123,3 @@ def summary(trainer: Trainer) -> str:
     ]
     width = shutil.get_terminal_size().columns
     return "\n".join(["", *(line if len(line) <= 2 * width else line[: 2 * width] for line in lines)])
-
-
-def flatten(config: dict, prefix: str = "") -> dict:
-    """A nested configuration as one level with dotted names."""
-    flat: dict = {}
-    for key, value in config.items():
-        name = f"{prefix}{key}"
-        flat |= flatten(value, f"{name}.") if isinstance(value, dict) else {name: json_safe(value)}
-    return flat
-
-
-def json_safe(value):
-    return value if isinstance(value, bool | int | float | str) else json.dumps(value)

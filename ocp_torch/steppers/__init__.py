@@ -1,7 +1,8 @@
-"""Steppers order the calls, optimisers do the arithmetic. `STEPPERS` maps names to classes."""
+"""Steppers say in which order players move, optimisers do the arithmetic. `STEPPERS` maps names to classes."""
 
-from ocp_torch.steppers.averaging import averaged
+from ocp_torch.steppers.averaging import Average, averaged
 from ocp_torch.steppers.extragradient import Extragradient
+from ocp_torch.steppers.loop import advance, short_fit
 from ocp_torch.steppers.nonfinite import NonFiniteError
 from ocp_torch.steppers.optimizers import optimizer_maker, schedule_maker
 from ocp_torch.steppers.simultaneous import Simultaneous
@@ -11,12 +12,15 @@ STEPPERS = {"simultaneous": Simultaneous, "extragradient": Extragradient}
 
 __all__ = [
     "STEPPERS",
+    "Average",
     "Extragradient",
     "NonFiniteError",
     "Simultaneous",
     "StepReport",
     "Stepper",
+    "advance",
     "averaged",
     "optimizer_maker",
     "schedule_maker",
+    "short_fit",
 ]

@@ -2,24 +2,37 @@
 
 from __future__ import annotations
 
-from torch import nn
+from collections.abc import Sequence
+from types import SimpleNamespace
+
+from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_multi_avg_fn
 
 from ocp_torch.errors import require_choice, require_number
 
+# A memory of about 1 / (1 - decay) = 50 steps: a longer one lags behind the last steps of the cosine schedule.
+DECAY = 0.98
 # At 1 the average would never leave the first iterate.
 MOST_DECAY = 0.999999
 
 
-def averaged(fields: nn.Module, kind: str = "ema", decay: float = 0.998) -> AveragedModel:
+class Average(AveragedModel):
+    """The average of the iterates that were counted is in ``module``."""
+
+    def count(self, iterate: Sequence[Tensor]) -> None:
+        """Take ``iterate``, all parameters in the order of those of the fields, into the average."""
+        self.update_parameters(SimpleNamespace(parameters=lambda: iterate, buffers=self.module.buffers))
+
+
+def averaged(fields: nn.Module, kind: str = "ema", decay: float = DECAY) -> Average:
     """A running average of ``fields``: ``ema`` (exponential with ``decay``), ``uniform`` as in the paper, or ``none``.
 
-    Call ``update_parameters(fields)`` at each iterate that counts; the average is in ``.module``.
+    Raises `InputError` for another ``kind``, or a ``decay`` outside of [0, 0.999999].
     """
     require_choice("averaging.kind", kind, ("ema", "uniform", "none"))
     decay = require_number("averaging.decay", decay, at_least=0.0, at_most=MOST_DECAY)
     rules = {"ema": lambda: get_ema_multi_avg_fn(decay), "uniform": get_swa_multi_avg_fn, "none": lambda: _latest}
-    average = AveragedModel(fields, multi_avg_fn=rules[kind](), use_buffers=False)
+    average = Average(fields, multi_avg_fn=rules[kind](), use_buffers=False)
     return average.requires_grad_(False)
 
 

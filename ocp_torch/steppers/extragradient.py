@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
-from ocp_torch.steppers.stepper import Draw, Stepper, StepReport, Visit
+from ocp_torch.objectives.phase import Phase
+from ocp_torch.problems.samples import Samples
+from ocp_torch.steppers.stepper import Stepper, StepReport
 
 
 class Extragradient(Stepper):
@@ -14,20 +18,20 @@ class Extragradient(Stepper):
     point is the iterate that counts.
     """
 
-    def step(self, draw: Draw, visit: Visit) -> StepReport:
-        everything = [p for parameters in self.parameters.values() for p in parameters]
-        origin = [p.detach().clone() for p in everything]
-        first = draw()
-        ahead, _ = self._differentiate(first)
+    draws = 2
+
+    def step(self, batches: Sequence[Samples], phase: Phase) -> StepReport:
+        first, second = batches
+        origin = self._parameters()
+        ahead, _ = self._differentiate(first, phase)
         self._update(ahead)
-        visit()
-        second = draw()
+        counted = self._parameters()
         try:
-            losses, norms = self._differentiate(second)
+            losses, norms = self._differentiate(second, phase)
         finally:
             # Also when the look-ahead point turns out bad: a failed step leaves the parameters where it began.
             with torch.no_grad():
-                torch._foreach_copy_(everything, origin)
+                torch._foreach_copy_(list(self.fields.parameters()), origin)
         self._update(losses)
         self._advance_schedules(losses)
-        return StepReport(losses, norms, second, len(first) + len(second))
+        return StepReport(losses, norms, batches, counted)

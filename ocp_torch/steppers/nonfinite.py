@@ -1,4 +1,4 @@
-"""What to blame when a loss or a gradient is not finite: whose, of which field, and at which state of the batch."""
+"""Where a loss or a gradient first is not finite: whose it is, of which field, and at which state of the batch."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from torch import Tensor
 
 from ocp_torch.fields.fields import Fields
 from ocp_torch.objectives.objective import Objective
+from ocp_torch.objectives.phase import Phase
 from ocp_torch.problems.samples import Samples
 
 DATA = {"f": "the state cost", "a": "the drift", "B": "the control matrix", "mu0": "the initial density"}
 DATA |= {"div_a": "the divergence of the drift", "div_B": "the divergence of the control matrix"}
-
 
 # How the sentence ends where no learning rate would help.
 BROKEN_PROBLEM = "; it must be finite on the whole torus"
@@ -21,20 +21,20 @@ class NonFiniteError(ArithmeticError):
     """A loss or gradient is not finite; raised before any parameter was touched."""
 
 
-def culprit(objective: Objective, fields: Fields, samples: Samples) -> str:
+def first_nonfinite(objective: Objective, fields: Fields, samples: Samples, phase: Phase) -> str:
     """The first thing that is not finite, in words; one state at a time, as slow as that is: the run is over anyway."""
     for name, parameter in fields.named_parameters():
         if not torch.isfinite(parameter).all():
             return (
                 f"the loss of player {_player(objective, name)!r} is not finite at any x: the weights of {name} are not"
             )
-    losses = objective.losses(fields, samples)
+    losses = objective.losses(fields, samples, phase)
     bad = [player for player, loss in losses.items() if not torch.isfinite(loss)]
     for one in samples.split(1):
         where = f"at x = {[round(c, 6) for c in one.x[0].tolist()]}"
         cause = _bad_data(one)
         try:
-            alone = objective.losses(fields, one)
+            alone = objective.losses(fields, one, phase)
         except RuntimeError:  # the loss is not a mean over states
             return f"the loss of player {bad[0]!r} is not finite" if bad else "a gradient is not finite"
         for player in bad:

@@ -12,7 +12,7 @@ from torch.optim.lr_scheduler import CosineAnnealingWarmRestarts, LambdaLR, LRSc
 
 from ocp_torch.errors import InputError, require_call, require_choice, require_integer, require_number
 
-# No update with a larger one is of use; far beyond it does not even fit into single precision.
+# A larger learning rate moves weights, which are about 1, so far at once that nothing is learnt; it is a slip.
 LARGEST_RATE = 1e6
 
 
@@ -20,7 +20,7 @@ def _sgd(parameters: list[Tensor], lr: float, momentum: float = 0.0) -> Optimize
     return torch.optim.SGD(parameters, lr=lr, momentum=require_number("optimizer.momentum", momentum, at_least=0.0))
 
 
-def _adam(parameters: list[Tensor], lr: float, betas=(0.9, 0.999)) -> Optimizer:
+def _adam(parameters: list[Tensor], lr: float, betas=(0.9, 0.99)) -> Optimizer:
     return torch.optim.Adam(parameters, lr=lr, betas=_betas(betas))
 
 
@@ -56,7 +56,7 @@ def schedule_maker(
     every: int = 20000,
     exponent: float = 0.5,
 ) -> Callable[..., LRScheduler]:
-    """A maker of the learning-rate schedule of an optimiser whose player rests for the part ``resting`` of ``steps``.
+    """A maker of the learning-rate schedule of an optimiser whose player waits for the part ``delay`` of ``steps``.
 
     ``constant``; ``cosine`` to zero over the player's own moves, and again over twice as many in each further round;
     ``decay``, a factor ``decay`` every ``every`` moves (the paper decreases by 25 % every 20,000); ``power``, a factor
@@ -68,8 +68,8 @@ def schedule_maker(
     period = require_integer("schedule.every", every, 1)
     exponent = require_number("schedule.exponent", exponent, at_least=0.0, at_most=1.0)
 
-    def make(optimizer: Optimizer, resting: float = 0.0) -> LRScheduler:
-        moves = max(1, steps - math.ceil(resting * steps))
+    def make(optimizer: Optimizer, delay: float = 0.0) -> LRScheduler:
+        moves = max(1, steps - math.ceil(delay * steps))
         if name == "cosine":
             return CosineAnnealingWarmRestarts(optimizer, T_0=moves, T_mult=2)
         if name == "decay":

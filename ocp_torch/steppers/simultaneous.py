@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from ocp_torch.steppers.stepper import Draw, Stepper, StepReport, Visit
+from collections.abc import Sequence
+
+from ocp_torch.objectives.phase import Phase
+from ocp_torch.problems.samples import Samples
+from ocp_torch.steppers.stepper import Stepper, StepReport
 
 
 class Simultaneous(Stepper):
     """The iterate before the update is the one that counts, as in the paper's average `(1/n) sum_{k<n} theta_k`."""
 
-    def step(self, draw: Draw, visit: Visit) -> StepReport:
-        samples = draw()
-        losses, norms = self._differentiate(samples)
-        visit()
+    def step(self, batches: Sequence[Samples], phase: Phase) -> StepReport:
+        (samples,) = batches
+        losses, norms = self._differentiate(samples, phase)
+        counted = self._parameters()
         self._update(losses)
         self._advance_schedules(losses)
-        return StepReport(losses, norms, samples, len(samples))
+        return StepReport(losses, norms, batches, counted)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,32 +16,40 @@ from torch.optim.lr_scheduler import LRScheduler
 from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
 from ocp_torch.objectives.objective import Objective
+from ocp_torch.objectives.phase import Phase
 from ocp_torch.problems.samples import Samples
-from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM, NonFiniteError, culprit
-
-Draw = Callable[[], Samples]
-Visit = Callable[[], None]
+from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM, NonFiniteError, first_nonfinite
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """What one step saw, per player; tensors, so that nothing is synchronised unless it is read."""
+    """What one step saw, per player; tensors, so that nothing is synchronised unless it is read.
+
+    ``counted`` are the parameters, in the order of those of the fields, of the iterate that counts for an average.
+    """
 
     losses: dict[str, Tensor]
     gradient_norms: dict[str, Tensor]
-    batch: Samples  # where they were seen
-    samples: int  # states drawn
+    batches: Sequence[Samples]  # what the step was given; losses and norms are those of the last one
+    counted: list[Tensor]
+
+    @property
+    def samples(self) -> int:
+        """How many states the step was given."""
+        return sum(len(batch) for batch in self.batches)
 
 
 class Stepper(ABC):
     """Moves every player of ``objective`` by its own optimiser and schedule.
 
-    ``optimizers`` maps a player to a maker of its optimiser, ``schedule`` makes the learning-rate schedule of each, given
-    the part of the run the player rests;
+    ``draws`` is how many independent batches a step takes. ``optimizers`` maps a player to a maker of its optimiser,
+    ``schedule`` makes the learning-rate schedule of each, given the part of a round for which the player waits;
     ``radius``, if given, is the Euclidean ball each player's parameters are projected on after every update (the paper's
     proximal operator); ``clip``, if given, is the largest gradient norm of a player; ``unit`` is what losses are divided by
     (see `cost_unit`).
     """
+
+    draws: int = 1
 
     def __init__(
         self,
@@ -56,14 +64,17 @@ class Stepper(ABC):
         self.fields, self.objective, self.radius, self.clip, self.unit = fields, objective, radius, clip, unit
         self.parameters = {player: fields.parameters_of(names) for player, names in objective.players.items()}
         self.optimizers = {player: optimizers[player](self.parameters[player]) for player in objective.players}
-        resting = objective.resting
-        self.schedules = {p: schedule(optimizer, resting.get(p, 0.0)) for p, optimizer in self.optimizers.items()}
+        delays = objective.delays
+        self.schedules = {p: schedule(optimizer, delays.get(p, 0.0)) for p, optimizer in self.optimizers.items()}
         self._configured = {p: _hyper_parameters(optimizer) for p, optimizer in self.optimizers.items()}
         self._unmoved = {p: copy.deepcopy(s.state_dict()) for p, s in self.schedules.items()}
 
     @abstractmethod
-    def step(self, draw: Draw, visit: Visit) -> StepReport:
-        """One update of all players from samples of ``draw``; calls ``visit`` while the iterate to average is in place."""
+    def step(self, batches: Sequence[Samples], phase: Phase) -> StepReport:
+        """One update of all players that have a loss at ``phase``, from ``draws`` independent ``batches``.
+
+        Raises `NonFiniteError` where a loss or gradient is not finite; the parameters are then as they were.
+        """
 
     def learning_rates(self) -> dict[str, float]:
         """The current learning rate of each player."""
@@ -91,9 +102,13 @@ class Stepper(ABC):
                 for _ in range(moves[player]):
                     self.schedules[player].step()
 
-    def _differentiate(self, samples: Samples) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def _parameters(self) -> list[Tensor]:
+        """A copy of all parameters as they stand."""
+        return [p.detach().clone() for p in self.fields.parameters()]
+
+    def _differentiate(self, samples: Samples, phase: Phase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Set each parameter's gradient to that of its own player's loss; losses and gradient norms per player."""
-        losses = self.objective.losses(self.fields, samples)
+        losses = self.objective.losses(self.fields, samples, phase)
         moving = {player: self.parameters[player] for player in losses}
         gradients = {}
         for i, (player, parameters) in enumerate(moving.items()):
@@ -106,16 +121,18 @@ class Stepper(ABC):
                 # A bias that only shifts V gets no gradient where only grad V matters.
                 parameter.grad = torch.zeros_like(parameter) if gradient is None else gradient
             norms[player] = torch.nn.utils.get_total_norm([p.grad for p in parameters])
-        self._guard(losses, norms, samples)
+        self._require_finite(losses, norms, samples, phase)
         if self.clip is not None:
             for player, parameters in moving.items():
                 torch.nn.utils.clip_grads_with_norm_(parameters, self.clip, norms[player])
         return {player: loss.detach() for player, loss in losses.items()}, norms
 
-    def _guard(self, losses: dict[str, Tensor], norms: dict[str, Tensor], samples: Samples) -> None:
+    def _require_finite(
+        self, losses: dict[str, Tensor], norms: dict[str, Tensor], samples: Samples, phase: Phase
+    ) -> None:
         checks = torch.stack([*losses.values(), *norms.values()])
         if not torch.isfinite(checks).all():
-            what = culprit(self.objective, self.fields, samples)
+            what = first_nonfinite(self.objective, self.fields, samples, phase)
             advice = "" if what.endswith(BROKEN_PROBLEM) else "; try a smaller optimizer.lr, or stepper.clip"
             raise NonFiniteError(f"{what}{advice}.")
 

@@ -1,1 +1,1 @@
-"""Training: the loop and what it looks at on the way. Knows of no folder but where its checkpoint goes."""
+"""Training: the loop, its batches, its evaluations on the way. Knows of no folder but where its checkpoint goes."""

@@ -11,26 +11,28 @@ from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.errors import InputError, require_number
 from ocp_torch.fields import VALUE, Fields
 from ocp_torch.maths.seeds import Branch, derive_seed
-from ocp_torch.objectives import Objective
+from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.samples import Samples
 
-# The part of a batch that is visited states, where no `M` is known and nobody said otherwise.
+# The part of a batch that is visited states, where no `M` is known and nobody said otherwise: more of them make the penalty
+# more exact, and leave fewer states for the integrals.
 VISITED = 0.25
 # At least a tenth of a batch is for the integrals.
-MOST = 0.9
-# Visited states move on, from batch to batch, by this part of 1 / rho, but never further than a stride on the torus.
-MOVE, STRIDE = 0.05, 0.05
+MOST_VISITED = 0.9
+# From batch to batch a visited state moves on by Euler's method for this part of 1 / rho, but no further than this distance
+# on the torus: longer steps leave the flow's paths, shorter ones repeat nearly the same states.
+STEP_TIME, LONGEST_STEP = 0.05, 0.05
 
 
 class Batches:
     r"""``size`` states a batch for ``objective``; the part ``visited`` of them comes from the closed loop of the present `V`.
 
     Visited states follow the controller of `V`, and start again at a uniform state at the rate `rho`: in the long run their
-    law is about the occupation measure of that controller. They carry no weight in integrals but, for as long as they stay,
-    `Samples.attention` for the penalties. That makes the penalty of D(M) exact also where `mu*` is unbounded: it is exact
-    wherever the measure that weighs the slack dominates `mu*` (proof of Proposition 3), which no multiple of the uniform
-    one then does. And in many dimensions a goal is so small that uniform states never meet it.
+    law is about the occupation measure of that controller. They carry no weight in integrals but, in proportion to the time
+    they spend where they are, `Samples.penalty_weight`. That makes the penalty of D(M) exact also where `mu*` is unbounded:
+    it is exact wherever the measure that weighs the slack dominates `mu*` (proof of Proposition 3), which no multiple of the
+    uniform one then does. And in many dimensions a goal is so small that uniform states never meet it.
 
     ``visited`` null takes a quarter where `Constants.unbounded`, and none elsewhere. Raises `InputError` where it is not in
     [0, 0.9], or above 0 for a method without `V` or a problem that has data only where it was recorded.
@@ -48,7 +50,7 @@ class Batches:
     ) -> None:
         self.problem, self.fields, self.objective, self.sampler, self.size = problem, fields, objective, sampler, size
         self.visited = (
-            None if visited is None else require_number("sampler.visited", visited, at_least=0.0, at_most=MOST)
+            None if visited is None else require_number("sampler.visited", visited, at_least=0.0, at_most=MOST_VISITED)
         )
         self._possible = VALUE in objective.fields and problem.has_simulator
         if self.visited and not self._possible:
@@ -59,48 +61,49 @@ class Batches:
             )
             raise InputError(f"sampler.visited is {visited:g}, but {lacks}; leave it out.")
         self.generator = torch.Generator().manual_seed(derive_seed(seed, Branch.VISITS))
-        self.states: Tensor | None = None  # (k, d), where the visitors are
+        self.states: Tensor | None = None  # (k, d), where the visited states are now
 
-    def draw(self) -> Samples:
-        """The next batch, in the precision and on the device of the fields."""
+    def draw(self, phase: Phase) -> Samples:
+        """The next batch, with what the objective needs at ``phase``, in the precision and on the device of the fields."""
         like = next(self.fields.parameters())
-        count = self._count()
+        count = self._count(phase)
         places = self.sampler.draw(self.size - count).to(like.device)
-        drawn = self.problem.samples(places, divergences=self.objective.needs_divergences)
+        divergences = self.objective.needs_divergences(phase)
+        drawn = self.problem.samples(places, divergences=divergences)
         if not self.problem.has_simulator:
             return drawn.to(like)
-        return self._with_visited(drawn, count, like) if count else drawn
+        return self._with_visited(drawn, count, like, divergences) if count else drawn
 
-    def _count(self) -> int:
+    def _count(self, phase: Phase) -> int:
         part = self.visited
         if part is None:
-            part = VISITED if self._possible and self.objective.constants.unbounded else 0.0
+            part = VISITED if self._possible and phase.constants.unbounded else 0.0
         return min(int(part * self.size), self.size - 1)
 
-    def _with_visited(self, drawn: Samples, count: int, like: Tensor) -> Samples:
+    def _with_visited(self, drawn: Samples, count: int, like: Tensor, divergences: bool) -> Samples:
         if self.states is None or len(self.states) != count:
-            self.states = self._born(count, like)
-        visited = self.problem.samples(self.states.to(like), divergences=self.objective.needs_divergences)
-        stay = self._move(visited)
+            self.states = self._uniform(count, like)
+        visited = self.problem.samples(self.states.to(like), divergences=divergences)
+        spent = self._move(visited)
         # The drawn states stand for all integrals, as they would without the visited ones; the penalties see both.
         share = (len(drawn) + count) / len(drawn)
-        drawn = replace(drawn, weight=share * drawn.weight, attention=drawn.weight)
-        visited = replace(visited, weight=torch.zeros_like(visited.weight), attention=stay)
+        drawn = replace(drawn, weight=share * drawn.weight, penalty_weight=drawn.weight)
+        visited = replace(visited, weight=torch.zeros_like(visited.weight), penalty_weight=spent)
         return Samples.concatenate([drawn, visited])
 
     def _move(self, at: Samples) -> Tensor:
-        """Along the closed loop for a short time, or back to a uniform state; the part of `MOVE` it took, ``(k,)``."""
+        """Along the closed loop for a short time, or back to a uniform state; the part of `STEP_TIME` it took, ``(k,)``."""
         policy, rho = ValuePolicy(self.problem, self.fields.value), self.problem.discount
         u = policy(at.x).detach()
         velocity = at.a + torch.einsum("ndm,nm->nd", at.B, u)
-        time = (STRIDE / velocity.norm(dim=-1).clamp_min(1e-12)).clamp_max(MOVE / rho)
+        time = (LONGEST_STEP / velocity.norm(dim=-1).clamp_min(1e-12)).clamp_max(STEP_TIME / rho)
         moved = (at.x + time.unsqueeze(-1) * velocity).remainder(1.0)
         chance = torch.rand(len(moved), generator=self.generator).to(moved)
         again = (chance < 1.0 - torch.exp(-rho * time)) | ~torch.isfinite(moved).all(dim=-1)
-        self.states = torch.where(again.unsqueeze(-1), self._born(len(moved), moved), moved)
-        return time * rho / MOVE
+        self.states = torch.where(again.unsqueeze(-1), self._uniform(len(moved), moved), moved)
+        return time * rho / STEP_TIME
 
-    def _born(self, count: int, like: Tensor) -> Tensor:
+    def _uniform(self, count: int, like: Tensor) -> Tensor:
         return torch.rand(count, self.problem.dim, generator=self.generator).to(like)
 
     def state_dict(self) -> dict:

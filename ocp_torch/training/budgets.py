@@ -1,4 +1,4 @@
-"""Sizes and budgets by dimension, for every field of the configuration that is null: what won in measurements."""
+"""Training budgets by dimension, for every field of the configuration that is null: what won in measurements."""
 
 from __future__ import annotations
 
@@ -6,83 +6,70 @@ import copy
 from dataclasses import dataclass, replace
 from math import inf
 
-from ocp_torch.errors import require_section
+from ocp_torch.errors import require_choice, require_section
+from ocp_torch.fields import MODELS
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import is_unbounded
 
 
 @dataclass(frozen=True)
 class Budget:
-    """One row: up to ``dim`` coordinates, for a run and for its certification stage."""
+    """One row: up to ``dim`` coordinates, for a run and for its policy evaluation."""
 
     dim: float
-    modes: int
-    waves: int
-    width: int
-    gated: bool
     steps: int
     batch: int
     good_gap: float
     stage_steps: int
 
 
-# Kinks want Fourier modes, affordable in one and two dimensions; many dimensions want samples, and gates: products of tanh
-# learn terms that couple many coordinates several times faster.
+# Many dimensions want samples.
 BUDGETS = (
-    Budget(1, modes=6, waves=0, width=96, gated=False, steps=900, batch=256, good_gap=0.005, stage_steps=300),
-    Budget(2, modes=6, waves=16, width=96, gated=False, steps=900, batch=256, good_gap=0.005, stage_steps=400),
-    Budget(4, modes=3, waves=32, width=128, gated=False, steps=1200, batch=384, good_gap=0.005, stage_steps=600),
-    Budget(8, modes=1, waves=64, width=128, gated=True, steps=1000, batch=512, good_gap=0.01, stage_steps=600),
-    Budget(inf, modes=1, waves=128, width=128, gated=True, steps=1200, batch=512, good_gap=0.02, stage_steps=800),
+    Budget(1, steps=900, batch=256, good_gap=0.005, stage_steps=300),
+    Budget(2, steps=900, batch=256, good_gap=0.005, stage_steps=400),
+    Budget(4, steps=1200, batch=384, good_gap=0.005, stage_steps=600),
+    Budget(8, steps=1000, batch=512, good_gap=0.01, stage_steps=600),
+    Budget(inf, steps=1200, batch=512, good_gap=0.02, stage_steps=800),
 )
 
-# Where no M is known the slack must be small everywhere, not on average: that wants more states at once, and longer.
-LARGE_BATCH, MANY_WAVES, MANY_STEPS = 1024, 64, 1200
+# Where no M is known the bound is decided by the worst state: that wants more states at once, and longer.
+LARGE_BATCH, MANY_STEPS = 1024, 1200
 # The larger batch is for the supremum of the slack, of which the density player of pd knows nothing.
 DENSITY_BATCH = 256
-# And no steep spots that nobody visits, but the supremum does: gelu leaves fewer than tanh, independent states fewer than
-# evenly spread ones.
-GENTLE_ACTIVATION, GENTLE_SAMPLER = "gelu", "uniform"
-ACTIVATION, SAMPLER, LEARNING_RATE = "tanh", "sobol", 1e-2
+# Evenly spread states leave more steep spots than independent ones, and the worst state is in one.
+SAMPLER, WORST_STATE_SAMPLER = "sobol", "uniform"
+LEARNING_RATE = 1e-2
 
 
 def fill(config: dict, problem: Problem) -> dict:
-    """``config`` with the fields that are null, and have a default by dimension, filled in."""
+    """``config`` with the fields that are null, and have a default by dimension, filled in.
+
+    Sizes of the networks are those that the class of the model has for itself. Raises `InputError` for a model that is not
+    known, or a section that is none.
+    """
     budget = next(b for b in BUDGETS if problem.dim <= b.dim)
     for name in ("model", "trainer", "optimizer", "certificate"):
         require_section(name, config.get(name))
     filled = copy.deepcopy(config)
-    activation, sampler, of_method = ACTIVATION, SAMPLER, {}
     method = require_section("method", config.get("method") or {})
-    if is_unbounded(problem, method.get("occupation_bound")):
+    model = MODELS[require_choice("model.name", config["model"].get("name"), MODELS)]
+    unbounded, of_method = is_unbounded(problem, method.get("occupation_bound")), {}
+    if unbounded:
         if method.get("name") == "pd" and config["trainer"].get("batch") is None:
             of_method = {("method", "density_batch"): DENSITY_BATCH}
-        activation, sampler = ACTIVATION if budget.gated else GENTLE_ACTIVATION, GENTLE_SAMPLER
-        budget = replace(
-            budget,
-            batch=max(budget.batch, LARGE_BATCH),
-            waves=max(budget.waves, MANY_WAVES),
-            steps=max(budget.steps, MANY_STEPS),
-        )
+        budget = replace(budget, batch=max(budget.batch, LARGE_BATCH), steps=max(budget.steps, MANY_STEPS))
     defaults = {
-        ("model", "modes"): budget.modes,
-        ("model", "waves"): budget.waves,
-        ("model", "width"): budget.width,
-        ("model", "gated"): budget.gated,
-        ("model", "activation"): activation,
+        **{("model", name): value for name, value in model.defaults(problem.dim, worst_state=unbounded).items()},
         ("trainer", "rounds"): 2 if config["trainer"].get("steps") is None else 1,
         ("trainer", "good_gap"): budget.good_gap,
         ("trainer", "steps"): budget.steps,
         ("trainer", "batch"): budget.batch,
         ("optimizer", "lr"): LEARNING_RATE,
-        ("sampler", "name"): sampler,
+        ("sampler", "name"): WORST_STATE_SAMPLER if unbounded else SAMPLER,
         ("certificate", "stage", "steps"): budget.stage_steps,
         **of_method,
     }
     for (*path, name), value in defaults.items():
-        # The table's sizes are those of perceptrons; a linear model chooses its own.
-        if path == ["model"] and config["model"].get("name") == "sobolev":
-            continue
         section = filled
         for depth, key in enumerate(path, start=1):
             require_section(".".join(path[:depth]), section.setdefault(key, {}))

@@ -1,8 +1,9 @@
-"""Whether a run is going anywhere: its best look at the bounds so far, and signs that it diverges or learns nothing."""
+"""Whether a run is going anywhere: its best evaluation so far, and signs that it diverges or learns nothing."""
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
 import torch
@@ -10,16 +11,18 @@ from torch import Tensor
 
 from ocp_torch.certificate import Certificate
 from ocp_torch.errors import notes
+from ocp_torch.fields.fields import typical_sizes
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
 
-# A run whose weights or losses have grown by so much since it began is not coming back.
+# Weights or losses that have grown by so much since the run began are reported as divergence. Smaller factors would report
+# sooner, and also the growth of a run that learns.
 GROWN_WEIGHTS, GROWN_LOSS = 100.0, 1e4
 # States on which the bound of the best constant V is computed.
 CONSTANT_STATES = 2**13
 CONTRADICTED = "bounds contradicted each other at step"
-# A lower bound that falls short of it by less is as good: networks round, and both are sampled.
+# A lower bound within this relative distance of that of the best constant is as good: both are sampled.
 ROUNDING = 1e-4
 
 
@@ -27,13 +30,11 @@ ROUNDING = 1e-4
 class Evaluation:
     """What the bounds were at ``step``; ``noise`` is half of the intervals of both sides, in the units of ``gap``.
 
-    Where bounds contradict each other nothing counts: such a look has neither a gap nor a performance.
+    Where bounds contradict each other nothing counts: there is then neither a gap nor a performance.
     """
 
     step: int
-    gap: (
-        float | None
-    )  # relative, from the lower bound to the simulated performance, between the far ends of their intervals
+    gap: float | None  # relative, from the lower bound to the simulated performance, between the far ends of both
     perf: float | None  # simulated, the upper end of its interval
     noise: float
 
@@ -59,6 +60,12 @@ class Evaluation:
             return self.gap is not None
         return self.gap + margin < other.gap
 
+    def in_words(self) -> str:
+        """What fields are judged by, as a user is told."""
+        if self.gap is not None:
+            return f"a gap of {100 * self.gap:.3g} %"
+        return f"a performance of {self.perf or float('nan'):.6g}"
+
 
 class Health:
     """Follows a run. ``best`` is the best `Evaluation` so far, ``fields`` the averaged fields it was of and ``certificate``
@@ -70,14 +77,22 @@ class Health:
         self.fields: dict | None = None
         self.certificate: Certificate | None = None
         self.notes: list[str] = []
-        self.warned = False  # that a look was hopeless
+        self.warned = False  # that a certificate was no better than not having trained
         self._unit, self._start = unit, {}
 
-    def looked(self, look: Evaluation, fields: torch.nn.Module, certificate: Certificate | None = None) -> bool:
-        """Take note of a look at ``fields``; whether it is the best so far."""
-        if not look.better_than(self.best):
+    @classmethod
+    def of(cls, problem: Problem) -> Health:
+        """Of a run on ``problem``, before its first step."""
+        (mean, spread), _ = typical_sizes(problem)
+        return cls(unit=abs(mean) + spread)
+
+    def evaluated(
+        self, evaluation: Evaluation, fields: torch.nn.Module, certificate: Certificate | None = None
+    ) -> bool:
+        """Take note of an evaluation of ``fields``; whether it is the best so far."""
+        if not evaluation.better_than(self.best):
             return False
-        self.best, self.certificate = look, certificate
+        self.best, self.certificate = evaluation, certificate
         self.fields = {name: tensor.detach().clone() for name, tensor in fields.state_dict().items()}
         return True
 
@@ -98,12 +113,16 @@ class Health:
         self.notes += fresh
         return fresh
 
-    def contradicted(self, step: int, sentence: str) -> list[str]:
-        """Take note, once, that bounds contradicted each other at ``step``; the sentence that says so, if it is news."""
-        if any(note.startswith(CONTRADICTED) for note in self.notes):
-            return []
-        self.notes.append(f"{CONTRADICTED} {step}: {sentence}")
-        return self.notes[-1:]
+    def doubts(self, step: int, contradiction: str | None, sanity: Callable[[], list[str]]) -> list[str]:
+        """What the certificate at ``step`` gives reason to doubt, each said once in a run: a ``contradiction`` of bounds, and
+        whatever ``sanity`` finds (see `sanity_warnings`)."""
+        fresh = []
+        if contradiction is not None and not any(note.startswith(CONTRADICTED) for note in self.notes):
+            fresh = [f"{CONTRADICTED} {step}: {contradiction}"]
+            self.notes += fresh
+        found = [] if self.warned else sanity()
+        self.warned = self.warned or bool(found)
+        return [*fresh, *(f"step {step}: {sentence}" for sentence in found)]
 
     def state_dict(self) -> dict:
         best = asdict(self.best) if self.best else None

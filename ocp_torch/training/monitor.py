@@ -17,17 +17,19 @@ from ocp_torch.control.policies import admissible_density, occupation_density
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import StepReport
+from ocp_torch.training.observer import Silent
 from ocp_torch.training.stages import Stages, in_words, rough_seconds
+from ocp_torch.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
-# How TensorBoard's files begin.
+# How the names of TensorBoard's files begin.
 EVENTS = "events.out.tfevents."
 
 
 @torch.no_grad()
-def liouville_residual(trainer, batch: Samples) -> dict[str, Tensor]:
+def liouville_residual(trainer: Trainer, batch: Samples) -> dict[str, Tensor]:
     """`mean |mu0 - mu - div(a mu + B w) / rho|` on ``batch``, whatever gives `mu`: also where the loss needs no divergences
-    (a player that rests, the plain saddle) or `mu` is in closed form. Nothing where the problem gives no divergences."""
+    (a player does not move yet, the plain saddle) or `mu` is in closed form. Nothing where the problem gives none."""
     problem, fields = trainer.problem, trainer.fields
     samples = Samples.of(problem, batch.x) if problem.has_simulator else batch
     if samples.div_a is None or samples.div_B is None:
@@ -44,27 +46,11 @@ def liouville_residual(trainer, batch: Samples) -> dict[str, Tensor]:
     return {"residual_mean_absolute": samples.mean((inflow - outflow).abs())}
 
 
-class Silent:
-    """A monitor that shows nothing: for tests and for use as a library."""
-
-    def stepped(self, trainer, report: StepReport, log: bool) -> None:
-        """A step was taken; ``log`` says whether it is one to be recorded."""
-
-    def evaluated(self, trainer, certificate: Certificate) -> None:
-        """The bounds were looked at."""
-
-    def extended(self, trainer) -> None:
-        """Another round begins."""
-
-    def noticed(self, sentence: str) -> None:
-        """Something is wrong with the run's health."""
-
-
 class Monitor(Silent):
     """Progress bar (terminals only), log lines, and TensorBoard scalars in the groups bounds, performance, loss, lr,
     gradient_norm, violation and throughput."""
 
-    def __init__(self, folder: Path, trainer) -> None:
+    def __init__(self, folder: Path, trainer: Trainer) -> None:
         done = trainer.step
         # What a killed start still wrote beyond its last checkpoint is not shown twice.
         self.writer = SummaryWriter(str(folder), purge_step=done + 1 if done else None)
@@ -85,17 +71,17 @@ class Monitor(Silent):
         self.bar.close()
         self.writer.close()
 
-    def stepped(self, trainer, report: StepReport, log: bool) -> None:
+    def stepped(self, trainer: Trainer, report: StepReport, log: bool) -> None:
         self.bar.update(trainer.step - self.bar.n)
         if not log:
             return
-        step = trainer.step
+        step, batch = trainer.step, report.batches[-1]
         for player in report.losses:
             self.writer.add_scalar(f"loss/{player}", float(report.losses[player]), step)
             self.writer.add_scalar(f"gradient_norm/{player}", float(report.gradient_norms[player]), step)
-        shown = trainer.objective.diagnostics(trainer.fields, report.batch)
+        shown = trainer.objective.diagnostics(trainer.fields, batch)
         if "residual_mean_absolute" not in shown and trainer.fields.control_density is not None:
-            shown |= liouville_residual(trainer, report.batch)
+            shown |= liouville_residual(trainer, batch)
         for name, value in shown.items():
             self.writer.add_scalar(f"violation/{name}", float(value), step)
         for player, rate in trainer.stepper.learning_rates().items():
@@ -106,7 +92,7 @@ class Monitor(Silent):
         self.writer.add_scalar("throughput/samples_per_second", speed, step)
         self._show(**{"samples/s": f"{speed:,.0f}"})
 
-    def evaluated(self, trainer, certificate: Certificate) -> None:
+    def evaluated(self, trainer: Trainer, certificate: Certificate) -> None:
         record(self.writer, certificate, trainer.step)
         shown = {name: e for name, e in {**certificate.lower, **certificate.upper}.items() if e is not None}
         values = {name: f"{shown[name].value:.6f}" for name in ("F_M", "J") if name in shown}
@@ -120,13 +106,14 @@ class Monitor(Silent):
     def noticed(self, sentence: str) -> None:
         log.warning("warning: %s", sentence)
 
-    def extended(self, trainer) -> None:
+    def extended(self, trainer: Trainer) -> None:
         self.bar.total = trainer.end
         log.info("not good yet: training goes on to step %d, with M = %.4g", trainer.end, trainer.constants.M)
 
-    def stopped(self, trainer, why: str, settings: CertificateSettings) -> None:
+    def stopped(self, trainer: Trainer, why: str, settings: CertificateSettings) -> None:
         """Training stopped, and the certificate is about to be made; says why, and about how long that takes."""
-        seconds = rough_seconds(trainer, settings.stage.steps)
+        per_step = trainer.state.seconds / max(trainer.step, 1)
+        seconds = rough_seconds(trainer.evaluator.seconds, per_step, settings.stage.steps)
         self.bar.clear()
         rest = f", in about {in_words(seconds)}" if seconds else ""
         log.info("%s; the certificate is next%s", why.rstrip("."), rest)

@@ -8,7 +8,7 @@ import torch
 
 from ocp_torch.errors import InputError, require_choice, require_flag, require_integer, require_number
 
-# More threads than any machine has crash the thread pool.
+# Many more threads than any machine has cores crash the thread pool.
 MOST_THREADS = 1024
 
 
@@ -47,9 +47,7 @@ class TrainerSettings:
             if getattr(self, name) is not None:
                 require_number(f"trainer.{name}", getattr(self, name), above=0.0)
         if self.target_gap is not None and not self.evaluate_every:
-            raise InputError(
-                "trainer.evaluate_every is 0, but trainer.target_gap needs looks at the bounds on the way."
-            )
+            raise InputError("trainer.evaluate_every is 0, but trainer.target_gap needs quick evaluations on the way.")
         require_choice("trainer.dtype", self.dtype, ("float32", "float64"))
         require_choice("trainer.device", self.device, ("auto", "cpu", "cuda"))
         if self.device == "cuda" and not torch.cuda.is_available():

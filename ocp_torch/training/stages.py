@@ -8,18 +8,17 @@ import threading
 from tqdm import tqdm
 
 log = logging.getLogger(__name__)
-# A certificate has cost 5 to 10 times a look at the bounds, beside its own fit (measured on the circle, the pendulum and a
+# A full certificate has cost 5 to 10 times a quick one, beside its own fit (measured on the circle, the pendulum and a
 # manufactured problem in four dimensions).
-LOOKS = 6.0
+QUICK_CERTIFICATES = 6.0
 TICK = 1.0  # seconds between two movements of the clock
 CLOCK = "{desc}: {elapsed}{postfix}"
 
 
-def rough_seconds(trainer, steps: int) -> float | None:
-    """About how long the certificate of ``trainer`` takes, whose fit has ``steps`` steps at least; `None` if nobody knows."""
-    if trainer.look_seconds is None:
-        return None
-    return LOOKS * trainer.look_seconds + steps * trainer.seconds / max(trainer.step, 1)
+def rough_seconds(quick: float | None, step: float, steps: int) -> float | None:
+    """About how long a certificate takes where a quick one took ``quick`` seconds and a step ``step``, and whose fit has
+    ``steps`` steps at least; `None` where there was no quick one."""
+    return None if quick is None else QUICK_CERTIFICATES * quick + steps * step
 
 
 def in_words(seconds: float) -> str:

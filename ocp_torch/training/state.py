@@ -1,87 +1,115 @@
-"""Everything a run needs to go on exactly, as plain data and tensors; and the way back."""
+"""Everything of a run that changes while it goes on: to be saved as plain data and tensors, and put back."""
 
 from __future__ import annotations
 
 import copy
-import math
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import torch
 
 from ocp_torch.errors import InputError, notes, require_integer, require_number, visible
+from ocp_torch.fields import Fields
+from ocp_torch.problems.constants import Constants
+from ocp_torch.steppers import Average, NonFiniteError, Stepper
+from ocp_torch.training.batches import Batches
 from ocp_torch.training.generators import generator_states, restore_generators
+from ocp_torch.training.health import Health
+from ocp_torch.training.rounds import Rounds
 
-if TYPE_CHECKING:
-    from ocp_torch.training.trainer import Trainer
-
-# What decides the learning rates: where one of these differs, they are those of the new configuration.
+# What decides the learning rates: where one of these differs at a resume, they are those of the new configuration.
 RATES = (("optimizer",), ("schedule",), ("trainer", "steps"))
 
 
-def gather(trainer: Trainer) -> dict:
-    """The state of ``trainer``; random generators last."""
-    return {
-        "problem": trainer.names[0],
-        "method": trainer.names[1],
-        "config": trainer.config,
-        "step": trainer.step,
-        "round": trainer.round,
-        "bounds": {
-            "M": trainer.constants.M,
-            "warnings": list(trainer.constants.warnings),
-            "unbounded": trainer.constants.unbounded,
-        },
-        "samples": trainer.samples,
-        "seconds": trainer.seconds,
-        "elapsed": trainer.elapsed,
-        "ended": trainer.ended,
-        "pending": trainer.pending,
-        "retry": trainer.retry,
-        "fields": trainer.fields.state_dict(),
-        "average": trainer.average.state_dict(),
-        "stepper": trainer.stepper.state_dict(),
-        "batches": trainer.batches.state_dict(),
-        "watch": trainer.health.state_dict(),
-        "generators": generator_states(),
-    }
+@dataclass
+class TrainState:
+    """What a run needs to go on exactly, and what it is a run of."""
 
+    names: tuple[str, str]  # of the problem and of the method
+    config: dict  # what all parts were built from
+    fields: Fields
+    average: Average
+    stepper: Stepper
+    batches: Batches
+    health: Health
+    constants: Constants  # in force
+    step: int = 0
+    round: int = 0
+    samples: int = 0  # states drawn so far
+    seconds: float = 0.0  # spent in steps alone
+    elapsed: float = 0.0  # with evaluations and checkpoints
+    pending: bool = False  # a full certificate may reach the target gap, and is to be made
+    retry: int = 0  # none is made before this step
+    ended: bool = False  # nothing was left to do when it was saved
 
-def restore(trainer: Trainer, state: dict) -> None:
-    """Put ``trainer`` where `gather` found another of its kind. With the same configuration it goes on to the same bits.
+    def state_dict(self) -> dict:
+        """All of it as plain data and tensors."""
+        (problem, method), constants = self.names, self.constants
+        return {
+            "problem": problem,
+            "method": method,
+            "config": self.config,
+            "step": self.step,
+            "round": self.round,
+            "bounds": {"M": constants.M, "warnings": list(constants.warnings), "unbounded": constants.unbounded},
+            "samples": self.samples,
+            "seconds": self.seconds,
+            "elapsed": self.elapsed,
+            "ended": self.ended,
+            "pending": self.pending,
+            "retry": self.retry,
+            "fields": self.fields.state_dict(),
+            "average": self.average.state_dict(),
+            "stepper": self.stepper.state_dict(),
+            "batches": self.batches.state_dict(),
+            "watch": self.health.state_dict(),
+            "generators": generator_states(),
+        }
 
-    With other `trainer.steps` the run is taken as one of the new length: its round, warm start and learning rates are
-    those such a run would have at this step. Raises `InputError` for a state of another problem or method; a state that
-    does not fit raises whatever its odd part leads to.
-    """
-    for what, own in zip(("problem", "method"), trainer.names, strict=True):
-        if state[what] != own:
-            raise InputError(f"the checkpoint belongs to the {what} {str(state[what])[:80]!r}, not to {own!r}.")
-    # Tensors of a loaded optimiser state would otherwise be those of ``state``, and change under its owner.
-    state = copy.deepcopy(state)
-    trainer.step = require_integer("step of the checkpoint", state["step"], 0)
-    trainer.round = require_integer("round of the checkpoint", state["round"], 0, maximum=15)
-    trainer.samples = require_integer("samples of the checkpoint", state["samples"], 0, maximum=2**63)
-    for name in ("seconds", "elapsed"):
-        setattr(trainer, name, require_number(f"{name} of the checkpoint", state[name], at_least=0.0))
-    trainer.pending, trainer.retry = bool(state["pending"]), int(state["retry"])
-    constants = state["bounds"]
-    warnings, unbounded = notes(constants["warnings"]), bool(constants["unbounded"])
-    trainer.use(replace(trainer.constants, M=constants["M"], warnings=warnings, unbounded=unbounded))
-    best = state["watch"]["fields"]
-    for module, weights in ((trainer.fields, state["fields"]), (trainer.average, state["average"])):
-        _require_weights(module, weights)
-        module.load_state_dict(weights)
-    if best is not None:
-        _require_weights(trainer.fields, best)
-    if any(_at(state["config"], path) != _at(trainer.config, path) for path in RATES):
-        _place_in_round(trainer)
-        trainer.stepper.load_state_dict(state["stepper"], moves=_moves(trainer))
-    else:
-        trainer.stepper.load_state_dict(state["stepper"])
-    trainer.batches.load_state_dict(state["batches"])
-    trainer.health.load_state_dict(state["watch"])
-    restore_generators(state["generators"])
+    def load_state_dict(self, saved: dict, rounds: Rounds) -> None:
+        """The way back from `state_dict`: with the same configuration the run goes on to the same bits.
+
+        With another `optimizer`, `schedule` or `trainer.steps` the run is taken as one of these ``rounds``: its round, warm
+        start and learning rates are those such a run would have at this step. Raises `InputError` for a state of another
+        problem or method, or weights that are none; a state that does not fit raises whatever its odd part leads to.
+        """
+        for what, own in zip(("problem", "method"), self.names, strict=True):
+            if saved[what] != own:
+                raise InputError(f"the checkpoint belongs to the {what} {str(saved[what])[:80]!r}, not to {own!r}.")
+        # Tensors of a loaded optimiser state would otherwise be those of ``saved``, and change under its owner.
+        saved = copy.deepcopy(saved)
+        self.step = require_integer("step of the checkpoint", saved["step"], 0)
+        self.round = require_integer("round of the checkpoint", saved["round"], 0, maximum=15)
+        self.samples = require_integer("samples of the checkpoint", saved["samples"], 0, maximum=2**63)
+        self.seconds = require_number("seconds of the checkpoint", saved["seconds"], at_least=0.0)
+        self.elapsed = require_number("elapsed of the checkpoint", saved["elapsed"], at_least=0.0)
+        self.pending, self.retry = bool(saved["pending"]), int(saved["retry"])
+        constants = saved["bounds"]
+        warnings, unbounded = notes(constants["warnings"]), bool(constants["unbounded"])
+        self.constants = replace(self.constants, M=constants["M"], warnings=warnings, unbounded=unbounded)
+        best = saved["watch"]["fields"]
+        for module, weights in ((self.fields, saved["fields"]), (self.average, saved["average"])):
+            _require_weights(module, weights)
+            module.load_state_dict(weights)
+        if best is not None:
+            _require_weights(self.fields, best)
+        moves = None
+        if any(_at(saved["config"], path) != _at(self.config, path) for path in RATES):
+            self.round, objective = rounds.at(self.step), self.stepper.objective
+            delays = {player: objective.delays.get(player, 0.0) for player in objective.players}
+            moves = {player: rounds.moves(self.step, self.round, delay) for player, delay in delays.items()}
+        self.stepper.load_state_dict(saved["stepper"], moves=moves)
+        self.batches.load_state_dict(saved["batches"])
+        self.health.load_state_dict(saved["watch"])
+        # Last: to restore the rest may draw from them.
+        restore_generators(saved["generators"])
+
+    def require_finite(self) -> None:
+        """Raise `NonFiniteError` where a weight is not finite: such a state is neither evaluated nor saved."""
+        for name, parameter in self.fields.named_parameters():
+            if not torch.isfinite(parameter).all():
+                raise NonFiniteError(
+                    f"the weights of {name} are not finite; try a smaller optimizer.lr, or stepper.clip."
+                )
 
 
 def _require_weights(module: torch.nn.Module, weights: dict) -> None:
@@ -101,24 +129,3 @@ def _at(config: dict, path: tuple[str, ...]):
     for key in path:
         config = config[key]
     return config
-
-
-def _place_in_round(trainer: Trainer) -> None:
-    """The round that a run of the present length would be in at this step."""
-    trainer.round = 0
-    while trainer.step >= trainer.end and trainer.round + 1 < trainer.settings.rounds:
-        trainer.round += 1
-
-
-def _moves(trainer: Trainer) -> dict[str, int]:
-    """How often each player would have moved by this step: each rests at the start of every round."""
-    counts = {}
-    for player in trainer.objective.players:
-        resting, count, begin = trainer.objective.resting.get(player, 0.0), 0, 0
-        for k in range(trainer.round + 1):
-            length = trainer.settings.steps * 2**k
-            done = min(length, trainer.step - begin)
-            count += max(0, done - math.ceil(resting * length))
-            begin += length
-        counts[player] = count
-    return counts

@@ -10,7 +10,12 @@ from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.certificate.simulated.simulation import discounted_integral
 from ocp_torch.certificate.upper.lagrangian import Terms, _integrands, best_multiples, closed_loop_bounds
-from ocp_torch.certificate.upper.policy_evaluation import StageSettings, fit_closed_loop, missing_price, relative_excess
+from ocp_torch.certificate.upper.policy_evaluation import (
+    StageSettings,
+    fit_closed_loop,
+    positive_weight,
+    relative_excess,
+)
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.maths import jets
@@ -142,11 +147,11 @@ def test_the_bounds_do_not_depend_on_the_mass_that_mu_was_given(problem):
     assert sum(best_multiples(terms, bound)) <= sum(bound(t, 1.0) for t in terms) + 1e-3
 
 
-def test_the_price_of_missing_mass_follows_the_slack():
-    """Deep slack on one side makes that side of the residual dear, within limits; a sign turned turns the price."""
+def test_the_weight_of_missing_mass_follows_the_slack():
+    """Deep slack on one side makes that side of the residual weigh more, within limits; a sign turned turns the ratio."""
     problem = zoo.build("manufactured 2-d q=2")
     loop = ClosedLoop(problem, problem.exact_control)
     samples = Samples.of(loop, zoo.states(problem, 4000))
     low, high = ((lambda x, c=c: problem.exact_value(x) + c) for c in (-0.1, 0.1))
-    assert missing_price(loop, low, samples) == pytest.approx(4.0)
-    assert missing_price(loop, high, samples) == pytest.approx(0.25)
+    assert positive_weight(loop, low, samples) == pytest.approx(4.0)
+    assert positive_weight(loop, high, samples) == pytest.approx(0.25)

@@ -11,7 +11,7 @@ import torch
 from ocp_torch.cli.compose import composed
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.files import storage
-from ocp_torch.runs.start import prepare
+from ocp_torch.runs.training_run import training_run
 from ocp_torch.training.checkpoint import MAGIC, SCHEMA, load_checkpoint, newest, save_checkpoint
 from ocp_torch.training.monitor import Silent
 from support.forked import TINY, completed, train
@@ -186,7 +186,7 @@ def test_a_run_goes_on_from_the_newest_good_checkpoint_and_says_which_was_not(tm
     trainer = small("method=dual", "trainer.checkpoint_every=5", "trainer.keep=3", "trainer.steps=18")
     trainer.fit(Silent(), folder / "checkpoints" / "last.pt")
     (folder / "checkpoints" / "last.pt").write_bytes(b"")
-    run = prepare(composed("train", [f"resume={folder}"]))
+    run = training_run(composed("train", [f"resume={folder}"]))
     assert run.trainer.step == 15
     (note,) = run.notes
     assert "last.pt" in note
@@ -202,5 +202,5 @@ def test_a_damaged_configuration_is_refused_in_one_sentence(content, tmp_path):
     (folder / ".hydra").mkdir()
     (folder / ".hydra" / "config.yaml").write_bytes(content)
     with pytest.raises(InputError, match=r"config\.yaml") as refused:
-        prepare(composed("train", [f"resume={folder}"]))
+        training_run(composed("train", [f"resume={folder}"]))
     assert "\n" not in str(refused.value)

@@ -21,8 +21,9 @@ from ocp_torch.files.storage import load_tensors, save_tensors
 from ocp_torch.problems import Kuramoto
 from ocp_torch.problems.recorded.recording import read
 from ocp_torch.runs.compare import compare
+from ocp_torch.runs.configuration import read_configuration
 from ocp_torch.runs.evaluate import settings_for
-from ocp_torch.runs.resume import read_configuration, result_of
+from ocp_torch.runs.resume import result_of
 from ocp_torch.training.checkpoint import load_checkpoint
 from support.strangers import make_run, seal, signed
 
@@ -231,7 +232,7 @@ def test_any_field_of_a_certificate_replaced_by_anything_is_shown_or_named(run, 
 @pytest.mark.nightly
 def test_any_entry_of_a_checkpoint_replaced_by_anything_is_refused_or_goes_on(run, tmp_path):
     from ocp_torch.cli.compose import composed
-    from ocp_torch.runs.start import prepare
+    from ocp_torch.runs.training_run import training_run
 
     chance, folder = random.Random(4), tmp_path / "run"
     shutil.copytree(run, folder)
@@ -242,4 +243,4 @@ def test_any_entry_of_a_checkpoint_replaced_by_anything_is_refused_or_goes_on(ru
         state = good()
         put(state, where, value)
         signed(folder / "checkpoints" / "last.pt", state)
-        tried(lambda path: prepare(composed("train", [f"resume={path}"])), folder)
+        tried(lambda path: training_run(composed("train", [f"resume={path}"])), folder)

@@ -17,8 +17,8 @@ from ocp_torch import load_controller
 from ocp_torch.cli.compose import composed
 from ocp_torch.errors import InputError
 from ocp_torch.files.storage import load_tensors, save_tensors
-from ocp_torch.runs.run import controller_of
-from ocp_torch.runs.start import prepare
+from ocp_torch.runs.finish import controller_of
+from ocp_torch.runs.training_run import training_run
 from ocp_torch.training.checkpoint import MAGIC, SCHEMA, load_checkpoint
 from support.forked import command
 from support.looks import certificate
@@ -63,7 +63,7 @@ def run(stranger, tmp_path):
 def refused(folder, *overrides: str) -> str:
     """The sentence with which going on from ``folder`` is refused."""
     with pytest.raises(InputError) as error:
-        prepare(composed("train", [f"resume={folder}", *overrides]))
+        training_run(composed("train", [f"resume={folder}", *overrides]))
     sentence = str(error.value)
     assert "\n" not in sentence
     return sentence
@@ -178,7 +178,7 @@ def test_weights_that_are_not_numbers_are_refused(run):
         assert "not finite" in refused(run)
         state[group][name] = kept
         signed(path, state)
-        assert prepare(composed("train", [f"resume={run}"])).trainer.step == 3
+        assert training_run(composed("train", [f"resume={run}"])).trainer.step == 3
 
 
 def test_a_small_storage_seen_as_a_huge_tensor_is_not_believed(run):
@@ -257,7 +257,7 @@ def test_paths_in_a_configuration_lead_nowhere(run, tmp_path):
     config = yaml.safe_load(file.read_text())
     config |= {"hydra": {"run": {"dir": str(tmp_path / "elsewhere")}}, "resume": "../../elsewhere"}
     file.write_text(yaml.safe_dump(config))
-    prepared = prepare(composed("train", [f"resume={run}"]))
+    prepared = training_run(composed("train", [f"resume={run}"]))
     assert prepared.trainer.step == 3
     assert not (tmp_path / "elsewhere").exists()
 

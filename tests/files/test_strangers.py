@@ -17,7 +17,8 @@ from safetensors.torch import save_file
 from ocp_torch import load_controller
 from ocp_torch.certificate import table
 from ocp_torch.cli.compose import composed
-from ocp_torch.cli.launch import Record, checked
+from ocp_torch.cli.outcome import Record
+from ocp_torch.cli.single import checked
 from ocp_torch.control.policies import CLOSED
 from ocp_torch.errors import InputError, visible
 from ocp_torch.files.arrays import read_npz
@@ -29,12 +30,13 @@ from ocp_torch.problems.simulator.target import resolved
 from ocp_torch.problems.systems.urdf import read_chain
 from ocp_torch.runs import figures
 from ocp_torch.runs.compare import compare
+from ocp_torch.runs.configuration import read_configuration, saved_configuration
 from ocp_torch.runs.evaluate import certify_saved, load_run, settings_for
+from ocp_torch.runs.interval import interval_figure
 from ocp_torch.runs.loading import load_policy
-from ocp_torch.runs.resume import read_configuration, saved_configuration
 from ocp_torch.runs.run import summary
-from ocp_torch.runs.start import prepare
-from ocp_torch.studies.reference.session import prepare as prepare_reference
+from ocp_torch.runs.training_run import training_run
+from ocp_torch.studies.reference.session import reference_job
 from ocp_torch.training.checkpoint import load_checkpoint
 from support.forked import command
 from support.guarded import guarded, refusal
@@ -59,7 +61,7 @@ def run(made, tmp_path):
 
 
 def going_on(run, *overrides: str):
-    return lambda: prepare(composed("train", [f"resume={run}", *overrides]))
+    return lambda: training_run(composed("train", [f"resume={run}", *overrides]))
 
 
 # A run folder that leads elsewhere
@@ -110,7 +112,7 @@ def test_a_run_folder_that_leads_elsewhere_is_not_written_into(how, name, run, t
     how(run, name, elsewhere)
     before = contents(elsewhere) if elsewhere.is_dir() else elsewhere.read_text()
     for arguments in ([f"resume={run}", "trainer.steps=9"], [f"hydra.run.dir={run}", *WAY]):
-        sentence = refusal(lambda arguments=arguments: checked(arguments, "train", prepare))
+        sentence = refusal(lambda arguments=arguments: checked(arguments, "train", training_run))
         assert name.split("/")[0] in sentence or "resume=" in sentence
     assert (contents(elsewhere) if elsewhere.is_dir() else elsewhere.read_text()) == before
 
@@ -130,16 +132,16 @@ def test_a_reference_is_not_drawn_through_a_link(run, tmp_path):
     (run / "figures").symlink_to(tmp_path / "mine")
     config = {"run": str(run), "problem": {}, "side": None, "memory": 1.0, "threads": 1, "save": None}
     for named in (run, run / "controller.safetensors"):
-        assert "link" in refusal(lambda named=named: prepare_reference({**config, "run": str(named)}))
+        assert "link" in refusal(lambda named=named: reference_job({**config, "run": str(named)}))
     (run / "figures").unlink()
-    assert prepare_reference(config).figure == run / "figures" / "reference.png"
+    assert reference_job(config).figure == run / "figures" / "reference.png"
 
 
 def test_links_of_the_users_own_are_no_matter(run, tmp_path):
     """The folder itself, and what a run does not write."""
     (run / "data").symlink_to(tmp_path)
     (tmp_path / "alias").symlink_to(run)
-    assert guarded(lambda: checked([f"resume={tmp_path / 'alias'}"], "train", prepare)) is None
+    assert guarded(lambda: checked([f"resume={tmp_path / 'alias'}"], "train", training_run)) is None
 
 
 # What is printed
@@ -166,7 +168,7 @@ def test_what_comes_from_a_file_steers_no_terminal(run, caplog):
 def test_a_name_in_a_figure_is_no_formula(run, tmp_path):
     certificate = json.loads((run / "certificate.json").read_text())
     for name in ("$\\nothing{", "$x$", ESCAPE, "x" * 10**5):
-        figure = figures.interval({**certificate, "problem": name})
+        figure = interval_figure({**certificate, "problem": name})
         figures.save({"certificate": figure}, tmp_path)
         assert figure.axes[0].get_title().startswith(visible(name)[:20])
     (tmp_path / "runs" / "$\\bad{").mkdir(parents=True)
@@ -629,7 +631,7 @@ def test_text_for_a_graph_is_no_larger_than_the_graph(tmp_path):
 READERS = {
     "controller": ("controller.safetensors", load_controller),
     "checkpoint": ("last.pt", load_checkpoint),
-    "resume": ("last.pt", lambda p: prepare(composed("train", [f"resume={p}"]))),
+    "resume": ("last.pt", lambda p: training_run(composed("train", [f"resume={p}"]))),
     "configuration": ("config.yaml", read_configuration),
     "certificate": ("certificate.json", read_json),
     "samples": ("data.npz", read),

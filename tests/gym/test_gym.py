@@ -270,7 +270,7 @@ def test_the_pendulum_is_gymnasiums_over_a_short_time(theirs):
 
 def test_a_saved_pendulum_controller_plays_gymnasiums_untouched(gymnasium, tmp_path):
     """The classical swing-up through the same maps: what does not swing up returns about -1200."""
-    from ocp_torch.runs.practice import classical_policy
+    from ocp_torch.runs.metrics import classical_policy
 
     pendulum = PROBLEMS["pendulum"](torque_cost=0.001, control_limit=1.0)
     policy = classical_policy(pendulum)

@@ -11,7 +11,7 @@ from torch import nn
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.maths.sampling import scrambled_sobol
-from ocp_torch.objectives import primal, saddle
+from ocp_torch.objectives import Phase, primal, saddle
 from ocp_torch.objectives.saddle import AugmentedSaddle, Saddle
 from ocp_torch.problems import Manufactured
 from ocp_torch.problems.constants import resolve_constants
@@ -55,24 +55,26 @@ def exact_fields(problem, **bumps) -> Fields:
 @pytest.mark.parametrize("problem", SMOOTH.values(), ids=SMOOTH.keys())
 @pytest.mark.parametrize("coupling", [0.0, 1.0])
 def test_no_player_gains_by_leaving_the_truth(problem, coupling):
-    objective = saddle(problem, resolve_constants(problem), augmentation=0.5, coupling=coupling, warm_start=0.0)
+    objective = saddle(problem, augmentation=0.5, coupling=coupling, warm_start=0.0)
+    phase = Phase(resolve_constants(problem))
     samples = Samples.of(problem, scrambled_sobol(2**13, problem.dim, 3, torch.float64))
-    at_truth = {k: float(v) for k, v in objective.losses(exact_fields(problem), samples).items()}
+    at_truth = {k: float(v) for k, v in objective.losses(exact_fields(problem), samples, phase).items()}
     for seed in range(6):
         for size in (0.003, 0.1):
             bump = partial(rough, problem.dim, seed, size)
-            away = objective.losses(exact_fields(problem, value=bump(None, 0)), samples)
+            away = objective.losses(exact_fields(problem, value=bump(None, 0)), samples, phase)
             assert float(away["value"]) > at_truth["value"] - 1e-5
             moved = exact_fields(problem, control_density=bump(problem.control_dim, 10), log_occupation=bump(None, 20))
-            assert float(objective.losses(moved, samples)["density"]) > at_truth["density"] - 1e-5
+            assert float(objective.losses(moved, samples, phase)["density"]) > at_truth["density"] - 1e-5
 
 
 @pytest.mark.parametrize("problem", SMOOTH.values(), ids=SMOOTH.keys())
 def test_the_losses_at_the_truth_are_the_optimum(problem):
-    objective = saddle(problem, resolve_constants(problem), augmentation=0.5, coupling=1.0, residual=7.0)
+    objective = saddle(problem, augmentation=0.5, coupling=1.0, residual=7.0)
+    phase = Phase(resolve_constants(problem))
     # The Lagrangian is 0 for either player there: what the other one pays is left out of its loss.
     samples = Samples.of(problem, scrambled_sobol(2**14, problem.dim, 3, torch.float64))
-    losses = objective.losses(exact_fields(problem), samples)
+    losses = objective.losses(exact_fields(problem), samples, phase)
     assert float(losses["value"]) == pytest.approx(-0.5 * problem.exact_optimum, rel=1e-4)
     assert float(losses["density"]) == pytest.approx(0.5 * problem.exact_optimum, rel=1e-4)
 
@@ -80,35 +82,35 @@ def test_the_losses_at_the_truth_are_the_optimum(problem):
 def test_a_value_that_is_no_subsolution_leaves_the_density_player_bounded():
     """Against `V` above `f` the plain Lagrangian falls without end as `mu` grows; the clipped one must not."""
     problem = Manufactured(dim=2)
-    objective = saddle(problem, resolve_constants(problem), warm_start=0.0)
+    objective = saddle(problem, warm_start=0.0)
+    phase = Phase(resolve_constants(problem))
     samples = Samples.of(problem, scrambled_sobol(1024, 2, 3, torch.float64))
     high = lambda x: torch.full_like(x[:, 0], 50.0)
     losses = []
     for c in (0.0, 3.0, 6.0):
         fields = exact_fields(problem, value=high, log_occupation=lambda x, c=c: c + 0 * x[:, 0])
-        losses.append(float(objective.losses(fields, samples)["density"]))
+        losses.append(float(objective.losses(fields, samples, phase)["density"]))
     assert losses[0] < losses[1] < losses[2]
 
 
 def test_the_density_player_rests_during_the_warm_start_and_asks_for_no_divergences():
     problem = Manufactured(dim=1)
-    objective = saddle(problem, resolve_constants(problem), warm_start=0.5)
-    objective.progress = 0.49
-    assert not objective.needs_divergences
+    objective = saddle(problem, warm_start=0.5)
+    before, after = (Phase(resolve_constants(problem), progress) for progress in (0.49, 0.5))
+    assert not objective.needs_divergences(before)
     samples = Samples.of(problem, scrambled_sobol(64, 1, 3, torch.float64), divergences=False)
-    assert set(objective.losses(exact_fields(problem), samples)) == {"value"}
-    objective.progress = 0.5
-    assert objective.needs_divergences
+    assert set(objective.losses(exact_fields(problem), samples, before)) == {"value"}
+    assert objective.needs_divergences(after)
 
 
 def test_the_density_player_works_on_states_that_carry_weight_and_on_so_many_at_most():
     problem = Manufactured(dim=2)
     drawn, visited = (Samples.of(problem, scrambled_sobol(n, 2, n, torch.float64)) for n in (96, 32))
     both = [replace(drawn, weight=4 / 3 * drawn.weight), replace(visited, weight=torch.zeros_like(visited.weight))]
-    batch = Samples.concatenate([replace(s, attention=torch.ones_like(s.f)) for s in both])
+    batch = Samples.concatenate([replace(s, penalty_weight=torch.ones_like(s.f)) for s in both])
     fields = exact_fields(problem, value=lambda x: 0.1 * torch.sin(2 * math.pi * x[:, 0]))
-    loss = lambda samples, most: saddle(problem, resolve_constants(problem), warm_start=0.0, density_batch=most).losses(
-        fields, samples
+    loss = lambda samples, most: saddle(problem, warm_start=0.0, density_batch=most).losses(
+        fields, samples, Phase(resolve_constants(problem))
     )["density"]
     torch.testing.assert_close(loss(batch, None), loss(drawn, None))
     torch.testing.assert_close(loss(batch, 40), loss(drawn.take(slice(40)), None))
@@ -140,9 +142,8 @@ class WithoutDivergences(Manufactured):
 
 def test_without_divergences_each_method_falls_back_to_what_needs_none_and_says_so():
     problem = WithoutDivergences(dim=2)
-    constants = resolve_constants(problem)
-    for objective in (saddle(problem, constants), primal(problem, constants)):
+    for objective in (saddle(problem), primal(problem)):
         assert isinstance(objective, Saddle)
-        assert not objective.needs_divergences
+        assert not objective.needs_divergences(Phase(resolve_constants(problem)))
         assert "no divergences" in objective.notes[0]
-    assert isinstance(saddle(Manufactured(dim=2), constants), AugmentedSaddle)
+    assert isinstance(saddle(Manufactured(dim=2)), AugmentedSaddle)

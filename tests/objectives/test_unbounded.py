@@ -8,7 +8,7 @@ import pytest
 
 from ocp_torch.fields import VALUE, Fields, PeriodicMLP
 from ocp_torch.maths.jets import jet
-from ocp_torch.objectives import Dual
+from ocp_torch.objectives import Dual, Phase
 from ocp_torch.problems import Arm, Circle, Torus
 from ocp_torch.problems.constants import OCCUPATION_WEIGHT, resolve_constants
 from ocp_torch.problems.generator import Generator
@@ -37,10 +37,10 @@ def test_the_weight_of_the_slack_grows_along_a_round():
     violation, started = float(slack.clamp_min(0.0).mean()), float((V.value * samples.mu0).mean())
     weights = {}
     for unbounded in (True, False):
-        objective = Dual(problem, replace(constants, unbounded=unbounded), residual=0.0)
+        objective = Dual(problem, residual=0.0)
         for progress in (0.0, 0.35, 0.7, 1.0):
-            objective.progress = progress
-            loss = float(objective.losses(fields, samples)["value"])
+            phase = Phase(replace(constants, unbounded=unbounded), progress)
+            loss = float(objective.losses(fields, samples, phase)["value"])
             weights[unbounded, progress] = (loss + started) / violation
     M = constants.M
     for progress, expected in ((0.0, M / 20.0), (0.35, M / math.sqrt(20.0)), (0.7, M), (1.0, M)):
@@ -49,14 +49,16 @@ def test_the_weight_of_the_slack_grows_along_a_round():
 
 
 def test_default_sizes_follow():
-    defaults = lambda problem: fill({"model": {}, "trainer": {}, "optimizer": {}, "certificate": {}}, problem)
+    defaults = lambda problem: fill(
+        {"model": {"name": "mlp"}, "trainer": {}, "optimizer": {}, "certificate": {}}, problem
+    )
     bounded, unbounded = defaults(Torus(2)), defaults(Arm())
     assert unbounded["trainer"]["batch"] > bounded["trainer"]["batch"]
     assert unbounded["model"]["waves"] > bounded["model"]["waves"]
 
 
 def test_the_larger_batch_is_not_for_the_density_player_unless_the_user_chose_it():
-    config = {"model": {}, "optimizer": {}, "certificate": {}, "method": {"name": "pd"}}
+    config = {"model": {"name": "mlp"}, "optimizer": {}, "certificate": {}, "method": {"name": "pd"}}
     given = lambda problem, trainer: fill({**config, "trainer": trainer}, problem)["method"].get("density_batch")
     assert given(Arm(), {}) == DENSITY_BATCH
     assert given(Arm(), {"batch": 4096}) is None

@@ -16,7 +16,7 @@ from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.policies import CLOSED, NETWORK, occupation_density
 from ocp_torch.fields import Fields
 from ocp_torch.maths.jets import jet
-from ocp_torch.objectives import Dual, primal, saddle
+from ocp_torch.objectives import Dual, Phase, primal, saddle
 from ocp_torch.objectives.primal import ClosedPrimal, NetworkPrimal
 from ocp_torch.problems import Problem
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -37,9 +37,9 @@ def bounds_of(name: str) -> Constants:
     return resolve_constants(zoo.build(name))
 
 
-def paper_dual(problem: Problem, constants: Constants) -> Dual:
+def paper_dual(problem: Problem) -> Dual:
     """`F_M` alone, without what training may add to it."""
-    return Dual(problem, constants, residual=0.0)
+    return Dual(problem, residual=0.0)
 
 
 # Far from the truth and close to it: `size` is that of the network, `near` says whether it is added to the exact answer.
@@ -60,8 +60,8 @@ def random_value(name: str, seed: int, size: float, near: bool):
 @given(**case)
 def test_no_value_function_gives_a_penalised_bound_above_the_optimum(name, seed, size, near):
     problem, fields = zoo.build(name), SimpleNamespace(value=random_value(name, seed, size, near))
-    dual = paper_dual(problem, replace(bounds_of(name), M=problem.occupation_bound))
-    F_M = Estimate.of([-float(dual.losses(fields, samples)["value"]) for samples in sets_of(name)])
+    dual, phase = paper_dual(problem), Phase(replace(bounds_of(name), M=problem.occupation_bound))
+    F_M = Estimate.of([-float(dual.losses(fields, samples, phase)["value"]) for samples in sets_of(name)])
     assert F_M.value <= problem.exact_optimum + ERRORS * F_M.se + 1e-9
 
 
@@ -123,17 +123,20 @@ def test_the_lagrangian_bound_at_the_exact_truth_is_the_optimum(problem):
 def test_losses_are_the_numbers_of_the_certificate(name, seed, size):
     problem, sets = zoo.build(name), sets_of(name)[:2]
     fields, constants = random_fields(problem, seed, size), bounds_of(name)
-    mean = lambda objective, player: Estimate.of([float(objective.losses(fields, s)[player]) for s in sets]).value
+    phase = Phase(constants)
+    mean = lambda objective, player: (
+        Estimate.of([float(objective.losses(fields, s, phase)[player]) for s in sets]).value
+    )
     # One set at a time: with several the certificate takes off what plane waves explain of their noise.
     alone = [lower_side(problem, fields.value, [s], constants.M, ascents=1).F_M.value for s in sets]
     F_M = Estimate.of(alone).value
-    assert mean(paper_dual(problem, constants), "value") == pytest.approx(-F_M, rel=1e-9, abs=1e-9)
+    assert mean(paper_dual(problem), "value") == pytest.approx(-F_M, rel=1e-9, abs=1e-9)
     J, G, *_ = upper_side(
         problem, fields.control_density, occupation_density(NETWORK, problem, fields, constants), sets, constants.C_V
     )
-    assert mean(NetworkPrimal(problem, constants), "density") == pytest.approx(J.value, rel=1e-9)
+    assert mean(NetworkPrimal(problem), "density") == pytest.approx(J.value, rel=1e-9)
     if problem.driftless:
-        assert mean(ClosedPrimal(problem, constants), "density") == pytest.approx(G.value, rel=1e-9)
+        assert mean(ClosedPrimal(problem), "density") == pytest.approx(G.value, rel=1e-9)
         closed = occupation_density(CLOSED, problem, fields, constants)
         attained, least, *_ = upper_side(problem, fields.control_density, closed, sets, constants.C_V)
         assert attained.value == pytest.approx(least.value, rel=1e-9)
@@ -141,7 +144,7 @@ def test_losses_are_the_numbers_of_the_certificate(name, seed, size):
 
 def test_the_primal_takes_the_closed_form_exactly_where_there_is_no_drift():
     for name, kind in (("torus 2-d chain", ClosedPrimal), ("manufactured 2-d q=2", NetworkPrimal)):
-        assert type(primal(zoo.build(name), bounds_of(name))) is kind
+        assert type(primal(zoo.build(name))) is kind
 
 
 @settings(max_examples=40)
@@ -161,15 +164,15 @@ def test_the_saddle_is_never_below_the_dual_and_meets_it_at_the_best_response(na
     class BestResponse(torch.nn.Module):
         forward = staticmethod(best_response)
 
-    paper_saddle = saddle(problem, constants, augmentation=0.0)
+    paper_saddle, phase = saddle(problem, augmentation=0.0), Phase(constants)
     best = Fields({"value": fields.value, "control_density": BestResponse()})
     for samples in sets[:2]:
-        dual = -float(paper_dual(problem, constants).losses(fields, samples)["value"])
-        losses = paper_saddle.losses(fields, samples)
+        dual = -float(paper_dual(problem).losses(fields, samples, phase)["value"])
+        losses = paper_saddle.losses(fields, samples, phase)
         rounding = 1e-9 * (1.0 + abs(dual))
         assert float(losses["density"]) >= dual - rounding
         assert float(losses["value"]) == -float(losses["density"])
-        assert float(paper_saddle.losses(best, samples)["density"]) == pytest.approx(dual, abs=rounding)
+        assert float(paper_saddle.losses(best, samples, phase)["density"]) == pytest.approx(dual, abs=rounding)
 
 
 @zoo.on(zoo.FEW)
@@ -178,8 +181,8 @@ def test_a_constant_is_worth_its_size_until_every_state_is_penalised(problem):
     samples = Samples.of(problem, zoo.states(problem, 2048))
     network, M = random_fields(problem, seed=1).value, problem.occupation_bound
     slack, mass = slack_function(problem, network)(samples.x), float(samples.mu0.mean())
-    dual = paper_dual(problem, replace(resolve_constants(problem), M=M))
-    F_M = lambda c: -float(dual.losses(SimpleNamespace(value=lambda x: network(x) + c), samples)["value"])
+    dual, phase = paper_dual(problem), Phase(replace(resolve_constants(problem), M=M))
+    F_M = lambda c: -float(dual.losses(SimpleNamespace(value=lambda x: network(x) + c), samples, phase)["value"])
     free, penalised = -float(slack.max()), -float(slack.min())
     assert F_M(free) - F_M(free - 1.0) == pytest.approx(mass, abs=1e-9)
     assert F_M(penalised + 1.0) - F_M(penalised) == pytest.approx(mass - M, abs=1e-9)

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ocp_torch.cli.launch import again
+from ocp_torch.cli.job import Job
 from ocp_torch.control.controller import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.maths.jets import jet
@@ -18,7 +18,6 @@ from ocp_torch.objectives import primal, saddle
 from ocp_torch.objectives.saddle import Saddle
 from ocp_torch.problems import Simulator
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.resume import OWN_TARGETS
 from support import zoo
@@ -242,8 +241,7 @@ def test_worker_processes_give_the_same_numbers(module, name):
 
 def test_methods_fall_back_without_divergences():
     _, bare = wrapped("swing")
-    constants = resolve_constants(bare)
-    assert type(saddle(bare, constants)) is type(primal(bare, constants)) is Saddle
+    assert type(saddle(bare)) is type(primal(bare)) is Saddle
 
 
 @pytest.mark.nightly
@@ -267,7 +265,7 @@ def test_a_run_on_a_simulator_leaves_bounds_and_a_controller_that_needs_the_simu
 def test_no_file_can_have_a_function_imported():
     assert not any("callable" in target.lower() for target in OWN_TARGETS)
     overrides = SimpleNamespace(task=["problem=callable", "problem.target=a:b", "problem.dim=3", "seed=1"])
-    hydra = SimpleNamespace(overrides=overrides)
-    command = again(hydra, "runs/here", sweeping=False)
+    hydra = SimpleNamespace(overrides=overrides, mode=None)
+    command = Job(hydra, "runs/here").again()
     assert "problem=callable problem.target=a:b problem.dim=3" in command
     assert "seed" not in command

@@ -21,6 +21,7 @@ from ocp_torch.control.controller import load_controller
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, admissible_density, occupation_density, trained_policies
 from ocp_torch.errors import InputError
 from ocp_torch.maths import jets
+from ocp_torch.objectives import Phase
 from ocp_torch.objectives.primal import ClosedPrimal, NetworkPrimal
 from ocp_torch.objectives.saddle import Saddle
 from ocp_torch.problems import Circle, Manufactured, Torus
@@ -31,7 +32,7 @@ from ocp_torch.problems.control_limit import LimitedCost
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.external import certify
-from ocp_torch.runs.run import controller_of
+from ocp_torch.runs.finish import controller_of
 from ocp_torch.studies.kernel.rules import DualRule
 from ocp_torch.studies.reference import solve_reference
 from support import zoo
@@ -241,13 +242,14 @@ def test_random_networks_obey_weak_duality_and_the_limit(name, seed, size):
     J, *_ = upper_side(problem, admissible_density(*form), occupation_density(*form), sets, constants.C_V)
     assert math.isfinite(J.value)
     assert J.value >= problem.exact_optimum - ERRORS * J.se - 1e-9
-    losses = [NetworkPrimal(problem, constants).losses(fields, s)["density"].item() for s in sets]
+    phase = Phase(constants)
+    losses = [NetworkPrimal(problem).losses(fields, s, phase)["density"].item() for s in sets]
     assert Estimate.of(losses).value == pytest.approx(J.value, rel=1e-9)
     x = zoo.states(problem, 200, seed=seed)
     for kind in (NETWORK, SADDLE):
         for policy in trained_policies(kind, problem, fields, constants).values():
             assert float(policy(x).norm(dim=-1).max()) <= problem.control_limit * (1.0 + 1e-9)
-    assert all(torch.isfinite(loss) for loss in Saddle(problem, constants).losses(fields, sets[0]).values())
+    assert all(torch.isfinite(loss) for loss in Saddle(problem).losses(fields, sets[0], phase).values())
 
 
 @settings(max_examples=10)
@@ -259,11 +261,12 @@ def test_without_drift_the_closed_occupation_carries_any_flux(seed, size, limit)
     form = (CLOSED, problem, fields, constants)
     J, G, *_ = upper_side(problem, admissible_density(*form), occupation_density(*form), sets, constants.C_V)
     assert J.value == pytest.approx(G.value, rel=1e-9)
-    mean = Estimate.of([float(ClosedPrimal(problem, constants).losses(fields, s)["density"]) for s in sets]).value
+    phase = Phase(constants)
+    mean = Estimate.of([float(ClosedPrimal(problem).losses(fields, s, phase)["density"]) for s in sets]).value
     assert mean == pytest.approx(G.value, rel=1e-9)
     # A tighter limit costs more, never less.
     free = Torus(seed=1)
-    unlimited = [float(ClosedPrimal(free, constants).losses(fields, s)["density"]) for s in sets]
+    unlimited = [float(ClosedPrimal(free).losses(fields, s, phase)["density"]) for s in sets]
     assert mean >= Estimate.of(unlimited).value - 1e-12
 
 

@@ -29,7 +29,7 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.evaluate import certify_saved, load_run
 from ocp_torch.runs.external import certify as certify_given
-from ocp_torch.runs.record import prepare
+from ocp_torch.runs.record import recorder
 from ocp_torch.training.checkpoint import load_checkpoint
 from ocp_torch.training.monitor import Silent
 from support import zoo
@@ -313,9 +313,8 @@ def test_nothing_is_claimed_that_samples_do_not_give(tmp_path):
         bare.control_matrix(torch.rand(2, 2))
     with pytest.raises(InputError, match="recorded states only"):
         bare.state_cost(torch.rand(2, 2))
-    constants = resolve_constants(bare)
-    assert {type(Dual(bare, constants)).__name__, type(saddle(bare, constants)).__name__} == {"Dual", "Saddle"}
-    assert type(primal(bare, constants)).__name__ == "Saddle"
+    assert {type(Dual(bare)).__name__, type(saddle(bare)).__name__} == {"Dual", "Saddle"}
+    assert type(primal(bare)).__name__ == "Saddle"
     certificate = certificate_of(bare, problem, 0, steps=3)
     assert certificate.upper["J"] is certificate.subject is None
     assert any("B varies" in w for w in certificate.warnings)
@@ -332,9 +331,9 @@ def test_a_torus_recorded_without_divergences_has_them_all_the_same(tmp_path):
     data = Dataset(str(record(tmp_path, zoo.build("torus 2-d chain"), 400, divergences=False)))
     assert data.driftless
     assert data.gives_divergences
-    assert primal(data, resolve_constants(data)).occupation == NETWORK
+    assert primal(data).occupation == NETWORK
     with pytest.raises(InputError, match=r"method\.occupation"):
-        primal(data, resolve_constants(data), occupation="closed")
+        primal(data, occupation="closed")
 
 
 @pytest.mark.parametrize(("discount", "bounded"), [(4.0, True), (0.5, False)])
@@ -420,10 +419,10 @@ def test_recording_is_checked_before_anything_is_written(tmp_path):
     good |= {"seed": 0, "divergences": True, "contrast": 0.0}
     for field, value in (("out", "a.csv"), ("samples", 3), ("contrast", 1.0), ("seed", -1), ("divergences", 1)):
         with pytest.raises(InputError, match=field):
-            prepare({**good, field: value})
-    path = prepare(good).run()
+            recorder({**good, field: value})
+    path = recorder(good).run()
     with pytest.raises(InputError, match="data set already"):
-        prepare({**good, "problem": {"_target_": "ocp_torch.problems.Dataset", "path": str(path)}})
+        recorder({**good, "problem": {"_target_": "ocp_torch.problems.Dataset", "path": str(path)}})
 
 
 @pytest.mark.nightly

@@ -7,8 +7,8 @@ from PIL import Image
 
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Arm, RobotArm
+from ocp_torch.runs.metrics import classical_policy, metrics
 from ocp_torch.runs.pictures import motion
-from ocp_torch.runs.practice import classical_policy, metrics
 
 IDENTITY = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 

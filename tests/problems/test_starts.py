@@ -19,7 +19,7 @@ from ocp_torch.problems import Problem, Simulator
 from ocp_torch.problems.constants import OCCUPATION_WEIGHT, resolve_constants
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.starts import drawn_starts, initial_points, start_distribution
-from ocp_torch.runs.practice.metrics import random_starts
+from ocp_torch.runs.metrics.trial import random_starts
 from support import zoo
 from support.adversarial import TURN, NarrowStart, gaussian, short_way
 

@@ -103,8 +103,7 @@ def killed_in(name: str):
     """In the child: no further than the middle of this step of the end."""
 
     def before():
-        from ocp_torch.runs import figures
-        from ocp_torch.runs import run as session
+        from ocp_torch.runs import completion, figures, finish, run
         from ocp_torch.training import monitor
 
         def die(*_, **__):
@@ -123,9 +122,9 @@ def killed_in(name: str):
         where, what, how = {
             "figures": (figures, "save", half_a_figure),
             "points": (monitor, "record", half_the_points),
-            "metrics": (session, "write_metrics", die),
-            "the last of it": (session.closing, "complete", die),
-            "the controller": (session, "controller_of", die),
+            "metrics": (run, "write_metrics", die),
+            "the last of it": (completion, "complete", die),
+            "the controller": (finish, "controller_of", die),
         }[name]
         setattr(where, what, how)
 

@@ -9,9 +9,10 @@ from PIL import Image
 from ocp_torch.control.policies import zero_policy
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Arm, Circle, Unicycle
+from ocp_torch.runs.metrics import classical_policy, metrics, metrics_table, simulate
+from ocp_torch.runs.metrics.measures import admissible, measure
+from ocp_torch.runs.metrics.trial import random_starts
 from ocp_torch.runs.pictures import animate, motion
-from ocp_torch.runs.practice import classical_policy, metrics, metrics_table, simulate
-from ocp_torch.runs.practice.metrics import admissible, measure, random_starts
 from support import zoo
 
 # Whether the number should be larger than with no control.

@@ -13,11 +13,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ocp_torch.cli.compose import composed
 from ocp_torch.errors import InputError
 from ocp_torch.runs.build import build_trainer
-from ocp_torch.runs.resume import find_run, saved_configuration
-from ocp_torch.runs.start import prepare
-from ocp_torch.runs.start import train as start
-from ocp_torch.training import trainer as trainer_module
+from ocp_torch.runs.configuration import saved_configuration
+from ocp_torch.runs.resume import find_run
+from ocp_torch.runs.run import train as start
+from ocp_torch.runs.training_run import training_run
 from ocp_torch.training.checkpoint import load_checkpoint, save_checkpoint
+from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.monitor import Silent
 from support.bits import differences
 from support.forked import TINY, completed, finished_run, train
@@ -67,7 +68,7 @@ def test_from_any_step_a_resumed_run_reaches_the_same_bits(way, tmp_path):
 
 
 def test_the_looks_so_far_are_part_of_the_state(monkeypatch, tmp_path):
-    monkeypatch.setattr(trainer_module.Trainer, "look", quick(lambda t: abs(t.step - 10.0) / 100.0))
+    monkeypatch.setattr(Evaluator, "evaluate", quick(lambda t: abs(t.step - 10.0) / 100.0))
     way = ("method=dual", "trainer.evaluate_every=4")
     whole = small(*way)
     whole.fit(Recorder(tmp_path, 6, 13), tmp_path / "run" / "last.pt")
@@ -102,7 +103,7 @@ def test_with_other_steps_a_run_is_one_of_the_new_length(method, schedule, tmp_p
     """Learning rates and the warm start are, at every step, those of a run that had that length from the start."""
     way = (f"method={method}", f"schedule={schedule}", *(["schedule.every=3"] if schedule == "decay" else []))
     rates = lambda seen: type("Rates", (Silent,), {"stepped": lambda _, t, r, log: seen.__setitem__(t.step, told(t))})()
-    told = lambda t: (t.stepper.learning_rates(), t.objective.needs_divergences)
+    told = lambda t: (t.stepper.learning_rates(), t.objective.needs_divergences(t.phase))
     made = maker(*way)
     made(steps=10).fit(Recorder(tmp_path, 8, 10))
     wanted = {steps: {} for steps in (24, 9, 6)}
@@ -122,12 +123,12 @@ def test_with_other_steps_a_run_is_one_of_the_new_length(method, schedule, tmp_p
 def test_the_round_follows_the_new_length(tmp_path):
     made = maker("method=dual")
     trainer = made(rounds=2, steps=4)
-    trainer.round, trainer.step = 1, 10
+    trainer.state.round, trainer.state.step = 1, 10
     save_checkpoint(tmp_path / "a.pt", trainer.state_dict())
     for steps, rounds, wanted in ((4, 2, 1), (5, 2, 1), (20, 2, 0), (3, 3, 2), (2, 1, 0)):
         other = made(rounds=rounds, steps=steps)
         other.resume(tmp_path / "a.pt")
-        assert other.round == wanted
+        assert other.state.round == wanted
 
 
 def test_an_optimisers_settings_can_change_at_a_resume_and_its_moments_stay(tmp_path):
@@ -152,7 +153,7 @@ def finished(tmp_path_factory):
 def resuming(folder, *overrides: str):
     """What `prepare` makes of a resume of ``folder``, or the sentence it is refused with."""
     try:
-        return prepare(composed("train", [f"resume={folder}", *overrides])).trainer
+        return training_run(composed("train", [f"resume={folder}", *overrides])).trainer
     except InputError as error:
         return str(error)
 
@@ -186,16 +187,18 @@ def test_sizes_by_dimension_are_those_the_run_began_with(tmp_path, monkeypatch):
     """Defaults may change between two versions; a run does not."""
     import dataclasses
 
+    from ocp_torch.fields import mlp
     from ocp_torch.training import budgets
 
     rest = [o for o in TINY if not o.startswith(("model.width", "trainer.batch"))]
     config = composed("train", [*rest, "trainer.steps=2"])
-    run = prepare(config)
+    run = training_run(config)
     run.trainer.fit(Silent(), tmp_path / "run" / "checkpoints" / "last.pt")
     (tmp_path / "run" / ".hydra").mkdir()
     (tmp_path / "run" / ".hydra" / "config.yaml").write_text(yaml.safe_dump(config))
-    others = tuple(dataclasses.replace(b, width=b.width + 8, batch=2 * b.batch) for b in budgets.BUDGETS)
+    others = tuple(dataclasses.replace(b, batch=2 * b.batch) for b in budgets.BUDGETS)
     monkeypatch.setattr(budgets, "BUDGETS", others)
+    monkeypatch.setattr(mlp, "SIZES", {dim: {**sizes, "width": sizes["width"] + 8} for dim, sizes in mlp.SIZES.items()})
     trainer = resuming(tmp_path / "run")
     assert trainer.config == run.trainer.config
 
@@ -230,7 +233,7 @@ def test_auto_finds_the_last_run_of_this_configuration_or_starts_it(finished, tm
     again = train(*way, cwd=tmp_path)
     assert "going on from step 5" in again.stdout
     assert [p.name for p in (tmp_path / "runs").iterdir()] == ["mine"]
-    other = prepare(composed("train", [*way[:-2], "resume=auto", "trainer.batch=17"], roots=(folder,)))
+    other = training_run(composed("train", [*way[:-2], "resume=auto", "trainer.batch=17"], roots=(folder,)))
     assert other.trainer.step == 0
 
 
@@ -249,7 +252,7 @@ def test_a_start_killed_while_its_configuration_was_written_is_no_obstacle(tmp_p
     for file, size in ((first, len(text) // 2), (second, len(text))):
         file.parent.mkdir(parents=True)
         file.write_text(text[:size])
-    start(dict(config), folder)
+    start(training_run(dict(config)), folder)
     assert saved_configuration(folder) == config
     third.parent.mkdir()
     asked = yaml.safe_dump({**config, "resume": str(folder)}, sort_keys=False)

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from ocp_torch.cli import compose as composition
-from ocp_torch.runs.resume import read_configuration, saved_configuration
+from ocp_torch.runs.configuration import read_configuration, saved_configuration
 from ocp_torch.training.checkpoint import load_checkpoint
 from support.forked import TINY, completed, finished_run, train
 

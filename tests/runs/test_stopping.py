@@ -12,10 +12,12 @@ from ocp_torch.objectives import Objective
 from ocp_torch.problems import Circle
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
-from ocp_torch.runs.run import run_session
+from ocp_torch.runs.run import run_to_end
 from ocp_torch.steppers import NonFiniteError
+from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.health import Evaluation, Health, best_constant
 from ocp_torch.training.monitor import Silent
+from ocp_torch.training.stopping import postpone
 from ocp_torch.training.trainer import Trainer
 from support.looks import LOWER, certificate, quick
 from support.small import small
@@ -28,14 +30,14 @@ WAY = ("method=dual", "trainer.evaluate_every=4", "trainer.figures=false")
 def run(trainer, folder, monkeypatch, gap, certified=lambda trainer: None, **rest):
     """A session whose looks have ``gap`` and whose certificates ``certified``; what was certified, and the certificate."""
     tried = []
-    monkeypatch.setattr(Trainer, "look", quick(gap, **rest))
+    monkeypatch.setattr(Evaluator, "evaluate", quick(gap, **rest))
 
     def certify(trainer, settings, fields=None, run=None):
         tried.append((trainer.step, {n: t.clone() for n, t in fields.state_dict().items()}))
         return certificate(trainer.run, gap(trainer), certified(trainer), **rest)
 
     monkeypatch.setattr(Trainer, "certify", certify)
-    return tried, run_session(trainer, build_certificate_settings(trainer.config), folder)
+    return tried, run_to_end(trainer, build_certificate_settings(trainer.config), folder)
 
 
 def test_a_target_gap_stops_the_run_once_a_certificate_has_it(tmp_path, monkeypatch):
@@ -55,7 +57,7 @@ def test_a_certificate_that_never_reaches_the_target_is_tried_ever_more_rarely(t
 
 
 def test_a_run_killed_while_a_certificate_is_tried_tries_it_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(Trainer, "look", quick(lambda t: 0.01))
+    monkeypatch.setattr(Evaluator, "evaluate", quick(lambda t: 0.01))
     way = (*WAY, "trainer.target_gap=0.02", "trainer.steps=40")
     first = small(*way)
     assert first.fit(Silent(), tmp_path / "last.pt") == "target_gap"
@@ -63,7 +65,7 @@ def test_a_run_killed_while_a_certificate_is_tried_tries_it_again(tmp_path, monk
     second.resume(tmp_path / "last.pt")
     assert second.fit(Silent()) == "target_gap"
     assert second.step == first.step == 4
-    second.go_on()
+    postpone(second.state)
     assert second.fit(Silent()) == "target_gap"
     assert second.step == 8
 
@@ -139,12 +141,13 @@ def test_fields_that_became_worse_are_not_handed_out(tmp_path, monkeypatch):
 def test_where_averages_are_certified_spikes_in_a_look_decide_nothing(monkeypatch, problem, last, handed):
     """The last look is bad; averaged, it is as good as the best one, or it is not; without averages it counts as it is."""
     trainer = small(f"problem={problem}", *WAY)
-    trainer.step = 20
-    trainer.health.looked(Evaluation(4, 0.1, 1.0, 0.0), trainer.averaged_fields)
+    trainer.state.step = 20
+    trainer.health.evaluated(Evaluation(4, 0.1, 1.0, 0.0), trainer.averaged_fields)
     with_gap = lambda gap: certificate(trainer.run, gap)
-    monkeypatch.setattr(trainer, "look", lambda: with_gap(0.5))
-    monkeypatch.setattr(trainer, "_quick", lambda settings, fields=None: with_gap(last if fields is None else 0.1))
-    fields, sentence = trainer.choose()
+    quick = lambda run, settings, fields=None: with_gap(last if fields is None else 0.1)
+    monkeypatch.setattr(trainer.evaluator, "evaluate", lambda run: with_gap(0.5))
+    monkeypatch.setattr(trainer.evaluator, "quick", quick)
+    fields, sentence = trainer.evaluator.choose(trainer.run)
     assert (fields is not trainer.averaged_fields) == handed
     assert (sentence is not None) == handed
 
@@ -201,10 +204,10 @@ def test_a_run_that_diverges_hands_out_its_best_look_and_still_fails(tmp_path, m
     trainer = small(*WAY)
     step = trainer.stepper.step
 
-    def failing(draw, visit):
+    def failing(batches, phase):
         if trainer.step == 10:
             raise NonFiniteError("the loss of player 'value' is not finite at x = [0.5].")
-        return step(draw, visit)
+        return step(batches, phase)
 
     trainer.stepper.step = failing
     with pytest.raises(InputError, match=r"Training stopped at step 10, before the update: .*best look before"):
@@ -244,7 +247,7 @@ class Steep(Objective):
     def __init__(self):
         """No problem, no bounds."""
 
-    def losses(self, fields, samples: Samples):
+    def losses(self, fields, samples: Samples, phase):
         value = fields.value(samples.x)
         far = samples.x[:, 0] > 0.9
         return {"value": value[~far].sum() + (value - value.detach())[far].sqrt().sum()}
@@ -255,7 +258,7 @@ def test_a_gradient_that_is_not_finite_is_named_with_its_field_and_state():
     trainer.stepper.objective = Steep()
     x = torch.linspace(0.0, 0.95, 16).unsqueeze(-1)
     with pytest.raises(NonFiniteError, match=r"gradient .* player 'value' for its value at x = \[0\.95"):
-        trainer.stepper.step(lambda: Samples.of(trainer.problem, x), lambda: None)
+        trainer.stepper.step([Samples.of(trainer.problem, x)], trainer.phase)
 
 
 def test_weights_that_are_not_finite_are_never_saved(tmp_path):

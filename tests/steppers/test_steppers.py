@@ -9,13 +9,23 @@ from torch import nn
 
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
-from ocp_torch.objectives import Objective
+from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems import Circle
+from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.samples import Samples
-from ocp_torch.steppers import Extragradient, NonFiniteError, Simultaneous, averaged, optimizer_maker, schedule_maker
+from ocp_torch.steppers import (
+    Extragradient,
+    NonFiniteError,
+    Simultaneous,
+    advance,
+    averaged,
+    optimizer_maker,
+    schedule_maker,
+)
 from ocp_torch.steppers.stepper import project_on_ball
 
 A0, B0 = np.array([1.0, -0.5]), np.array([0.3, 2.0, -1.0])
+PHASE = Phase(resolve_constants(Circle()))
 both_steppers = pytest.mark.parametrize("stepper", [Simultaneous, Extragradient])
 
 
@@ -38,32 +48,30 @@ class MatrixGame(Objective):
     def __init__(self) -> None:
         """No problem, no bounds."""
 
-    def losses(self, fields, samples):
+    def losses(self, fields, samples, phase):
         a, b = fields.value(samples.x), fields.control_density(samples.x)
         payoff = a @ samples.x.reshape(len(a), len(b)) @ b
         return {"value": -payoff, "density": payoff}
 
 
 class Game:
-    """A stepper on `MatrixGame`, the average of its iterates, and all points it visited."""
+    """A stepper on `MatrixGame`, the average of its iterates, and all points that counted for it."""
 
     def __init__(self, stepper, matrices, a=A0, b=B0, rates=(0.1, 0.1), optimizer="sgd", average="none", **options):
         self.fields = Fields({"value": Vector(a), "control_density": Vector(b)})
-        self.average, self.visited = averaged(self.fields, average, decay=0.8), []
+        self.average, self.counted = averaged(self.fields, average, decay=0.8), []
         makers = {p: optimizer_maker(optimizer, r) for p, r in zip(MatrixGame.players, rates, strict=True)}
         objective, schedule = options.pop("objective", MatrixGame()), schedule_maker("constant", steps=1)
         self.stepper = stepper(self.fields, objective, makers, options.pop("schedule", schedule), **options)
         self.queue = iter(matrices)
 
-    def draw(self) -> Samples:
+    def draw(self, phase) -> Samples:
         return Samples.of(Circle(), torch.as_tensor(next(self.queue)).reshape(-1, 1))
 
-    def visit(self) -> None:
-        self.average.update_parameters(self.fields)
-        self.visited.append(self.point)
-
     def step(self):
-        return self.stepper.step(self.draw, self.visit)
+        report = advance(self.stepper, self.average, self.draw, PHASE)
+        self.counted.append(tuple(p.numpy() for p in report.counted))
+        return report
 
     @property
     def point(self):
@@ -134,7 +142,7 @@ def test_a_step_is_the_papers_update_with_projection_fresh_samples_and_each_play
     for k, z in enumerate(iterates):
         report = game.step()
         assert_close(game.point, z)
-        assert_close(game.visited[k], counted[k])
+        assert_close(game.counted[k], counted[k])
         assert report.samples == 6 * len(matrices) // len(iterates)
 
 
@@ -255,8 +263,8 @@ def test_a_non_finite_loss_stops_before_any_parameter_changed(stepper, draw):
 class LoneGame(MatrixGame):
     """The value player's half of the game: the density player rests."""
 
-    def losses(self, fields, samples):
-        return {"value": super().losses(fields, samples)["value"]}
+    def losses(self, fields, samples, phase):
+        return {"value": super().losses(fields, samples, phase)["value"]}
 
 
 @both_steppers
@@ -272,7 +280,7 @@ def test_a_player_without_a_loss_rests_and_so_does_its_schedule(stepper):
 class RootGame(MatrixGame):
     """A finite loss whose gradient is infinite where the first entry of `a` is zero."""
 
-    def losses(self, fields, samples):
+    def losses(self, fields, samples, phase):
         a, b = fields.value(samples.x), fields.control_density(samples.x)
         return {"value": a[0].sqrt(), "density": b.square().sum()}
 

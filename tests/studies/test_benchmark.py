@@ -21,7 +21,7 @@ from ocp_torch.studies.benchmark.curve import Curve, Point, due, median_and_spre
 from ocp_torch.studies.benchmark.kernels import KernelContender
 from ocp_torch.studies.benchmark.measure import Judge, relative, tabulated
 from ocp_torch.studies.benchmark.networks import NetworkContender
-from ocp_torch.studies.benchmark.report import load, reference, save, table
+from ocp_torch.studies.benchmark.report import contest_table, load, reference, save
 from ocp_torch.studies.benchmark.require import require_rl
 from ocp_torch.studies.paper import figures
 from ocp_torch.studies.paper.recipes import RECIPES
@@ -158,17 +158,17 @@ def test_the_report_says_what_was_reached_and_comes_back_from_its_file(tmp_path)
     assert "1 % on Perf in the fewest samples: fast, 20." in text
     assert "slow" not in text.rsplit("\n\n", 1)[1]
     assert reference(curves, None) == (0.9, "the best lower bound found")
-    assert "the best lower bound found" in table(curves, None)
+    assert "the best lower bound found" in contest_table(curves, None)
 
 
 def test_certified_gaps_are_held_against_the_paper_s_primal_dual():
     few = [curve("kernel pd", s, [1.1], gap) for s, gap in enumerate((0.1, 0.12, 0.2))]
-    text = table([*few, curve("a", 0, [1.1], 0.004)], 1.0)
+    text = contest_table([*few, curve("a", 0, [1.1], 0.004)], 1.0)
     rows = {row.split(" | ")[0].strip("| "): row.split(" | ") for row in text.split("\n")}
     place = rows["contender"].index("times smaller")
     assert rows["a"][place] == "30"
     assert rows["kernel pd"][place] == "1"
-    assert "nan" not in table([curve("a", 0, [1.1], 0.004), curve("b", 0, [1.1])], 1.0)
+    assert "nan" not in contest_table([curve("a", 0, [1.1], 0.004), curve("b", 0, [1.1])], 1.0)
 
 
 def test_a_kernel_method_without_a_time_of_its_own_gets_that_of_the_longest_run_before_it(tmp_path, monkeypatch):
@@ -181,16 +181,19 @@ def test_a_kernel_method_without_a_time_of_its_own_gets_that_of_the_longest_run_
     for made in (KernelContender, NetworkContender):
         monkeypatch.setattr(made, "run", run)
     free = [o for o in TINY if "kernel.seconds" not in o]
-    contest(composed("benchmark", [*free, "seeds=[0,2]", "contenders=[kernel_pd,network_dual,kernel_dual]"]), tmp_path)
+    contest(
+        build(composed("benchmark", [*free, "seeds=[0,2]", "contenders=[kernel_pd,network_dual,kernel_dual]"])),
+        tmp_path,
+    )
     assert given == [30.0, 30.0, None, None, 9.0, 9.0]
-    contest(composed("benchmark", [*TINY, "seeds=[0]", "contenders=[network_dual,kernel_dual]"]), tmp_path)
+    contest(build(composed("benchmark", [*TINY, "seeds=[0]", "contenders=[network_dual,kernel_dual]"])), tmp_path)
     assert given[6:] == [None, 0.01]
 
 
 @pytest.mark.nightly
 def test_a_whole_contest_in_small(tmp_path, quick):
     config = composed("benchmark", [*TINY, "seeds=[0,1]", "contenders=[kernel_dual,network_dual]"])
-    curves = contest(config, tmp_path)
+    curves = contest(build(config), tmp_path)
     assert [(c.contender, c.seed) for c in curves] == [
         (name, seed) for name in ("kernel dual", "mlp dual") for seed in (0, 1)
     ]
@@ -347,7 +350,7 @@ def test_the_exact_kernel_does_more_work_at_each_step_and_features_do_not():
 def test_a_whole_reproduction_in_small(tmp_path, monkeypatch, quick):
     for name in RECIPES:
         monkeypatch.setitem(RECIPES, name, small(name))
-    reproduce({"seeds": [0], "modes": 8, "exact_steps": {"dual": 10, "primal": 10, "pd": 10}}, tmp_path)
+    reproduce(check({"seeds": [0], "modes": 8, "exact_steps": {"dual": 10, "primal": 10, "pd": 10}}), tmp_path)
     made = {path.stem for path in (tmp_path / "figures").glob("*.png")}
     each = {f"{name}_{kind}" for name in RECIPES for kind in ("performance", "iterates")}
     assert made == each | {"mu_star", "cost_per_step"}

@@ -8,7 +8,7 @@ from ocp_torch.cli.launch import composed
 from ocp_torch.errors import InputError
 from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields
 from ocp_torch.fields.sobolev import SobolevFeatures, SobolevField
-from ocp_torch.objectives import METHODS
+from ocp_torch.objectives import METHODS, Phase
 from ocp_torch.problems import Manufactured
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.samples import Samples
@@ -114,7 +114,7 @@ def test_a_rule_is_minus_the_gradient_of_the_package_s_loss(method, name, tight)
     given = dict(occupation_bound=0.3, value_bound=0.1) if tight else dict(occupation_bound=2.0, value_bound=2.0)
     constants = resolve_constants(problem, **given)
     rule = RULES[method](problem, constants)
-    objective = METHODS[method](problem, constants, **PLAIN[method])
+    objective = METHODS[method](problem, **PLAIN[method])
     moving = 0
     for seed, size in enumerate((0.03, 0.3, 3.0)):
         fields = random_fields(problem, rule.fields, seed, size)
@@ -126,7 +126,7 @@ def test_a_rule_is_minus_the_gradient_of_the_package_s_loss(method, name, tight)
         datum = Datum(*(c.numpy() for c in columns), jets)
         theta = {n: np.atleast_2d(f.coefficients.detach().numpy()).T for n, f in fields.networks.items()}
         step = rule(datum, {n: jets @ t for n, t in theta.items()})
-        losses = objective.losses(fields, samples)
+        losses = objective.losses(fields, samples, Phase(constants))
         for player, names in objective.players.items():
             parameters = [fields.networks[n].coefficients for n in names]
             gradients = torch.autograd.grad(losses[player], parameters, retain_graph=True)

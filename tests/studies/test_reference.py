@@ -16,7 +16,7 @@ from ocp_torch.studies.reference.grid import Grid
 from ocp_torch.studies.reference.policy_iteration import solve
 from ocp_torch.studies.reference.richardson import extrapolate
 from ocp_torch.studies.reference.semi_lagrangian import SemiLagrangian, discounted_weights
-from ocp_torch.studies.reference.session import prepare, table
+from ocp_torch.studies.reference.session import reference_job, reference_table
 from support import zoo
 from support.controllers import controllers
 
@@ -76,7 +76,7 @@ def assert_true_within_its_error(make, side, close):
 def test_kinked_problems_are_solved_within_the_stated_error(name):
     reference = assert_true_within_its_error(*KINKED[name], close=5e-3)
     assert 1.6 <= reference.order <= 2.5
-    assert "settled" not in table(reference)
+    assert "settled" not in reference_table(reference)
 
 
 @pytest.mark.nightly
@@ -135,7 +135,7 @@ def test_an_iteration_that_is_stopped_early_says_so_and_states_what_it_leaves(po
     reference = solve_reference(problem, 64)
     assert reference.unsettled > 1e-4 * problem.exact_optimum
     assert abs(reference.optimum - problem.exact_optimum) <= reference.error
-    assert "stopped before it settled" in table(reference)
+    assert "stopped before it settled" in reference_table(reference)
 
 
 def test_pure_transport_has_its_closed_form():
@@ -235,8 +235,8 @@ def test_a_hole_that_grids_hardly_see_makes_the_error_unknown(name):
     centre, radius, side, options = HIDDEN[name]
     reference = solve_reference(Shell(len(centre), lambda x: 1.0 - bump(x, centre, radius), **options), side)
     assert reference.error is None
-    assert "error unknown" in table(reference)
-    assert "+-" not in table(reference)
+    assert "error unknown" in reference_table(reference)
+    assert "+-" not in reference_table(reference)
 
 
 FEATURES = {
@@ -330,7 +330,7 @@ CONFIG = {"problem": {}, "run": None, "side": 64, "memory": 4.0, "threads": 1, "
 
 def test_a_saved_reference_loads_without_pickle(tmp_path):
     file = tmp_path / "deep" / "circle.npz"
-    job = prepare(CONFIG | {"problem": {"_target_": "ocp_torch.problems.Circle"}, "save": str(file)})
+    job = reference_job(CONFIG | {"problem": {"_target_": "ocp_torch.problems.Circle"}, "save": str(file)})
     reference = job.run()
     with np.load(file, allow_pickle=False) as saved:
         assert float(saved["optimum"]) == reference.optimum
@@ -353,7 +353,7 @@ def test_a_saved_reference_loads_without_pickle(tmp_path):
 )
 def test_a_wrong_field_is_refused_before_anything_is_solved(change, words):
     with pytest.raises(InputError, match=words):
-        prepare(CONFIG | change)
+        reference_job(CONFIG | change)
 
 
 @pytest.mark.nightly
@@ -361,7 +361,7 @@ def test_a_wrong_field_is_refused_before_anything_is_solved(change, words):
 def test_a_run_is_drawn_beside_the_grid_in_its_own_folder(method, tmp_path):
     """With a `V` network and without one."""
     controllers(method)[0].save(tmp_path / "controller.safetensors")
-    prepare(CONFIG | {"run": str(tmp_path), "side": 32}).run()
+    reference_job(CONFIG | {"run": str(tmp_path), "side": 32}).run()
     drawn = tmp_path / "figures" / "reference.png"
     assert drawn.read_bytes().startswith(b"\x89PNG")
     assert {p.name for p in tmp_path.iterdir()} == {"controller.safetensors", "figures"}

@@ -23,20 +23,20 @@ def quickly():
     a field that is there, or goes wrong, is composed from the files."""
     real, kept = composition.compose, {}
 
-    def compose(config_name, overrides=()):
+    def compose(config_name, overrides=(), **options):
         files = tuple(o for o in overrides if not is_field(o))
         fields = composition.parsed([o for o in overrides if is_field(o) and not o.startswith("hydra.run.dir=")])
         if any(o.is_sweep_override() or o.is_delete() or o.is_add() for o in fields):
-            return real(config_name, list(overrides))
+            return real(config_name, list(overrides), **options)
         if (config_name, files) not in kept:
-            kept[config_name, files] = real(config_name, list(files))
+            kept[config_name, files] = real(config_name, list(files), **options)
         config = kept[config_name, files].copy()
         OmegaConf.set_struct(config, True)
         try:
             for field in fields:
                 OmegaConf.update(config, field.key_or_group, field.value(), force_add=field.is_force_add())
         except OmegaConfBaseException:
-            return real(config_name, list(overrides))
+            return real(config_name, list(overrides), **options)
         return config
 
     composition.compose = compose

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from ocp_torch.certificate import Certificate
+from ocp_torch.certificate import Certificate, Run
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.checks.contradictions import examined
 from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.training.trainer import Trainer
 
 LOWER = 0.05  # above any constant's bound on the circle, below what doing nothing costs
 
@@ -29,6 +28,6 @@ def certificate(run, gap: float | None, certified: float | None = None, zero: fl
     return examined(made)
 
 
-def quick(gap: Callable[[Trainer], float | None], **rest) -> Callable:
-    """In place of `Trainer.look`: the gap is a function of the trainer."""
-    return lambda trainer, **_: certificate(trainer.run, gap(trainer), **rest)
+def quick(gap: Callable[[Run], float | None], **rest) -> Callable:
+    """In place of `Evaluator.evaluate`: the gap is a function of the run, that is of its step."""
+    return lambda evaluator, run: certificate(run, gap(run), **rest)

@@ -7,20 +7,22 @@ import importlib.util
 import io
 import sys
 from functools import cache
+from unittest import mock
 
 import torch
 
-from ocp_torch.cli.launch import CHECKOUT, fail, launch
+from ocp_torch.cli import launch as launching
+from ocp_torch.cli.launch import CHECKOUT, fail
 from ocp_torch.errors import InputError
 
 # Script -> the name of its check, where it has one of Hydra's configurations.
 CHECKS = {
-    "train": "prepare",
-    "certify": "read",
-    "evaluate": "check",
-    "reference": "prepare",
-    "record": "prepare",
-    "rollout": "prepare",
+    "train": "training_run",
+    "certify": "arguments",
+    "evaluate": "recertification",
+    "reference": "reference_job",
+    "record": "recorder",
+    "rollout": "rollout_job",
     "benchmark": "build",
     "reproduce_paper": "check",
 }
@@ -48,7 +50,8 @@ def entered(name: str, *arguments: str) -> tuple[int, str, str]:
                 except InputError as error:
                     fail(str(error))
             else:
-                launch(lambda: print("begun"), name, getattr(script(name), CHECKS[name]))
+                with mock.patch.object(launching, "carry_out", side_effect=lambda *_: print("begun")):
+                    launching.launch(lambda: print("begun"), name, getattr(script(name), CHECKS[name]), print)
         return 0, out.getvalue(), err.getvalue()
     except SystemExit as end:
         return end.code, out.getvalue(), err.getvalue()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from ocp_torch.cli.launch import composed, register_resolvers
 from ocp_torch.errors import InputError
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
-from ocp_torch.runs.run import run_session
+from ocp_torch.runs.run import run_to_end
 from ocp_torch.training.trainer import Trainer
 
 register_resolvers()
@@ -51,7 +51,7 @@ def small(*overrides: str):
 
 
 def session(trainer, folder):
-    return run_session(trainer, build_certificate_settings(trainer.config), folder)
+    return run_to_end(trainer, build_certificate_settings(trainer.config), folder)
 
 
 def state_of(trainer) -> dict:

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 import yaml
 
-from ocp_torch.runs.run import controller_of
+from ocp_torch.runs.finish import controller_of
 from ocp_torch.training.checkpoint import MAGIC, SCHEMA, load_checkpoint
 from ocp_torch.training.monitor import Silent
 from support.looks import certificate

@@ -7,7 +7,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ocp_torch.control.policies import occupation_density
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
-from ocp_torch.runs.run import run_session
+from ocp_torch.runs.run import run_to_end
 from ocp_torch.training.monitor import Monitor, liouville_residual
 from ocp_torch.training.stages import Stages
 from support.small import METHODS, small
@@ -27,7 +27,7 @@ def test_the_game_is_shown_at_every_phase(way, tmp_path):
     events.Reload()
     shown = {tag: [e.step for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
     for player in trainer.objective.players:
-        moves = [s for s in (5, 10, 15, 20) if s > 20 * trainer.objective.resting.get(player, 0.0)]
+        moves = [s for s in (5, 10, 15, 20) if s > 20 * trainer.objective.delays.get(player, 0.0)]
         assert shown[f"loss/{player}"] == shown[f"gradient_norm/{player}"] == moves
     if trainer.fields.value is not None:
         assert shown["violation/slack_mean_positive"] == shown["violation/slack_maximum"] == [5, 10, 15, 20]
@@ -63,7 +63,7 @@ def test_the_liouville_residual_is_that_of_finite_differences(way):
 def test_after_the_last_step_one_is_told_why_and_what_is_being_made(override, why, tmp_path, caplog):
     trainer = small("method=pd", "trainer.evaluate_every=4", override)
     with caplog.at_level("INFO"):
-        run_session(trainer, build_certificate_settings(trainer.config), tmp_path)
+        run_to_end(trainer, build_certificate_settings(trainer.config), tmp_path)
     (stopped,) = [line for line in caplog.messages if line.startswith("Training stopped")]
     assert why in stopped
     assert "the certificate is next" in stopped

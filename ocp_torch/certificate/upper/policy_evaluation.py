@@ -17,13 +17,14 @@ from ocp_torch.maths.jets import CHUNK, Field
 from ocp_torch.maths.sampling import SobolSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import minimiser
+from ocp_torch.objectives.phase import Phase
 from ocp_torch.objectives.policy_evaluation import PolicyEvaluation
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
-from ocp_torch.steppers import Simultaneous, averaged, optimizer_maker, schedule_maker
+from ocp_torch.steppers import advance, short_fit
 from ocp_torch.steppers.optimizers import LARGEST_RATE
 
 # The closed loop's data are computed once on so many states at most: their divergences cost more than a step.
@@ -80,19 +81,16 @@ def fit_closed_loop(
     if fields is not None and fields.log_occupation is not None:
         fitted.log_occupation.load_state_dict(fields.log_occupation.state_dict())
     pool = pool or Pool(loop, derive_seed(seed, Branch.POLICY_EVALUATION, 1), like, double=fields is None)
-    draw = lambda: pool.draw(settings.batch)
+    draw = lambda phase: pool.draw(settings.batch)
     pool.grow(min(POOL, settings.steps * settings.batch))
-    price = 1.0 if with_value else missing_price(loop, fields.value, pool.samples.take(slice(EXCESS_STATES)))
-    objective = PolicyEvaluation(loop, constants, with_value, price)
-    optimizer = optimizer_maker("soap", settings.lr, betas=(0.95, 0.95))
-    makers = {player: optimizer for player in objective.players}
-    stepper = Simultaneous(fitted, objective, makers, schedule_maker("cosine", settings.steps))
-    average = averaged(fitted, decay=0.98)
+    weight = 1.0 if with_value else positive_weight(loop, fields.value, pool.samples.take(slice(EXCESS_STATES)))
+    objective, phase = PolicyEvaluation(loop, with_value, weight), Phase(constants)
+    stepper, average = short_fit(fitted, objective, settings.lr, settings.steps)
     for k in range(settings.rounds):
         steps = settings.steps * 2**k
         pool.grow(min(POOL, steps * settings.batch))
         for _ in range(steps):
-            stepper.step(draw, lambda: average.update_parameters(fitted))
+            advance(stepper, average, draw, phase)
         value = average.module.value if with_value else fields.value
         excess = relative_excess(loop, value, average.module.log_occupation, pool.samples.take(slice(EXCESS_STATES)))
         if excess <= settings.good_excess:
@@ -128,8 +126,8 @@ class Pool:
 
 
 @torch.no_grad()
-def missing_price(loop: ClosedLoop, value: Field, samples: Samples) -> float:
-    """How much more a positive residual should weigh than a negative one: the root of `eps_hi / eps_lo`, within limits."""
+def positive_weight(loop: ClosedLoop, value: Field, samples: Samples) -> float:
+    """What a positive residual should weigh where a negative one weighs 1: the root of `eps_hi / eps_lo`, within limits."""
     slack = Generator.of(loop, samples).hjb_slack(jets.jet(value, samples.x))
     hi, lo = float((-slack).max().clamp_min(1e-30)), float(slack.max().clamp_min(1e-30))
     return math.sqrt(min(max(hi / lo, 1.0 / MOST_LOPSIDED), MOST_LOPSIDED))

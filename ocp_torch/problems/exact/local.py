@@ -12,7 +12,7 @@ ROUNDING = 1e-9
 
 
 def optimal_contraction(A: Tensor, B: Tensor, Q: Tensor, rho: float) -> float:
-    r"""How fast the optimal flow of `dx/dt = A x + B u`, cost `rho int e^{-rho t} (x'Qx + |u|^2) / 2 dt`, loses volume.
+    r"""How fast the optimal flow of `dx/dt = A x + B u` for `rho int e^{-rho t} (x'Qx + |u|^2) / 2 dt` loses volume.
 
     ``A`` and ``Q`` are ``(d, d)``, ``B`` ``(d, m)``. The closed loop is `F - BB'P + rho/2` with `F = A - rho/2` and `P` the
     stabilising solution of `F'P + PF - PBB'P + Q = 0`, and the eigenvalues of `F - BB'P` are the stable half of those of the

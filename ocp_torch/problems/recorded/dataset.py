@@ -9,21 +9,18 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
-from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import MARGIN, Problem
 from ocp_torch.problems.recorded import recording
+from ocp_torch.problems.recorded.split import HELD_OUT, TRAINING, VALIDATION, split, with_divergences
 from ocp_torch.problems.samples import Samples
 
-# The part of what is not held out that looks during training are made on.
-LOOKS_PART = 0.1
-# Fewest samples of a part that anything is estimated from.
-FEWEST_PART = 32
+# Matrices that differ by less, relative to 1 + their size, are the same.
 CONSTANT = 1e-9
 
 
 class Dataset(Problem):
     """The samples of ``path`` (a file of `recording`), split at random by ``seed``: ``held_out`` of them, a part
-    in (0, 1), for the certificate alone, a tenth of the rest for looks on the way, and the others to train on.
+    in (0, 1), for the certificate alone, a tenth of the rest to choose by while training, and the others to train on.
 
     ``discount``, ``exponent`` and ``control_limit`` where not given are those of the file. ``wrap`` takes states modulo 1.
     Where `B` is the same at all samples it is known everywhere, and the controller from `V` with it; otherwise only
@@ -65,15 +62,14 @@ class Dataset(Problem):
             constant_matrix = first[0].tolist() if same else None
         if discount is None:
             raise InputError("problem.discount is missing: the file does not hold it; give problem.discount=...")
-        super().__init__(dim, control_dim, discount, exponent, control_limit)  # type: ignore[arg-type] # refused there
+        super().__init__(
+            dim=dim, control_dim=control_dim, discount=discount, exponent=exponent, control_limit=control_limit
+        )
         self._B = None if constant_matrix is None else torch.tensor(constant_matrix, dtype=torch.float64)
-        self.knows_control_matrix = self._B is not None
         if self._B is not None and self._B.shape != (self.dim, self.control_dim):
             raise InputError(f"problem.constant_matrix has shape {tuple(self._B.shape)}, but must be (d, m).")
         if self._recording is not None:
-            # The largest cost there is among the samples, with head-room: an estimate, and called one in `bounds`.
-            self.state_cost_bound = MARGIN * float(self._recording.samples.f.max())
-            self._split()
+            self._take_in(self._recording)
 
     incidental = ("path",)
 
@@ -96,30 +92,15 @@ class Dataset(Problem):
                 raise InputError(
                     f"{self.path} is of d, m = {tuple(found.samples.B.shape[1:])}, not {(self.dim, self.control_dim)}."
                 )
-            self._recording = found
-            self.state_cost_bound = MARGIN * float(found.samples.f.max())
-            self._split()
+            self._take_in(found)
         return self._recording
 
-    def _split(self) -> None:
-        samples = self.recording.samples
-        zero, constant = torch.zeros_like(samples.f), self._B is not None
-        if samples.div_a is None and not samples.a.any():
-            samples = Samples(**{**vars(samples), "div_a": zero})
-        if samples.div_B is None and constant:
-            samples = Samples(**{**vars(samples), "div_B": zero.unsqueeze(-1).expand(-1, self.control_dim)})
-        count = len(samples)
-        generator = torch.Generator().manual_seed(derive_seed(self.seed, Branch.DATASET_SPLIT))
-        order = torch.randperm(count, generator=generator)
-        held = round(self.held_out_part * count)
-        looks = max(FEWEST_PART, round(LOOKS_PART * (count - held)))
-        if held < FEWEST_PART or count - held - looks < FEWEST_PART:
-            raise InputError(
-                f"problem.held_out = {self.held_out_part:g} of {count} samples leaves too few on one side; each part needs "
-                f"at least {FEWEST_PART}."
-            )
-        cuts = {"held_out": order[:held], "looks": order[held : held + looks], "training": order[held + looks :]}
-        self._parts = {name: samples.take(rows) for name, rows in cuts.items()}
+    def _take_in(self, found: recording.Recording) -> None:
+        self._recording = found
+        # The largest cost among the samples, with head-room: an estimate, and the certificate calls it one.
+        self.state_cost_bound = MARGIN * float(found.samples.f.max())
+        samples = with_divergences(found.samples, constant_matrix=self._B is not None)
+        self._parts = split(samples, self.held_out_part, self.seed)
 
     def _part(self, name: str) -> Samples:
         _ = self.recording
@@ -128,18 +109,18 @@ class Dataset(Problem):
     @property
     def training(self) -> Samples:
         """What may be learned from."""
-        return self._part("training")
+        return self._part(TRAINING)
 
     @property
     def held_out(self) -> Samples:
         """What nothing was learned from or chosen by."""
-        return self._part("held_out")
+        return self._part(HELD_OUT)
 
     @property
     def validation_view(self) -> Dataset:
-        """The same problem with other held-out samples, for looks by which choices are made."""
+        """The same problem with other held-out samples, for evaluations by which choices are made."""
         other = copy.copy(self)
-        other._recording, other._parts = self.recording, {**self._parts, "held_out": self._part("looks")}
+        other._recording, other._parts = self.recording, {**self._parts, HELD_OUT: self._part(VALIDATION)}
         return other
 
     def samples(self, places: Tensor, divergences: bool = True) -> Samples:
@@ -164,6 +145,10 @@ class Dataset(Problem):
     @property
     def gives_divergences(self) -> bool:
         return self.training.div_a is not None and self.training.div_B is not None
+
+    @property
+    def knows_control_matrix(self) -> bool:
+        return self._B is not None
 
     def control_matrix(self, x: Tensor) -> Tensor:
         if self._B is None:

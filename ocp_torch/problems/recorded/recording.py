@@ -1,8 +1,8 @@
 """Recorded samples of a problem as a file, NPZ or safetensors: read without running anything in it, and checked.
 
 Arrays: ``x (N, d)`` in `[0, 1)`, ``f (N,)``, ``a (N, d)``, ``B (N, d, m)``; optionally ``div_a (N,)``, ``div_B (N, m)``,
-``mu0 (N,)``, and ``density (N,)``, that of the law ``x`` was drawn from (uniform where it is left out). Optionally the
-numbers ``discount``, ``exponent`` and ``control_limit``. Samples must be independent draws.
+``mu0 (N,)``, and ``density (N,)``, that of the distribution ``x`` was drawn from (uniform where it is left out). Optionally
+the numbers ``discount``, ``exponent`` and ``control_limit``. Samples must be independent draws.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from ocp_torch.errors import InputError, nearest
 from ocp_torch.files.arrays import read_npz
 from ocp_torch.files.reading import kind
 from ocp_torch.files.storage import read_safetensors, write_atomically
+from ocp_torch.problems.recorded.plausible import dependence_notes, samples_of
 from ocp_torch.problems.samples import Samples
 
 REQUIRED = {"x": "Nd", "f": "N", "a": "Nd", "B": "Ndm"}
@@ -28,13 +29,10 @@ OPTIONAL = {"div_a": "N", "div_B": "Nm", "mu0": "N", "density": "N"}
 NUMBERS = ("discount", "exponent", "control_limit")
 KNOWN = (*REQUIRED, *OPTIONAL, *NUMBERS)
 SUFFIXES = (".npz", ".safetensors")
+# Fewer samples say too little of their own distribution for it to be checked.
 FEWEST = 100
 # What is read into memory at most, unpacked.
 MOST_BYTES = 2**33
-# How many standard errors a mean may be from what it must be, and rounding relative to its size.
-SURE, ROUNDING = 6.0, 1e-6
-# The frequencies of each coordinate by which the law of x is held against the density it is said to have.
-FREQUENCIES = (1, 2, 3)
 
 
 @dataclass(frozen=True)
@@ -67,11 +65,12 @@ def read(path: str | Path, wrap: bool = False) -> Recording:
         bad = ~np.isfinite(array).reshape(len(array), -1).all(axis=1)
         if bad.any():
             raise InputError(f"{path}: {name} is not finite at {int(bad.sum())} samples, first at row {bad.argmax()}.")
-    return _checked(path, arrays, numbers, wrap)
+    samples = samples_of(path, arrays, wrap)
+    return Recording(samples, numbers, _digest(arrays), dependence_notes(path, samples))
 
 
 def write(path: str | Path, samples: Samples, numbers: dict[str, float | None], density: Tensor | None = None) -> None:
-    """Write ``samples`` for `read`; ``density`` ``(N,)`` is that of the law of ``x``, uniform if `None`."""
+    """Write ``samples`` for `read`; ``density`` ``(N,)`` is that of the distribution of ``x``, uniform if `None`."""
     path = Path(path)
     if path.suffix not in SUFFIXES:
         raise InputError(f"out is {str(path)!r}, but must be a file ending in {' or '.join(SUFFIXES)}.")
@@ -134,81 +133,9 @@ def _require_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
         raise InputError(f"{path} holds {len(x)} samples, but at least {FEWEST} are needed.")
 
 
-def _checked(path: Path, arrays: dict[str, np.ndarray], numbers: dict[str, float], wrap: bool) -> Recording:
-    x, f = arrays["x"], arrays["f"]
-    outside = (x < -ROUNDING) | (x > 1.0 + ROUNDING)
-    if outside.any() and not wrap:
-        row = int(outside.any(axis=1).argmax())
-        raise InputError(
-            f"{path}: x is {x[row].tolist()} at row {row}, outside [0, 1); scale each coordinate to period 1, "
-            "and set problem.wrap=true if whole turns should be taken off."
-        )
-    if (f < -ROUNDING * np.abs(f).max()).any():
-        row = int((f < 0.0).argmax())
-        raise InputError(f"{path}: f is {f[row]:g} at row {row}, but must not be negative.")
-    for name, what in (("density", "positive"), ("mu0", "at least 0")):
-        array = arrays.get(name)
-        if array is not None and ((array <= 0.0) if name == "density" else (array < 0.0)).any():
-            raise InputError(f"{path}: {name} falls to {array.min():g}, but must be {what}.")
-    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    one = torch.ones(len(f), dtype=torch.float64)
-    weight = 1.0 / tensors["density"] if "density" in tensors else one
-    samples = Samples(
-        x=torch.from_numpy(x).remainder(1.0),
-        f=tensors["f"].clamp_min(0.0),
-        a=tensors["a"],
-        B=tensors["B"],
-        mu0=tensors.get("mu0", one),
-        weight=weight,
-        div_a=tensors.get("div_a"),
-        div_B=tensors.get("div_B"),
-    )
-    _require_policy(path, samples, "density" in tensors)
+def _digest(arrays: dict[str, np.ndarray]) -> str:
     digest = hashlib.sha256()
     for name in sorted(arrays):
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(arrays[name]).data)
-    return Recording(samples, numbers, digest.hexdigest(), _notes(path, samples))
-
-
-def _require_policy(path: Path, samples: Samples, given: bool) -> None:
-    """The weighted means of what integrates to a known number: 1, `mu0`, and waves along each coordinate."""
-    count = len(samples)
-    weigh = "mean of 1 / density" if given else "mean of 1"
-
-    def off(values: Tensor, truth: float) -> float:
-        """Standard errors between the weighted mean and ``truth``, with room for one per mille."""
-        terms = samples.weight * values
-        return max(0.0, abs(float(terms.mean()) - truth) - 1e-3) / max(float(terms.std()) / count**0.5, 1e-12)
-
-    if off(torch.ones(count, dtype=torch.float64), 1.0) > SURE:
-        raise InputError(
-            f"{path}: the {weigh} is {float(samples.weight.mean()):.4g}, but must be 1: density is not that of x."
-        )
-    if off(samples.mu0, 1.0) > SURE:
-        mean = float(samples.mean(samples.mu0))
-        raise InputError(f"{path}: mu0 has mean {mean:.4g} over the torus, but a density must have mean 1.")
-    for i in range(samples.x.shape[1]):
-        for k in FREQUENCIES:
-            angle = 2.0 * torch.pi * k * samples.x[:, i]
-            if max(off(angle.cos(), 0.0), off(angle.sin(), 0.0)) > SURE:
-                source = "the density it comes with" if given else "the uniform law"
-                raise InputError(
-                    f"{path}: coordinate {i} of x does not follow {source}; "
-                    + ("give the density of the law it was drawn from." if not given else "density must be that of x.")
-                )
-
-
-def _notes(path: Path, samples: Samples) -> tuple[str, ...]:
-    """Signs that the samples are no independent draws."""
-    centred = samples.f - samples.f.mean()
-    spread = float(centred.square().sum())
-    if spread <= 0.0:
-        return ()
-    correlation = float((centred[1:] * centred[:-1]).sum()) / spread
-    if correlation * len(centred) ** 0.5 <= SURE:
-        return ()
-    return (
-        f"consecutive samples of {path.name} are alike (correlation {correlation:.2g}): they are no independent draws, and "
-        "errors and intervals are too small.",
-    )
+    return digest.hexdigest()

@@ -22,12 +22,12 @@ def end_with_parent(lifeline: int, parent: int, mortal: bool) -> None:
     code lets no other thread run; ``parent`` is whose child it was, in case it died before it could be asked for.
     """
 
-    def health() -> None:
+    def wait_for_the_end() -> None:
         while os.read(lifeline, 1):
             pass
         os._exit(1)
 
-    threading.Thread(target=health, daemon=True).start()
+    threading.Thread(target=wait_for_the_end, daemon=True).start()
     if mortal and sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:

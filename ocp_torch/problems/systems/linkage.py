@@ -3,6 +3,7 @@ r"""What arms of turning joints share, in the plane and in space: a tip that is 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -14,7 +15,7 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.angles import bump, to_radians, to_turns
 
 
-class Linkage(Problem):
+class Linkage(Problem, ABC):
     r"""`dx/dt = speed u` and `f = target_weight |p(x) - target|^2 + obstacle_weight sum_o (1 - prod_s (1 - b_o(r_s(x))))`.
 
     `x_i` is the angle of joint `i` in turns, `p` the tip, and `s` runs over ``points_per_link`` points of each link, where
@@ -56,13 +57,13 @@ class Linkage(Problem):
         farthest = math.hypot(*shoulder) + length + math.hypot(*self.target)
         self.state_cost_bound = self.target_weight * farthest**2 + self.obstacle_weight * len(self.obstacles)
 
+    @abstractmethod
     def joints(self, x: Tensor) -> Tensor:
         """The corners of the arm from base to tip in metres, ``(N, k, c)``."""
-        raise NotImplementedError
 
+    @abstractmethod
     def jacobian(self, x: Tensor) -> Tensor:
         """`dp / d angle` in metres per radian, ``(N, c, n)``."""
-        raise NotImplementedError
 
     def end_effector(self, x: Tensor) -> Tensor:
         """`p(x)` in metres, ``(N, c)``."""

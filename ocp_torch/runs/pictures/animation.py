@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path as FilePath
 
-from matplotlib.animation import PillowWriter
-
+from ocp_torch.control.policies import Policy
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.problems.problem import Problem
 from ocp_torch.runs.pictures.picture import FRAMES, moving
 from ocp_torch.runs.pictures.scenes import scene
-from ocp_torch.runs.practice.paths import Law
 
+# Every fourth frame of the path, coarsely: a GIF of a few hundred kilobytes.
 FRAMES_PER_SECOND, STRIDE, DPI = 12, 4, 60
 
 
@@ -24,11 +23,13 @@ def require_gif(problem: Problem, path: object) -> FilePath:
     return FilePath(str(path))
 
 
-def animate(problem: Problem, policy: Law, path: str | FilePath, seed: int = 0) -> FilePath:
+def animate(problem: Problem, policy: Policy, path: str | FilePath, seed: int = 0) -> FilePath:
     """Write the motion of ``problem`` under ``policy`` as ``path``, a `.gif`.
 
     Raises `InputError` for another suffix or a problem without a scene, `StorageError` for a file that cannot be written.
     """
+    from matplotlib.animation import PillowWriter
+
     path, shown = require_gif(problem, path), moving(problem, policy, seed)
     figure, writer = shown.figure(), PillowWriter(fps=FRAMES_PER_SECOND)
     figure.set_layout_engine("none")  # the same axes in every frame, and not found anew for each

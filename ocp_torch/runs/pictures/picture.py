@@ -4,24 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import singledispatch
+from typing import TYPE_CHECKING
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
-from ocp_torch.control.policies import zero_policy
+from ocp_torch.control.policies import Policy, zero_policy
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.planar import PlanarVehicle
+from ocp_torch.runs.metrics.trajectories import Path, simulate
+from ocp_torch.runs.metrics.trial import random_starts
 from ocp_torch.runs.pictures.scenes import Scene, projection, scene
-from ocp_torch.runs.practice.metrics import random_starts
-from ocp_torch.runs.practice.paths import Law, Path, simulate
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Time drawn, in units of 1 / rho, and frames of it.
 DURATION, FRAMES = 5.0, 160
-# How many starts are drawn.
-OSCILLATORS = 24
+# Starts drawn in one panel, of oscillators and of vehicles and pendulums; of arms, one in a panel.
+OSCILLATORS, TRACKS, ARMS = 24, 6, 3
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,9 @@ class Moving:
 
     def figure(self) -> Figure:
         """An empty figure of the right size."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
         figure = Figure(figsize=(4.6 * len(self.panels), 4.2), layout="constrained")
         FigureCanvasAgg(figure)
         return figure
@@ -54,16 +58,16 @@ def starts_drawn(problem: Problem) -> tuple[int, bool]:
 
 @starts_drawn.register
 def _(problem: Linkage) -> tuple[int, bool]:
-    return 3, True
+    return ARMS, True
 
 
 @starts_drawn.register(PlanarVehicle)
 @starts_drawn.register(Pendulum)
 def _(problem) -> tuple[int, bool]:
-    return 6, False
+    return TRACKS, False
 
 
-def moving(problem: Problem, policy: Law, seed: int = 0) -> Moving | None:
+def moving(problem: Problem, policy: Policy, seed: int = 0) -> Moving | None:
     """``problem`` under ``policy`` from random admissible starts; beside it, where they share a panel, without control."""
     draw = scene(problem)
     if draw is None:
@@ -79,7 +83,7 @@ def moving(problem: Problem, policy: Law, seed: int = 0) -> Moving | None:
     return Moving(panels, projection(problem))
 
 
-def motion(problem: Problem, policy: Law, seed: int = 0) -> Figure | None:
+def motion(problem: Problem, policy: Policy, seed: int = 0) -> Figure | None:
     """The whole motion in one figure; `None` for problems without a scene."""
     shown = moving(problem, policy, seed)
     if shown is None:
@@ -87,3 +91,9 @@ def motion(problem: Problem, policy: Law, seed: int = 0) -> Figure | None:
     figure = shown.figure()
     shown.draw(figure, FRAMES)
     return figure
+
+
+def practical_figures(problem: Problem, policy: Policy, seed: int) -> dict[str, Figure]:
+    """`motion`, by its name in a run's folder, for problems that have a scene."""
+    figure = motion(problem, policy, seed)
+    return {} if figure is None else {"motion": figure}

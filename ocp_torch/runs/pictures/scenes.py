@@ -8,11 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import singledispatch
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.patches import Circle, Wedge
 from torch import Tensor
 
 from ocp_torch.problems.problem import Problem
@@ -22,10 +21,13 @@ from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.systems.planar import PlanarVehicle
 from ocp_torch.problems.systems.robot import RobotArm
-from ocp_torch.runs.practice.paths import Path
+from ocp_torch.runs.metrics.trajectories import Path
 
-# Draws the path up to frame k.
-Scene = Callable[[Axes, Path, int], None]
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Draws the path up to frame k on Matplotlib's axes, which are not imported before something is drawn.
+Scene = Callable[[Any, Path, int], None]
 # Earlier poses of an arm that stay visible.
 GHOSTS = 12
 
@@ -48,6 +50,8 @@ def _(problem: RobotArm) -> str:
 
 
 def _obstacles(axes: Axes, discs: list, clearance: float, period: float | None = None) -> None:
+    from matplotlib.patches import Circle
+
     shifts = [0.0] if period is None else [-period, 0.0, period]
     for x, y, radius in discs:
         for dx in shifts:
@@ -134,6 +138,8 @@ def pendulum_scene(problem: Pendulum) -> Scene:
     """The portrait of angle and velocity, with the band in which the model is faithful; the rod at the end in a corner."""
 
     def draw(axes: Axes, path: Path, k: int) -> None:
+        from matplotlib.patches import Wedge
+
         for speed in (-problem.max_speed, problem.max_speed):
             axes.axhline(speed, color="0.7", linestyle=":")
         for i in range(path.states.shape[1]):

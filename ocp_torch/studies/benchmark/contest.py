@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -63,7 +64,18 @@ def contender(name: str, config: dict, problem: Problem, constants: Constants):
     return call(RLContender, "rl", options, **given)
 
 
-def build(config: dict) -> tuple[Problem, Constants, list, list[int], CertificateSettings | None]:
+@dataclass(frozen=True)
+class Contest:
+    """Who runs on what, and how the end of each is certified."""
+
+    problem: Problem
+    constants: Constants
+    contenders: list
+    seeds: list[int]
+    certificate: CertificateSettings
+
+
+def build(config: dict) -> Contest:
     """Everything a contest needs; kernel methods and judge use the bounds a run with null bounds would."""
     problem = build_problem(config["problem"])
     torch.set_num_threads(1)
@@ -82,7 +94,7 @@ def build(config: dict) -> tuple[Problem, Constants, list, list[int], Certificat
     training = {group: config[group] for group in TRAINING}
     certificate = build_certificate_settings(fill(training, problem))
     require_possible(problem, certificate)
-    return problem, constants, made, seeds, certificate
+    return Contest(problem, constants, made, seeds, certificate)
 
 
 def _require_numbers(config: dict) -> None:
@@ -96,23 +108,23 @@ def _require_numbers(config: dict) -> None:
         require_integer(f"rl.steps.{algorithm}", steps, 1)
 
 
-def contest(config: dict, folder: Path, say: Callable[[str], None] = log.info) -> list[Curve]:
+def contest(made: Contest, folder: Path, say: Callable[[str], None] = log.info) -> list[Curve]:
     """Run everyone with every seed; what is there so far is saved after each run.
 
     A kernel method without a time of its own gets that of the longest run before it: they are compared at equal time.
     """
-    problem, constants, contenders, seeds, certificate = build(config)
-    judge = Judge(problem, constants)
+    contenders, seeds, exact = made.contenders, made.seeds, made.problem.exact_optimum
+    judge = Judge(made.problem, made.constants)
     curves: list[Curve] = []
     with tqdm(total=len(contenders) * len(seeds), unit="run", disable=None) as bar:
-        for made in contenders:
-            if isinstance(made, KernelContender):
-                made = made.in_time(max((c.points[-1].seconds for c in curves), default=UNHURRIED))
+        for one in contenders:
+            if isinstance(one, KernelContender):
+                one = one.in_time(max((c.points[-1].seconds for c in curves), default=UNHURRIED))
             for seed in seeds:
-                bar.set_postfix_str(f"{made.name}, seed {seed}")
-                curves.append(made.run(seed, judge, certificate))
-                text = save(curves, problem.exact_optimum, folder)
+                bar.set_postfix_str(f"{one.name}, seed {seed}")
+                curves.append(one.run(seed, judge, made.certificate))
+                text = save(curves, exact, folder)
                 bar.update()
-    plot(curves, problem.exact_optimum).savefig(folder / "benchmark.png", dpi=130)
+    plot(curves, exact).savefig(folder / "benchmark.png", dpi=130)
     say(f"\n{text}\n\nwritten to {folder}")
     return curves

@@ -6,12 +6,15 @@ import json
 import math
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
+from ocp_torch.runs.canvas import blank_figure
 from ocp_torch.studies.benchmark.curve import Curve, Point, median_and_spread
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # The certified gaps of all are held against that of the paper's primal-dual.
 BASELINE = "kernel pd"
@@ -32,7 +35,7 @@ def by_contender(curves: list[Curve]) -> dict[str, list[Curve]]:
     return {name: [c for c in curves if c.contender == name] for name in names}
 
 
-def table(curves: list[Curve], exact: float | None) -> str:
+def contest_table(curves: list[Curve], exact: float | None) -> str:
     """A Markdown table: at each contender's end, median over seeds and, where there are several, smallest to largest."""
     optimum, what = reference(curves, exact)
     off = lambda number: 100.0 * (number / optimum - 1.0)
@@ -113,8 +116,7 @@ def plot(curves: list[Curve], exact: float | None) -> Figure:
         "(min(J, G) - F_M) / F_M, %": lambda p: 100.0 * p.gap,
     }
     columns = {"samples": lambda p: float(p.samples), "CPU seconds of training": lambda p: p.seconds}
-    figure = Figure(figsize=(11.0, 8.0), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(11.0, 8.0)
     axes = figure.subplots(2, 2, sharey="row", sharex="col")
     for i, (label, height) in enumerate(rows.items()):
         for j, (unit, place) in enumerate(columns.items()):
@@ -144,7 +146,7 @@ def draw(axis, curves: list[Curve], place, height, color: str, name: str) -> Non
 def save(curves: list[Curve], exact: float | None, folder: Path) -> str:
     """Write `benchmark.md` and `curves.json`; returns the table."""
     folder.mkdir(parents=True, exist_ok=True)
-    text = table(curves, exact)
+    text = contest_table(curves, exact)
     (folder / "benchmark.md").write_text(text + "\n")
     (folder / "curves.json").write_text(json.dumps([asdict(c) for c in curves], indent=1, default=float) + "\n")
     return text

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from ocp_torch.control.policies import occupation_density, trained_policies
 from ocp_torch.problems import Circle
+from ocp_torch.runs.canvas import blank_figure
 from ocp_torch.studies.benchmark.kernels import OCCUPATION
 from ocp_torch.studies.paper.runs import Comparison, History, circle
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DISCOUNTS = (0.5, 1.0, 1.5, 2.0, 4.0)
 LABELS = {
@@ -23,8 +27,7 @@ LABELS = {
 
 
 def _figure(columns: int, rows: int = 1, width: float = 5.0) -> tuple[Figure, np.ndarray]:
-    figure = Figure(figsize=(width * columns, 3.8 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(width * columns, 3.8 * rows)
     return figure, figure.subplots(rows, columns, squeeze=False).ravel()
 
 

@@ -34,9 +34,9 @@ def check(config: dict) -> tuple[tuple[int, ...], int, dict[str, int]]:
     return tuple(require_integer("seeds", seed, 0) for seed in seeds), modes, exact
 
 
-def reproduce(config: dict, folder: Path) -> None:
-    """Write `figures/*.png`, `numbers.md` and `numbers.json` under ``folder``."""
-    seeds, modes, exact = check(config)
+def reproduce(checked: tuple[tuple[int, ...], int, dict[str, int]], folder: Path) -> None:
+    """Write `figures/*.png`, `numbers.md` and `numbers.json` under ``folder``; ``checked`` is what `check` gave."""
+    seeds, modes, exact = checked
     torch.set_num_threads(1)
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from ocp_torch.control.controller import Controller
 from ocp_torch.files.storage import write_atomically
+from ocp_torch.runs.canvas import blank_figure
 from ocp_torch.studies.reference.reference import Reference
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 LINE_POINTS, MAP_POINTS, ARROWS = 400, 96, 16
 
@@ -50,8 +53,7 @@ def _states(dim: int) -> Tensor:
 
 
 def _panels(rows: int, columns: int):
-    figure = Figure(figsize=(4.8 * columns, 3.8 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(4.8 * columns, 3.8 * rows)
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 

@@ -43,7 +43,7 @@ class ReferenceJob:
         torch.set_num_threads(self.threads)
         started = time.process_time()
         reference = solve_reference(self.problem, self.side, self.memory)
-        log.info("%s\n%.1f s of CPU", table(reference), time.process_time() - started)
+        log.info("%s\n%.1f s of CPU", reference_table(reference), time.process_time() - started)
         if self.file is not None:
             save_reference(self.file, reference)
             log.info("saved in %s", self.file)
@@ -53,7 +53,7 @@ class ReferenceJob:
         return reference
 
 
-def prepare(config: dict) -> ReferenceJob:
+def reference_job(config: dict) -> ReferenceJob:
     """Check every field before anything is solved or written. Raises `InputError` for a wrong one."""
     controller, figure, section = None, None, require_section("problem", config["problem"])
     if config["run"] is None:
@@ -77,7 +77,7 @@ def prepare(config: dict) -> ReferenceJob:
     return ReferenceJob(problem, controller, figure, config["side"], config["memory"], threads, file)
 
 
-def table(reference: Reference) -> str:
+def reference_table(reference: Reference) -> str:
     """What a user reads: `OPT` with its error, the grids, the order, and the exact optimum where the problem knows it."""
     problem = reference.problem
     lines = [

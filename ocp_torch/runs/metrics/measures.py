@@ -1,4 +1,4 @@
-"""Numbers a practitioner would ask for, from simulated random starts: of the controller, of zero and of a classical one."""
+"""What is measured on each system, and which states are fair to start from."""
 
 from __future__ import annotations
 
@@ -7,22 +7,17 @@ from functools import singledispatch
 import torch
 from torch import Tensor
 
-from ocp_torch.control.policies import zero_policy
 from ocp_torch.problems.problem import Problem
-from ocp_torch.problems.starts import drawn_starts, starts_narrowly
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.systems.planar import PlanarVehicle
-from ocp_torch.runs.practice.classical import classical_policy
-from ocp_torch.runs.practice.paths import Law, Path, simulate
+from ocp_torch.runs.metrics.trajectories import Path
 
-STARTS, STEPS = 512, 240
-# The time of a trial in units of 1 / rho; what the discount still sees after it is e^-8.
-TRIAL = 8.0
-# What counts as reached, relative to the arm's length or the period of the plane; as upright, in rad and rad/s.
+# What counts as reached, relative to the arm's length or the period of the plane; as upright, in rad and rad/s. Definitions
+# of what the numbers say, not tuned.
 REACHED = 0.05
 UPRIGHT = (0.2, 0.5)
 
@@ -89,52 +84,6 @@ def _(problem: Pendulum, path: Path) -> dict[str, float]:
 def has_metrics(problem: Problem) -> bool:
     """Whether ``problem`` has numbers of its own."""
     return measure.dispatch(type(problem)) is not measure.dispatch(Problem)
-
-
-def metrics(problem: Problem, policy: Law, seed: int = 0, starts: int = STARTS) -> dict | None:
-    """``controller``, ``zero`` and ``classical`` (where there is one), each with its numbers and mean discounted ``cost``.
-
-    All from the same ``starts`` (`random_starts`), for ``duration`` in the problem's unit of time; `None` for a problem
-    without numbers of its own. Statistics, not bounds: a part `p` has the standard error `sqrt(p (1 - p) / starts)`.
-    """
-    if not has_metrics(problem):
-        return None
-    x0 = random_starts(problem, starts, seed)
-    duration = TRIAL / problem.discount
-    policies = {"controller": policy, "zero": zero_policy(problem), "classical": classical_policy(problem)}
-    found = {}
-    for name, each in policies.items():
-        if each is None:
-            continue
-        path = simulate(problem, _within_limit(problem, each), x0, duration, STEPS)
-        found[name] = {**measure(problem, path), "cost": float(path.cost.mean())}
-    return {"starts": starts, "seed": seed, "duration": duration, **found}
-
-
-def _within_limit(problem: Problem, policy: Law) -> Law:
-    """``policy``, shrunk to the problem's control limit where it has one: a classical policy knows none, and others round."""
-    return lambda x: problem.control_cost.within(policy(x), torch.ones_like(x[:, 0]))
-
-
-def random_starts(problem: Problem, count: int, seed: int) -> Tensor:
-    """``count`` starts, ``(count, d)`` float64: drawn from `mu0` where that is narrow; else uniform admissible ones, or all
-    where hardly any is admissible."""
-    if starts_narrowly(problem):
-        return drawn_starts(problem, count, seed)
-    generator = torch.Generator().manual_seed(seed)
-    x = torch.rand(64 * count, problem.dim, generator=generator, dtype=torch.float64)
-    fair = x[admissible(problem, x)]
-    return (fair if len(fair) >= count else x)[:count]
-
-
-def metrics_table(found: dict) -> str:
-    """What a user reads: a row for each controller."""
-    rows = {name: found[name] for name in ("controller", "zero", "classical") if name in found}
-    names = list(rows["controller"])
-    lines = [f"{found['starts']} random starts, {found['duration']:g} units of time"]
-    lines.append(" " * 12 + "".join(f"{name:>14}" for name in names))
-    lines += [f"{row:<12}" + "".join(f"{rows[row][name]:>14.4g}" for name in names) for row in rows]
-    return "\n".join(lines)
 
 
 def _part(flags: Tensor) -> float:

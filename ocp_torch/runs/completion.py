@@ -6,9 +6,8 @@ from pathlib import Path
 
 from ocp_torch.certificate import CertificateSettings
 from ocp_torch.files.storage import write_atomically
-from ocp_torch.runs.metrics import METRICS
+from ocp_torch.runs.metrics import METRICS, has_metrics
 from ocp_torch.runs.pictures import scene
-from ocp_torch.runs.practice import has_metrics
 from ocp_torch.training.trainer import Trainer
 
 # Lies beside the checkpoints from before the first file of the end is written until after the last.

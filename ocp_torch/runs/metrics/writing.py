@@ -1,4 +1,4 @@
-"""The practitioner's numbers and picture of a finished run, in files of their own beside the certificate."""
+"""The practitioner's numbers of a finished run, in a file of their own beside the certificate."""
 
 from __future__ import annotations
 
@@ -6,20 +6,17 @@ import json
 import logging
 from pathlib import Path
 
-from matplotlib.figure import Figure
-
+from ocp_torch.control.policies import Policy
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem
-from ocp_torch.runs.pictures import motion
-from ocp_torch.runs.practice import metrics, metrics_table
-from ocp_torch.runs.practice.paths import Law
+from ocp_torch.runs.metrics.trial import metrics, metrics_table
 
 log = logging.getLogger(__name__)
 METRICS = "metrics.json"
 
 
-def write_metrics(problem: Problem, policy: Law, seed: int, folder: Path | None) -> dict | None:
+def write_metrics(problem: Problem, policy: Policy, seed: int, folder: Path | None) -> dict | None:
     """Print the numbers of ``policy`` and write them as `metrics.json` in ``folder``, where the problem has any."""
     found = metrics(problem, policy, derive_seed(seed, Branch.METRICS))
     if found is None:
@@ -29,9 +26,3 @@ def write_metrics(problem: Problem, policy: Law, seed: int, folder: Path | None)
         text = json.dumps(found, indent=2) + "\n"
         write_atomically(folder / METRICS, lambda path: Path(path).write_text(text))
     return found
-
-
-def practical_figures(problem: Problem, policy: Law, seed: int) -> dict[str, Figure]:
-    """`motion`, for problems that have a scene."""
-    figure = motion(problem, policy, seed)
-    return {} if figure is None else {"motion": figure}

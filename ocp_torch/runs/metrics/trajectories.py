@@ -8,10 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ocp_torch.control.policies import Policy
 from ocp_torch.problems.problem import Problem
-
-# Maps states (N, d) to controls (N, m).
-Law = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -33,7 +31,7 @@ class Path:
 
 
 @torch.no_grad()
-def simulate(problem: Problem, policy: Law, x0: Tensor, duration: float, steps: int) -> Path:
+def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, steps: int) -> Path:
     r"""From ``x0`` ``(N, d)`` for ``duration``, by RK4 with a control recomputed at each stage.
 
     The cost is `int_0^T rho e^{-rho t} (f + R(u)) dt` by the trapezoidal rule: good to a few digits, where the certificate's

@@ -7,6 +7,7 @@ from functools import singledispatch
 import torch
 from torch import Tensor
 
+from ocp_torch.control.policies import Policy
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.dubins import Dubins
@@ -15,23 +16,27 @@ from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.systems.unicycle import Unicycle
-from ocp_torch.runs.practice.paths import Law
 
-# Gains per second, the damping of the pseudo-inverse relative to the arm's length, and where the pendulum's balance starts.
+# All tuned by hand, once.
+# Arms: the gain per second, and the damping of the pseudo-inverse relative to the arm's length.
 REACH, DAMPING = 1.5, 0.1
+# Vehicles: gains per second of speed and of turn rate.
 DRIVE, STEER = 1.0, 2.0
+# Oscillators: the gain of descent.
 DESCENT = 2.0
-PUMP, BALANCE, CATCH = 0.2, (20.0, 5.0), 0.5
+# Pendulum: the gain of the pump; those of the balance, on angle (1/s^2) and velocity (1/s); and angle in rad and speed in
+# rad/s below which it balances.
+PUMP, BALANCE, CATCH = 0.2, (20.0, 5.0), (0.5, 2.0)
 
 
 @singledispatch
-def classical_policy(problem: Problem) -> Law | None:
+def classical_policy(problem: Problem) -> Policy | None:
     """The classical controller of ``problem``, or `None` where nobody has named one."""
     return None
 
 
 @classical_policy.register
-def resolved_rate(problem: Linkage) -> Law:
+def resolved_rate(problem: Linkage) -> Policy:
     r"""`dtheta/dt = k J^+ (target - p)`, `J^+` the damped pseudo-inverse (Whitney, 1969; Nakamura and Hanafusa, 1986)."""
     damping = (DAMPING * problem.length) ** 2 or 1.0  # a tip on the last of its joints does not move: J = 0
 
@@ -51,7 +56,7 @@ def _bearing(problem: Unicycle | Dubins, x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @classical_policy.register
-def go_to_goal(problem: Unicycle) -> Law:
+def go_to_goal(problem: Unicycle) -> Policy:
     """Speed in proportion to the way ahead, turn rate to the bearing of the nearer end, front or back."""
 
     def policy(x: Tensor) -> Tensor:
@@ -63,7 +68,7 @@ def go_to_goal(problem: Unicycle) -> Law:
 
 
 @classical_policy.register
-def pursue(problem: Dubins) -> Law:
+def pursue(problem: Dubins) -> Policy:
     """Turn rate in proportion to the bearing of the target."""
 
     def policy(x: Tensor) -> Tensor:
@@ -75,7 +80,7 @@ def pursue(problem: Dubins) -> Law:
 
 @classical_policy.register(Kuramoto)
 @classical_policy.register(PhaseNeurons)
-def descend(problem: Problem) -> Law:
+def descend(problem: Problem) -> Policy:
     r"""`u = -k B' grad f`: proportional feedback on how the stimulus changes the synchrony (for Kuramoto, the mean field)."""
 
     def policy(x: Tensor) -> Tensor:
@@ -88,7 +93,7 @@ def descend(problem: Problem) -> Law:
 
 
 @classical_policy.register
-def energy_pump(problem: Pendulum) -> Law:
+def energy_pump(problem: Pendulum) -> Policy:
     """Pump energy, then balance by proportional and derivative feedback (Astrom and Furuta, 2000); `|u| <= 1`."""
 
     def policy(x: Tensor) -> Tensor:
@@ -97,7 +102,7 @@ def energy_pump(problem: Pendulum) -> Law:
         missing = pull * (1.0 - angle.cos()) - 0.5 * velocity.square()
         pump = PUMP * missing * torch.where(velocity < 0.0, -1.0, 1.0)
         balance = -(BALANCE[0] * angle + BALANCE[1] * velocity) / 3.0
-        near = (angle.abs() < CATCH) & (velocity.abs() < 2.0)
+        near = (angle.abs() < CATCH[0]) & (velocity.abs() < CATCH[1])
         return (torch.where(near, balance, pump) / problem.max_torque).clamp(-1.0, 1.0).unsqueeze(-1)
 
     return policy

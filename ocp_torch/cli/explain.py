@@ -1,0 +1,86 @@
+"""Hydra's and OmegaConf's own words as one sentence, with what would be right."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from hydra.errors import ConfigCompositionException, MissingConfigException, OverrideParseException
+from omegaconf import OmegaConf
+
+from ocp_torch.errors import nearest
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+CONFIGS = CHECKOUT / "configs"
+EXTRAS = {"hydra/launcher": "parallel"}  # Hydra's plugin groups -> the extra that installs them
+
+
+def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -> str:
+    """What ``error``, of Hydra or OmegaConf, has against the command line; ``overrides`` name the groups that were chosen."""
+    text = str(error)
+    unknown = re.search(r"Could not find '([\w./-]+)/([^'/]*)'", text)
+    if isinstance(error, MissingConfigException) and unknown:
+        group, choice = unknown.groups()
+        if group in EXTRAS:
+            return (
+                f"{group} is {choice!r}, which is not installed; pip install -e '.[{EXTRAS[group]}]' brings joblib's."
+            )
+        known = choices(group)
+        return f"{group} is {choice!r}, but must be one of {', '.join(known)}{nearest(choice, known)}."
+    override = re.search(r"Could not override '([\w.@/-]+)'", text)
+    if isinstance(error, ConfigCompositionException) and override:
+        field = override.group(1)
+        if is_choice(field):
+            known = ", ".join(choices(field))
+            return (
+                f"{field} is a group, not a field: {field}=... takes one of {known}, and {field}.<field>=... a value."
+            )
+        hint = field_hint(field, config_name, overrides)
+        return f"{field} is not a field of the configuration{hint}; write +{field}=... to add an argument of your own."
+    missing = re.search(r"Missing mandatory value: ([\w.]+)", text)
+    if missing:
+        field = getattr(error, "full_key", None) or missing.group(1)
+        return f"{field} is missing; give {field}=... on the command line."
+    if isinstance(error, OverrideParseException):
+        return f"{error.override!r} cannot be read; write field=value, and quote a value that holds signs of its own."
+    return " ".join(text.split()).rstrip(".") + "."
+
+
+def is_choice(override: str) -> bool:
+    """Whether it chooses a file of a group, and sets no field."""
+    return (CONFIGS / override.lstrip("+~").split("=")[0].partition("@")[0]).is_dir()
+
+
+def choices(group: str) -> list[str]:
+    """The files of a group."""
+    return sorted(p.stem for p in (CONFIGS / group).glob("*.yaml"))
+
+
+def field_hint(field: str, config_name: str, overrides: Iterable[str]) -> str:
+    """A bracket with the nearest field of the chosen groups, or, where none is near, with all that the group has."""
+    chosen = tuple(o for o in overrides if is_choice(o))
+    known = known_fields(config_name, chosen)
+    group, _, last = field.rpartition(".")
+    below = [k.removeprefix(f"{group}.") for k in known if group and k.startswith(f"{group}.")]
+    names = sorted(n for n in below if "." not in n and not n.startswith("_"))
+    if not names:
+        return nearest(field, known)
+    if nearest(last, names):  # names are compared alone: the group before them makes all of them look alike
+        return nearest(field, [f"{group}.{n}" for n in names])
+    return f" ({group} has {', '.join(names)})"
+
+
+@cache
+def known_fields(config_name: str, chosen: tuple[str, ...] = ()) -> list[str]:
+    """Dotted names of all fields and groups of the configuration with these groups ``chosen``, or of the default one."""
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        config = OmegaConf.to_container(compose(config_name, list(chosen)), resolve=False)
+
+    def names(node: dict, prefix: str = "") -> list[str]:
+        own = [f"{prefix}{k}" for k in node]
+        return own + [n for k, v in node.items() if isinstance(v, dict) for n in names(v, f"{prefix}{k}.")]
+
+    return names(config)

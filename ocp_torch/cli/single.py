@@ -1,0 +1,94 @@
+"""A single run: checked while nothing is written, and what was built for that is what then runs, in this process."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from hydra import initialize_config_dir
+from hydra._internal.callbacks import Callbacks
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import run_job
+from hydra.types import HydraContext, RunMode
+from omegaconf import DictConfig, OmegaConf, read_write
+
+from ocp_torch.cli.compose import configuration, parsed, plain, run_data
+from ocp_torch.cli.explain import CONFIGS
+from ocp_torch.cli.folders import fresh_folder, require_fresh, require_writable
+from ocp_torch.cli.job import Job
+from ocp_torch.errors import InputError, shown
+from ocp_torch.files.reading import require_unlinked
+from ocp_torch.problems.blame import blamed
+from ocp_torch.runs.configuration import locate
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A command that nothing is known against: its configuration, Hydra's part and the run's folder in it, and what the
+    check built."""
+
+    config_name: str
+    config: DictConfig
+    made: object
+
+
+def checked(arguments: list[str], config_name: str, check: Callable[[dict], object]) -> Checked:
+    """What ``arguments``, without Hydra's own options, ask for; a resume goes on in the folder of its run.
+
+    Raises `InputError` for anything that can be known to be wrong before a folder is made.
+    """
+    require_places_to_write(arguments, "hydra.run.dir")
+    given = {o.key_or_group: o.value() for o in parsed(arguments) if not o.is_sweep_override() and not o.is_delete()}
+    own = Path(str(given["hydra.run.dir"])) if "hydra.run.dir" in given else None
+    config = configuration(config_name, arguments)
+    try:
+        data = run_data(plain(config, config_name, arguments), arguments, roots=(own,) if own else ())
+        going_on = data.get("resume") is not None
+        folder = locate(Path(data["resume"]))[0] if going_on else own
+        if folder is not None:
+            require_unlinked(folder)
+        made = check(data)
+    except OSError as error:  # a name that no file can have, a device that gives nothing
+        told = blamed(error)
+        named = f"{shown(str(error.filename))} cannot be used" if error.filename else "a file cannot be used"
+        raise told or InputError(f"{named}: {error.strerror or error}.") from None
+    except (Exception, SystemExit) as error:
+        told = blamed(error)
+        if told is None and isinstance(error, SystemExit):  # somebody's module would end the run without a word
+            told = InputError(f"the code that the command line names asks Python to exit (status {error.code}).")
+        raise told or error from None
+    if own is not None and "resume" in data and not going_on:
+        require_fresh(own)
+    if going_on:
+        place = str(folder) if folder is not None else fresh_folder(data) if own is None else str(own)
+        with read_write(config):
+            OmegaConf.update(config, "hydra.run.dir", place)
+    return Checked(config_name, config, made)
+
+
+def require_places_to_write(arguments: list[str], name: str) -> None:
+    """Raise `InputError` where nothing can be written to the folder that ``name`` is given as."""
+    for value in (o.value() for o in parsed(arguments) if o.key_or_group == name and not o.is_sweep_override()):
+        # What is only known later, such as the time, is below what can be looked at now.
+        require_writable(name, Path(re.split(r"[^/]*\$\{", str(value))[0]))
+
+
+def carry_out(command: Checked, work: Callable[[object, Path], object]) -> None:
+    """`Hydra.run` for what is composed already: make the folder, begin its log, and do the ``work`` on what was built."""
+    config = command.config
+
+    def task(_: DictConfig) -> None:
+        hydra = HydraConfig.get()
+        this = Job(hydra, Path(hydra.runtime.output_dir))
+        with this.outcome():
+            work(command.made, this.folder)
+
+    with initialize_config_dir(str(CONFIGS), job_name=command.config_name, version_base="1.3"):
+        context = HydraContext(GlobalHydra.instance().config_loader(), Callbacks(config))
+        with read_write(config):
+            config.hydra.mode = RunMode.RUN
+        done = run_job(task, config, job_dir_key="hydra.run.dir", job_subdir_key=None, hydra_context=context)
+    _ = done.return_value  # raises what the job did

@@ -1,0 +1,99 @@
+"""Whether recorded arrays can be what they are called: signs, the range of states, the distribution they were drawn from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ocp_torch.errors import InputError
+from ocp_torch.problems.samples import Samples
+
+# Standard errors that a mean may be from what it must be: a normal variable is further off once in 5e8 times.
+SURE = 6.0
+# What is forgiven beside that, absolutely, of a mean that must be 0 or 1.
+FORGIVEN = 1e-3
+# Rounding of states and costs, relative to their size: files may be in single precision.
+ROUNDING = 1e-6
+# The frequencies of each coordinate by which the distribution of x is held against the density it is said to have.
+FREQUENCIES = (1, 2, 3)
+
+
+def samples_of(path: Path, arrays: dict[str, np.ndarray], wrap: bool) -> Samples:
+    """The ``arrays`` of the file ``path``, of known names and shapes and finite, as samples; with ``wrap`` states are taken
+    modulo 1. Raises `InputError` where values cannot be what their names say."""
+    x, f = arrays["x"], arrays["f"]
+    outside = (x < -ROUNDING) | (x > 1.0 + ROUNDING)
+    if outside.any() and not wrap:
+        row = int(outside.any(axis=1).argmax())
+        raise InputError(
+            f"{path}: x is {x[row].tolist()} at row {row}, outside [0, 1); scale each coordinate to period 1, "
+            "and set problem.wrap=true if whole turns should be taken off."
+        )
+    if (f < -ROUNDING * np.abs(f).max()).any():
+        row = int((f < 0.0).argmax())
+        raise InputError(f"{path}: f is {f[row]:g} at row {row}, but must not be negative.")
+    for name, what in (("density", "positive"), ("mu0", "at least 0")):
+        array = arrays.get(name)
+        if array is not None and ((array <= 0.0) if name == "density" else (array < 0.0)).any():
+            raise InputError(f"{path}: {name} falls to {array.min():g}, but must be {what}.")
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    one = torch.ones(len(f), dtype=torch.float64)
+    weight = 1.0 / tensors["density"] if "density" in tensors else one
+    samples = Samples(
+        x=torch.from_numpy(x).remainder(1.0),
+        f=tensors["f"].clamp_min(0.0),
+        a=tensors["a"],
+        B=tensors["B"],
+        mu0=tensors.get("mu0", one),
+        weight=weight,
+        div_a=tensors.get("div_a"),
+        div_B=tensors.get("div_B"),
+    )
+    _require_distribution(path, samples, "density" in tensors)
+    return samples
+
+
+def _require_distribution(path: Path, samples: Samples, given: bool) -> None:
+    """The weighted means of what integrates to a known number: 1, `mu0`, and waves along each coordinate."""
+    count = len(samples)
+    weigh = "mean of 1 / density" if given else "mean of 1"
+
+    def off(values: Tensor, truth: float) -> float:
+        """Standard errors between the weighted mean and ``truth``, less `FORGIVEN`."""
+        terms = samples.weight * values
+        return max(0.0, abs(float(terms.mean()) - truth) - FORGIVEN) / max(float(terms.std()) / count**0.5, 1e-12)
+
+    if off(torch.ones(count, dtype=torch.float64), 1.0) > SURE:
+        raise InputError(
+            f"{path}: the {weigh} is {float(samples.weight.mean()):.4g}, but must be 1: density is not that of x."
+        )
+    if off(samples.mu0, 1.0) > SURE:
+        mean = float(samples.mean(samples.mu0))
+        raise InputError(f"{path}: mu0 has mean {mean:.4g} over the torus, but a density must have mean 1.")
+    for i in range(samples.x.shape[1]):
+        for k in FREQUENCIES:
+            angle = 2.0 * torch.pi * k * samples.x[:, i]
+            if max(off(angle.cos(), 0.0), off(angle.sin(), 0.0)) > SURE:
+                source = "the density it comes with" if given else "the uniform law"
+                raise InputError(
+                    f"{path}: coordinate {i} of x does not follow {source}; "
+                    + ("give the density of the law it was drawn from." if not given else "density must be that of x.")
+                )
+
+
+def dependence_notes(path: Path, samples: Samples) -> tuple[str, ...]:
+    """Signs that the samples are no independent draws: the correlation of consecutive state costs."""
+    centred = samples.f - samples.f.mean()
+    spread = float(centred.square().sum())
+    if spread <= 0.0:
+        return ()
+    correlation = float((centred[1:] * centred[:-1]).sum()) / spread
+    if correlation * len(centred) ** 0.5 <= SURE:
+        return ()
+    return (
+        f"consecutive samples of {path.name} are alike (correlation {correlation:.2g}): they are no independent draws, and "
+        "errors and intervals are too small.",
+    )

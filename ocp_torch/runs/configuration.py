@@ -1,0 +1,120 @@
+"""The configurations that a run's folder keeps, one for each start, as plain data; and the checkpoint that a path names.
+
+Files may come from strangers: nothing in them is run, and what Hydra wrote is what was asked for, not what the run is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from pathlib import Path
+
+import yaml
+
+from ocp_torch.errors import InputError
+from ocp_torch.files.reading import FOLDER, kind, read_yaml
+from ocp_torch.files.storage import write_atomically
+from ocp_torch.problems.renamed import current_name, current_section
+from ocp_torch.training.checkpoint import load_checkpoint, newest
+
+CONFIG, AUTO = "config.yaml", "auto"
+
+
+def locate(path: Path) -> tuple[Path | None, Path | None]:
+    """The run's folder and the checkpoint that ``path`` names: a folder stands for its newest good checkpoint (`None`),
+    and a checkpoint that lies in no run's folder has none."""
+    if "${" in str(path):
+        raise InputError(f"resume is {str(path)!r}, which Hydra would take for an interpolation; rename the folder.")
+    found = kind(path)
+    if found == FOLDER:
+        return path, None
+    if found is None:
+        raise InputError(f"resume is {str(path)!r}, which does not exist; give a run's folder or a checkpoint.")
+    return (path.absolute().parent.parent if path.absolute().parent.name == "checkpoints" else None), path
+
+
+def load_state(path: Path) -> tuple[dict, Path, list[str]]:
+    """The state that ``path`` names, the file it came from, and a sentence on each damaged newer one."""
+    folder, checkpoint = locate(path)
+    if checkpoint is not None:
+        return current_state(load_checkpoint(checkpoint)), checkpoint, []
+    state, checkpoint, notes = newest(folder / "checkpoints")
+    return current_state(state), checkpoint, notes
+
+
+def current_state(state: object) -> object:
+    """The ``state`` of a run of any version, with the names that its problem has now."""
+    config = state.get("config") if isinstance(state, dict) else None
+    if not isinstance(config, dict):
+        return state
+    return {**state, "problem": current_name(state.get("problem"), config.get("problem")), "config": current(config)}
+
+
+def latest_subfolder(folder: Path) -> Path:
+    """Where the newest start's configuration lies: `.hydra`, or `.hydra/resume_<n>` after `n` resumes."""
+    return max((folder / ".hydra").glob("resume_*"), key=_number, default=folder / ".hydra")
+
+
+def next_subfolder(folder: Path) -> str:
+    """Where the next start's configuration goes: `.hydra` is the first start's, and stays."""
+    if not (folder / ".hydra" / CONFIG).exists():
+        return ".hydra"
+    return f".hydra/resume_{_number(latest_subfolder(folder)) + 1}"
+
+
+def _number(path: Path) -> int:
+    found = re.fullmatch(r"resume_(\d{1,9})", path.name)
+    return int(found.group(1)) if found else 0
+
+
+def saved_configuration(path: Path) -> dict:
+    """The configuration of the run that ``path`` names, as plain data: that of its newest start that got going, or, for
+    a checkpoint without a run's folder, its own copy."""
+    folder, checkpoint = locate(path)
+    starts = sorted((folder / ".hydra").glob("resume_*"), key=_number, reverse=True) if folder else []
+    for start in starts:
+        # Until a start has been checked, its file is what was asked for, names a run, and may be half written.
+        with contextlib.suppress(InputError, OSError):
+            config = read_configuration(start / CONFIG)
+            if config.get("resume", "") is None and (start / CONFIG).read_bytes().endswith(b"\n"):
+                return config
+    if folder is not None and kind(folder / ".hydra" / CONFIG) is not None:
+        config = read_configuration(folder / ".hydra" / CONFIG)
+        # One that names a run to go on with is that of a resume too: the folder had no configuration before.
+        if config.get("resume") in (None, AUTO):
+            return {**config, "resume": None}
+    config = load_state(path)[0].get("config")
+    if not isinstance(config, dict):
+        raise InputError(f"{path} holds no configuration.")
+    return {**config, "resume": None}
+
+
+def read_configuration(file: Path) -> dict:
+    """A configuration file as plain nested data; runs nothing. Raises `InputError` when it is damaged or crafted."""
+    return current(read_yaml(file))
+
+
+def current(config: dict) -> dict:
+    """A ``config`` of any version as this one would have written it."""
+    config = {name: value for name, value in config.items() if name != "hydra"}
+    return {**config, "problem": current_section(config["problem"])} if "problem" in config else config
+
+
+def keep_configuration(folder: Path, config: dict) -> None:
+    """Write the configuration with which a run goes on, or begins again, beside its first start's."""
+    file = latest_subfolder(folder) / CONFIG
+    text = yaml.safe_dump({**config, "resume": None}, sort_keys=False, allow_unicode=True)
+    write_atomically(file, lambda temporary: temporary.write_text(text))
+
+
+def adopt(stub: Path, folder: Path) -> None:
+    """Move what Hydra wrote into the fresh ``stub`` to the run's own ``folder``, and remove the stub."""
+    target = folder / next_subfolder(folder)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    os.replace(stub / ".hydra", target)
+    for log in stub.glob("*.log"):
+        if log.stat().st_size == 0:
+            log.unlink()
+    if not any(stub.iterdir()):
+        stub.rmdir()

@@ -1,0 +1,22 @@
+"""What is told of a run while it goes on."""
+
+from __future__ import annotations
+
+from ocp_torch.certificate import Certificate
+from ocp_torch.steppers import StepReport
+
+
+class Silent:
+    """Is told by the `Trainer` ``trainer``, and shows nothing: for tests, for use as a library, and to inherit from."""
+
+    def stepped(self, trainer, report: StepReport, log: bool) -> None:
+        """A step was taken; ``log`` says whether it is one to be recorded."""
+
+    def evaluated(self, trainer, certificate: Certificate) -> None:
+        """A quick certificate was made."""
+
+    def extended(self, trainer) -> None:
+        """Another round begins."""
+
+    def noticed(self, sentence: str) -> None:
+        """Something is wrong with the run's health."""

@@ -1,0 +1,46 @@
+"""Why a run stops, and what a user is told of it."""
+
+from __future__ import annotations
+
+from ocp_torch.certificate import Certificate
+from ocp_torch.training.rounds import Rounds
+from ocp_torch.training.settings import TrainerSettings
+from ocp_torch.training.state import TrainState
+
+STEPS, TARGET_GAP, MAX_SECONDS = "steps", "target_gap", "max_seconds"
+NOT_FINITE, FAILED = "not_finite", "failed"
+# After a certificate that did not reach the target gap, the next is tried at so many times the step: there are then few of
+# them, also in a long run, and it stops at most a quarter later than it could.
+RETRY = 1.25
+
+
+def reason_to_stop(settings: TrainerSettings, state: TrainState) -> str | None:
+    """The reason to stop before the next step, or `None`."""
+    if state.pending:
+        return TARGET_GAP
+    limit = settings.max_seconds
+    return MAX_SECONDS if limit is not None and state.elapsed >= limit else None
+
+
+def in_words(reason: str, settings: TrainerSettings, rounds: Rounds, state: TrainState) -> str:
+    """``reason`` as a user is told."""
+    at = f"step {state.step:,}"
+    if reason == MAX_SECONDS:
+        return f"trainer.max_seconds = {settings.max_seconds:g} are over, at {at} of {rounds.end(state.round):,}"
+    if reason == TARGET_GAP:
+        return f"a quick evaluation at {at} finds trainer.target_gap = {settings.target_gap:g} reached"
+    more = state.round + 1 < rounds.most
+    return f"all {state.step:,} steps are done" + (
+        f", and trainer.good_gap = {settings.good_gap:g} is met" if more else ""
+    )
+
+
+def may_be_reached(settings: TrainerSettings, state: TrainState, certificate: Certificate) -> bool:
+    """Whether the quick ``certificate`` has the target gap, and enough steps were taken since the last try."""
+    target, gap = settings.target_gap, certificate.plain_gap
+    return target is not None and gap is not None and gap <= target and state.step >= state.retry
+
+
+def postpone(state: TrainState) -> None:
+    """The full certificate did not reach the target gap: training goes on, and it is tried again later."""
+    state.pending, state.retry = False, round(RETRY * state.step)
