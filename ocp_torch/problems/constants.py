@@ -81,10 +81,10 @@ def resolve_constants(
         if configured[name] is not None:
             chosen[name] = require_number(fields[name], configured[name], above=0.0)
             sources[name] = FROM_CONFIGURATION
-        elif known[name] is not None and math.isfinite(known[name]):
+        elif (declared := known[name]) is not None and math.isfinite(declared):
             # J bounds the cost of a controller that is not quite optimal only if C_V leaves it room above V*.
             room = MARGIN if name == "C_V" else 1.0
-            chosen[name], sources[name] = room * float(known[name]), FROM_PROBLEM
+            chosen[name], sources[name] = room * float(declared), FROM_PROBLEM
         else:
             if name == "C_u" and problem.control_limit is not None:
                 chosen[name], sources[name] = problem.control_limit, FROM_PROBLEM

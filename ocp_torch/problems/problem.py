@@ -50,10 +50,11 @@ class Problem:
     knows_control_matrix: bool = True
     # Arguments that say where the data come from, not what they are: another run may give others.
     incidental: tuple[str, ...] = ()
+    _given: tuple[tuple, dict]  # the arguments it was made with, for `parameters`
 
     def __new__(cls, *args, **kwargs) -> Problem:
         made = super().__new__(cls)
-        made._given = args, kwargs  # for `parameters`
+        made._given = args, kwargs
         return made
 
     def __init__(

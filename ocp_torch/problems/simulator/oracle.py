@@ -50,7 +50,7 @@ class Oracle:
         self.one_by_one = self.driftless = self.gives_mu0 = self.in_float32 = False
         self._understand()
         self._check_the_seam()
-        if workers > 1:
+        if isinstance(target, str) and workers > 1:
             self._pool = Workers(target, workers)
 
     def answers(self, at: Tensor) -> dict:
@@ -104,8 +104,8 @@ class Oracle:
             if name == "a" and part is None:
                 part = np.zeros((count, d))
             try:
-                array = np.asarray(part)
-                array = array.astype(np.float64) if array.dtype.kind in "fiu" else None
+                given = np.asarray(part)
+                array = given.astype(np.float64) if given.dtype.kind in "fiu" else None
             except (TypeError, ValueError):
                 array = None
             if array is None:

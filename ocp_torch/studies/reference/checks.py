@@ -32,7 +32,7 @@ def grid_sides(dim: int, side: int | None, memory: float) -> tuple[int, int, int
         )
     ratio = RATIO[dim]
     finest = FINEST[dim] if side is None else require_integer("side", side, 1)
-    sides = tuple(round(finest / ratio**k) for k in (2, 1, 0))
+    sides = round(finest / ratio**2), round(finest / ratio), round(finest)
     if sides[0] < FEWEST_NODES:
         least = round(FEWEST_NODES * ratio**2)
         raise InputError(
