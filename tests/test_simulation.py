@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import zoo
-from ocp_torch.certificate.checks.assumptions import occupation_along_flow
+from ocp_torch.certificate.simulated.occupation import occupation_along_flow
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance
-from ocp_torch.certificate.simulated.simulation import discounted_integral, refined
+from ocp_torch.maths.runge_kutta import discounted_integral, refined
 from ocp_torch.maths.sampling import evaluation_points
 
 TURN = 2.0 * math.pi

@@ -71,6 +71,11 @@ class Estimate:
         return {"value": self.value, "se": self.se, **extra}
 
 
+def known(estimate: Estimate | None) -> bool:
+    """Whether there is a number."""
+    return estimate is not None and estimate.finite
+
+
 @torch.no_grad()
 def replicated_samples(
     problem: Problem, count: int, replicates: int, seed: int, divergences: bool, policy: Mixture | None = None

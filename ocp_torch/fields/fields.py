@@ -72,7 +72,7 @@ class Fields(nn.Module):
 
 # A state cost whose mean is within this factor of 1 is of an ordinary size.
 ORDINARY = 1e4
-# What was found for a problem: the search takes seconds in eight dimensions, and the stage builds networks again.
+# What was found for a problem: the search takes seconds in eight dimensions, and policy evaluation builds networks again.
 _found: WeakKeyDictionary[Problem, dict[int, Tensor]] = WeakKeyDictionary()
 
 

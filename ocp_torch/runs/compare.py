@@ -11,7 +11,7 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ocp_torch.certificate.certificate import LONGEST_NAME
+from ocp_torch.certificate.run import LONGEST_NAME
 from ocp_torch.errors import InputError, visible
 from ocp_torch.files.reading import FOLDER, kind, read_json
 from ocp_torch.files.storage import write_atomically

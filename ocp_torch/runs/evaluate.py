@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields, table
-from ocp_torch.certificate.certify import in_float64
+from ocp_torch.certificate.trained import in_float64
 from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.control.policies import Policy, trained_policies
 from ocp_torch.errors import InputError, require_integer, require_section

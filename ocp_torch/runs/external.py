@@ -33,7 +33,7 @@ from ocp_torch.training.budgets import fill
 
 log = logging.getLogger(__name__)
 
-# Branch of the seed tree for the V trained here, beside those of runs, evaluation and the stage.
+# Branch of the seed tree for the V trained here, beside those of runs, certificates and policy evaluation.
 JUDGE_STREAM = 4
 # States at which a controller trained under another limit is held against the problem's.
 LIMIT_PROBES = 2**14

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings, table
-from ocp_torch.certificate.certify import in_float64
+from ocp_torch.certificate.trained import in_float64
 from ocp_torch.control.controller import Controller
 from ocp_torch.control.policies import trained_policies
 from ocp_torch.errors import InputError, StorageError

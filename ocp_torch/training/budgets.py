@@ -13,7 +13,7 @@ from ocp_torch.problems.constants import is_unbounded
 
 @dataclass(frozen=True)
 class Budget:
-    """One row: up to ``dim`` coordinates, for a run and for its certification stage."""
+    """One row: up to ``dim`` coordinates, for a run and for the policy evaluation of its certificate."""
 
     dim: float
     modes: int

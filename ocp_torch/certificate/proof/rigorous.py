@@ -24,7 +24,6 @@ from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.lower.shifted import slack_function
 from ocp_torch.certificate.proof.activations import SERIES
 from ocp_torch.certificate.proof.network_model import network_model
-from ocp_torch.certificate.sides import LowerSide
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.mlp import Gated, PeriodicMLP
 from ocp_torch.maths.enclosure import contradiction
@@ -263,12 +262,3 @@ def _conclude(slack, sampled_slack, means, radii, count, theta, seconds, complet
     low, high = math.nextafter(middle - radius, -math.inf), math.nextafter(middle + radius, math.inf)
     bound = math.nextafter(low - slack, -math.inf)
     return RigorousBound(bound, slack, sampled_slack, (low, high), count, theta, seconds, complete)
-
-
-def proved_lower(problem: Problem, value: nn.Module, lower: LowerSide) -> tuple[RigorousBound | None, list[str]]:
-    """The proved counterpart of ``lower.own``, or a warning that says why there is none."""
-    why = obstacle(problem, value)
-    if why is not None:
-        return None, [f"no rigorous lower bound: {why}."]
-    bound = rigorous_lower_bound(problem, value, theta=lower.own.theta, sampled_slack=lower.own.largest.value)
-    return bound, [] if bound else ["no rigorous lower bound: nothing finite was proved within the budget of cells."]
