@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.student import t_factor
+from ocp_torch.certificate.estimate import t_factor
 
 # Waves along each of the first axes, and in random directions.
 ALONG, MOST_AXES, RANDOM, LARGEST = (1, 2, 3, 4, 6, 8, 12), 8, 24, 4
