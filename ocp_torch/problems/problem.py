@@ -5,8 +5,6 @@ minimise  rho E_{x0 ~ mu0} int_0^inf e^{-rho t} (f(x_t) + |u_t|^q / q) dt,   dx/
 
 from __future__ import annotations
 
-import inspect
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -17,6 +15,7 @@ from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.control_limit import control_cost
 from ocp_torch.problems.lipschitz import Lipschitz
+from ocp_torch.problems.reproducible import Reproducible
 from ocp_torch.problems.samples import Samples
 
 # With more, `B` alone would take over 8 GB for a batch of a thousand states.
@@ -30,7 +29,7 @@ MARGIN = 1.05
 SCAN_FACTOR = 32
 
 
-class Problem:
+class Problem(Reproducible):
     """Base class: override `state_cost`, and whatever else differs from `dx/dt = u` with a uniform start.
 
     All methods are batched, take states ``(N, d)``, work in the precision and on the device of their argument, and have
@@ -50,12 +49,6 @@ class Problem:
     knows_control_matrix: bool = True
     # Arguments that say where the data come from, not what they are: another run may give others.
     incidental: tuple[str, ...] = ()
-    _given: tuple[tuple, dict]  # the arguments it was made with, for `parameters`
-
-    def __new__(cls, *args, **kwargs) -> Problem:
-        made = super().__new__(cls)
-        made._given = args, kwargs
-        return made
 
     def __init__(
         self,
@@ -189,20 +182,6 @@ class Problem:
         raise InputError(
             f"{type(self).__name__} does not know the environment {env}: it must define from_observation and to_action."
         )
-
-    @property
-    def parameters(self) -> dict:
-        """The arguments that make this problem again: each `__init__` argument is read from the attribute of its name, or,
-        where there is none, is what was given."""
-        args, kwargs = self._given
-        signature = inspect.signature(type(self).__init__)
-        bound = signature.bind(self, *args, **kwargs)
-        bound.apply_defaults()
-        found = dict(list(bound.arguments.items())[1:])
-        for name, parameter in signature.parameters.items():
-            if parameter.kind is parameter.VAR_KEYWORD:
-                found |= found.pop(name)
-        return {name: getattr(self, name, value) for name, value in found.items()}
 
     def _like(self, x: Tensor, name: str, constant: Tensor) -> Tensor:
         """``constant`` in the precision and on the device of ``x``, converted once."""
