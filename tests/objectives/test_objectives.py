@@ -1,10 +1,12 @@
 """What the losses of all methods share: units do not matter, a weight is a number of states, and a penalty is not a mean."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from ocp_torch.fields import Fields
-from ocp_torch.objectives import METHODS
+from ocp_torch.objectives import METHODS, Phase
 from ocp_torch.objectives.policy_evaluation import PolicyEvaluation
 from ocp_torch.problems import Problem
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -59,16 +61,17 @@ class Times(torch.nn.Module):
         return self.unit * self.network(x)
 
 
-def losses(objective, fields: Fields, samples: Samples) -> dict[str, float]:
-    return {player: loss.item() for player, loss in objective.losses(fields, samples).items()}
+def losses(objective, fields: Fields, samples: Samples, constants: Constants) -> dict[str, float]:
+    found = objective.losses(fields, samples, Phase(constants))
+    return {player: loss.item() for player, loss in found.items()}
 
 
-def made(kind: str, problem: Problem, constants: Constants, **options):
+def made(kind: str, problem: Problem, **options):
     """The objective, and the problem whose samples it reads."""
     if kind != "policy evaluation":
-        return METHODS[kind](problem, constants, **options), problem
+        return METHODS[kind](problem, **options), problem
     loop = ClosedLoop(problem, lambda x: getattr(problem, "control", 1.0) * 0.2 * (6.2831853 * x).sin()[:, :1])
-    return PolicyEvaluation(loop, constants, True, 3.0), loop
+    return PolicyEvaluation(loop, True, 3.0), loop
 
 
 KINDS = {
@@ -104,10 +107,10 @@ def test_units_of_cost_and_of_time_do_not_matter(kind, name):
     there = Fields({n: Times(network, units[n]) for n, network in fields.networks.items()})
     measured = Constants(constants.M, COST * constants.C_V, other.control * constants.C_u, constants.sources)
     x = zoo.states(problem, 500)
-    objective, data = made(method, problem, constants, **options)
-    found = losses(objective, fields, Samples.of(data, x))
-    objective, data = made(method, other, measured, **options)
-    again = losses(objective, there, Samples.of(data, x))
+    objective, data = made(method, problem, **options)
+    found = losses(objective, fields, Samples.of(data, x), constants)
+    objective, data = made(method, other, **options)
+    again = losses(objective, there, Samples.of(data, x), measured)
     unit = 1.0 if method == "policy evaluation" else COST
     assert again == pytest.approx({player: unit * loss for player, loss in found.items()}, rel=1e-9)
 
@@ -116,24 +119,22 @@ def test_units_of_cost_and_of_time_do_not_matter(kind, name):
 def test_a_weight_is_a_number_of_states(kind, name):
     """A state of weight `k` is `k` states, one of weight 0 none."""
     (method, options), problem = KINDS[kind], zoo.build(name)
-    fields = random_fields(problem, 5, 0.3)
-    objective, data = made(method, problem, resolve_constants(problem), **options)
+    fields, constants = random_fields(problem, 5, 0.3), resolve_constants(problem)
+    objective, data = made(method, problem, **options)
     x = zoo.states(problem, 300)
     counts = torch.arange(len(x)) % 4
     weight = counts * len(x) / counts.sum().double()
-    once = losses(objective, fields, Samples.of(data, x, weight=weight))
-    often = losses(objective, fields, Samples.of(data, x.repeat_interleave(counts, dim=0)))
+    once = losses(objective, fields, Samples.of(data, x, weight=weight), constants)
+    often = losses(objective, fields, Samples.of(data, x.repeat_interleave(counts, dim=0)), constants)
     assert once == pytest.approx(often, rel=1e-9)
 
 
-def test_only_violations_are_weighed_by_attention():
-    """Twice the attention is twice the multiplier `M`: what is gained, `E[V mu0]`, keeps its weights."""
+def test_a_penalty_weight_is_a_multiple_of_the_multiplier():
+    """What is gained, `E[V mu0]`, keeps the weights of the integrals."""
     problem = zoo.build("swing")
     fields, constants = random_fields(problem, 5, 0.3), resolve_constants(problem)
-    samples = Samples.of(problem, zoo.states(problem, 300))
-    columns = vars(samples)
-    dual = METHODS["dual"](problem, constants)
-    loss = lambda attention: losses(dual, fields, Samples(**{**columns, "attention": attention}))["value"]
+    samples, dual = Samples.of(problem, zoo.states(problem, 300)), METHODS["dual"](problem)
+    loss = lambda weight: losses(dual, fields, replace(samples, penalty_weight=weight), constants)["value"]
     none, one, two = (loss(level * samples.weight) for level in (0.0, 1.0, 2.0))
     assert none == pytest.approx(-float((fields.value(samples.x) * samples.mu0).mean()), rel=1e-12)
     assert one == pytest.approx(loss(None), rel=1e-12)
@@ -149,7 +150,7 @@ def test_policy_evaluation_weighs_missing_mass(log_mu, weighs):
     fields = Fields({"log_occupation": Field(lambda x: 0.0 * x[:, 0] + log_mu)})
     samples = Samples.of(loop, zoo.states(problem, 50))
     even, priced = (
-        losses(PolicyEvaluation(loop, constants, False, price), fields, samples)["occupation"] for price in (1.0, 5.0)
+        losses(PolicyEvaluation(loop, False, price), fields, samples, constants)["occupation"] for price in (1.0, 5.0)
     )
     assert even == pytest.approx((1.0 - torch.tensor(log_mu, dtype=torch.float64).exp().item()) ** 2, rel=1e-6)
     assert priced == pytest.approx(weighs * even, rel=1e-9)

@@ -129,7 +129,8 @@ def test_the_coupling_is_the_value_times_the_residual_it_is_the_multiplier_of(co
     fields = Fields({"value": Function(V), "control_density": Function(w), "log_occupation": Function(log_mu)})
     generator = Generator.of(problem, samples)
     r = generator.control_inflow(w)[1] - generator.occupation_outflow(log_mu)[1]
-    loss = lambda c: saddle(problem, resolve_constants(problem), coupling=c, warm_start=0.0).losses(fields, samples)
+    phase = Phase(resolve_constants(problem))
+    loss = lambda c: saddle(problem, coupling=c, warm_start=0.0).losses(fields, samples, phase)
     earned = loss(0.0)["value"] - loss(coupling)["value"]
     assert abs(float((V(samples.x) * r).mean())) > 1e-3
     torch.testing.assert_close(earned, coupling * (V(samples.x) * r).mean(), rtol=1e-6, atol=1e-12)
