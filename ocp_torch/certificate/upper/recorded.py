@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 # The samples with most mass, at which the contraction of the flow is looked at.
 TOP = 10
-# Branch of the seed tree for the draws of the fit, as in `policy_evaluation`.
-STREAM = 3
 
 
 class RecordedPrimal(PenalisedPrimal):
