@@ -81,7 +81,7 @@ def problem_name(problem: Problem) -> str:
 
 
 def plain_parameters(parameters: dict) -> dict:
-    """Those of a problem's ``parameters`` that JSON can hold. What it cannot, only a user's own problem has, and that is handed
-    in on loading."""
+    """Those of a problem's ``parameters`` that JSON can hold. Others only a user's own problem has, which is handed in on
+    loading."""
     listed = {k: list(v) if isinstance(v, tuple) else v for k, v in parameters.items()}
     return {k: v for k, v in listed.items() if isinstance(v, bool | int | float | str | list | type(None))}
