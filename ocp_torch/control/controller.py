@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 import torch
@@ -41,6 +42,10 @@ class Controller:
         self._policy = trained_policies(self.occupation, self.problem, self.fields, self.constants)[self.kind]
         self._like = next(self.fields.parameters())
 
+    @overload
+    def __call__(self, x: Tensor) -> Tensor: ...
+    @overload
+    def __call__(self, x: np.ndarray) -> np.ndarray: ...
     def __call__(self, x: Tensor | np.ndarray) -> Tensor | np.ndarray:
         """Controls ``(N, m)`` at states ``(N, d)``: any reals, wrapped to the torus; NumPy in gives NumPy out.
 

@@ -9,7 +9,8 @@ import pickletools
 import re
 import zipfile
 from collections.abc import Iterator
-from typing import BinaryIO
+from io import BufferedReader
+from typing import BinaryIO, cast
 
 import torch
 from torch import Tensor
@@ -28,7 +29,7 @@ SHARED = 4
 class After:
     """What follows the first ``start`` bytes of an open file, as a file of its own: only what is asked for is in memory."""
 
-    def __init__(self, file: BinaryIO, start: int) -> None:
+    def __init__(self, file: BufferedReader, start: int) -> None:
         self.file, self.start = file, start
         self.size = file.seek(0, os.SEEK_END) - start
         self.seek(0)
@@ -53,7 +54,7 @@ def unpacked(content: After) -> object:
     """Plain data with tensors, as `torch.save` wrote them. Raises `pickle.UnpicklingError` where there is anything else in
     it, which is not run, `ValueError` where it is crafted, and whatever PyTorch raises where it is damaged."""
     _require_modest(content)
-    state = torch.load(content, map_location="cpu", weights_only=True)
+    state = torch.load(cast(BinaryIO, content), map_location="cpu", weights_only=True)
     require_plain(state, tensors=True)
     _require_whole(state, content.size)
     return state
@@ -61,7 +62,7 @@ def unpacked(content: After) -> object:
 
 def _require_modest(content: After) -> None:
     """A crafted archive could unpack to any size; `torch.save` never compresses. And its list of parts makes few things."""
-    with zip_file(content) as archive:
+    with zip_file(cast(BinaryIO, content)) as archive:
         entries = archive.infolist()
         if (
             any(e.compress_type != zipfile.ZIP_STORED for e in entries)
@@ -81,7 +82,7 @@ def _require_few_things(listed: bytes) -> None:
         if count > MOST_INSTRUCTIONS:
             raise ValueError("the list of its parts is too long")
         name = instruction.name
-        if name in ("STACK_GLOBAL", "INST", "OBJ") or (name == "GLOBAL" and not MADE_OF.fullmatch(argument)):
+        if name in ("STACK_GLOBAL", "INST", "OBJ") or (name == "GLOBAL" and not MADE_OF.fullmatch(str(argument))):
             raise pickle.UnpicklingError
 
 

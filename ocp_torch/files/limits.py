@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from ocp_torch.errors import InputError
 
 # Whole numbers and lengths of lists among a problem's arguments; `seed` is but a name.
@@ -43,7 +45,7 @@ def _require_modest(source: object, name: str, value: object, remedy: str) -> No
         )
 
 
-def require_modest_run(source: object, config: dict, named: set[str] = frozenset()) -> None:
+def require_modest_run(source: object, config: dict, named: Collection[str] = frozenset()) -> None:
     """Raise `InputError` where the plain ``config`` that the file ``source`` holds asks for too much of anything but what
     the command line ``named``."""
     for field, limit in {**MOST, **LEAST}.items():

@@ -72,7 +72,7 @@ def _environment_class() -> type:
     """The class, made when Gymnasium is there."""
     gymnasium = require_gymnasium()
 
-    class ControlEnvironment(gymnasium.Env):
+    class ControlEnvironment(gymnasium.Env):  # type: ignore[name-defined]
         metadata: dict = {"render_modes": ["rgb_array"], "render_fps": 15}
 
         def __init__(self, problem, control_bound, time_step, horizon, seed, render_mode) -> None:

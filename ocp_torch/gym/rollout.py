@@ -6,6 +6,7 @@ import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -67,10 +68,10 @@ class RolloutJob:
             env.close()
         log.info("%s: %s", self.env, found)
         if self.video is not None:
-            self._film()
+            self._film(self.video)
         return found
 
-    def _film(self) -> None:
+    def _film(self, video: Path) -> None:
         """The first episode again, with pictures."""
         env = made(self.env, "rgb_array")
         frames: list[np.ndarray] = []
@@ -79,8 +80,8 @@ class RolloutJob:
             rate = env.metadata.get("render_fps", 15)
         finally:
             env.close()
-        save_gif(self.video, frames, rate)
-        log.info("%d frames in %s", len(frames), self.video)
+        save_gif(video, frames, rate)
+        log.info("%d frames in %s", len(frames), video)
 
 
 def made(name: str, render_mode: str | None):
@@ -128,8 +129,10 @@ def _picture(env, name: str) -> np.ndarray:
 def save_gif(path: Path, frames: list[np.ndarray], rate: float) -> None:
     """Write ``frames`` as a GIF of ``rate`` pictures a second."""
     images = [Image.fromarray(frame) for frame in frames]
-    options = dict(format="GIF", save_all=True, append_images=images[1:], duration=round(1000.0 / rate), loop=0)
-    write_atomically(path, lambda temporary: images[0].save(temporary, **options))
+    options: dict[str, Any] = dict(
+        format="GIF", save_all=True, append_images=images[1:], duration=round(1000.0 / rate), loop=0
+    )
+    write_atomically(path, lambda temporary: images[0].save(temporary, duration=round(1000.0 / rate), **options))
 
 
 def rollout_job(config: dict) -> RolloutJob:

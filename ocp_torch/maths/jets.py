@@ -44,7 +44,7 @@ def jet(field: Field, x: Tensor) -> Jet:
         return own(x)
     again, at = torch.is_grad_enabled(), _differentiable(x)
     if at is None:
-        value, pullback = torch.func.vjp(field, x)
+        value, pullback = torch.func.vjp(field, x)[:2]
         return Jet(value, pullback(torch.ones_like(value))[0])
     with torch.enable_grad():
         value = field(at)
@@ -75,7 +75,7 @@ def value_and_jacobian(field: Field, x: Tensor) -> tuple[Tensor, Tensor]:
     again, at = torch.is_grad_enabled(), _differentiable(x)
     basis = lambda w: torch.eye(w.shape[1], dtype=w.dtype, device=w.device).unsqueeze(1).expand(-1, len(x), -1)
     if at is None:
-        value, pullback = torch.func.vjp(field, x)
+        value, pullback = torch.func.vjp(field, x)[:2]
         return value, torch.func.vmap(pullback)(basis(value))[0]
     with torch.enable_grad():
         value = field(at)

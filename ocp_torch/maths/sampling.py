@@ -69,7 +69,7 @@ class SobolSampler:
     def __init__(self, dim: int, seed: int, dtype: torch.dtype) -> None:
         self.dim, self.seed, self.dtype = dim, seed, dtype
         self.count = 0
-        self._buffer, self._start = None, -1
+        self._buffer, self._start = torch.empty(0, dim, dtype=dtype), -1
 
     def draw(self, count: int) -> Tensor:
         """The next ``count`` states, ``(count, d)``."""

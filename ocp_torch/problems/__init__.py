@@ -16,7 +16,7 @@ from ocp_torch.problems.systems.robot import RobotArm
 from ocp_torch.problems.systems.unicycle import Unicycle
 
 # `Simulator` is not among them: a file may not name a function to be imported.
-PROBLEMS = {
+PROBLEMS: dict[str, type[Problem]] = {
     "circle": Circle,
     "torus": Torus,
     "manufactured": Manufactured,

@@ -46,7 +46,7 @@ class Generator:
 
     data: Samples | Any
     rho: float
-    cost: PowerCost | None = None
+    cost: PowerCost | Any = None
 
     @classmethod
     def of(cls, problem: Problem, samples: Samples) -> Generator:

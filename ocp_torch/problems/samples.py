@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -67,7 +68,7 @@ class Samples:
 
     def take(self, index: Tensor | slice) -> Samples:
         """The samples at the rows ``index``."""
-        return Samples(**{k: None if v is None else v[index] for k, v in self._columns()})
+        return self._map(lambda column: column[index])
 
     def take_weighted(self, most: int | None = None) -> tuple[Samples, Tensor]:
         """Those that carry weight, the first ``most`` of them, and their rows; `mean` estimates the same integrals."""
@@ -78,7 +79,7 @@ class Samples:
 
     def to(self, like: Tensor) -> Samples:
         """The samples in the precision and on the device of ``like``."""
-        return Samples(**{k: None if v is None else v.to(like) for k, v in self._columns()})
+        return self._map(lambda column: column.to(like))
 
     def split(self, chunk: int) -> list[Samples]:
         """The samples in pieces of at most ``chunk`` states."""
@@ -88,8 +89,12 @@ class Samples:
     @staticmethod
     def concatenate(pieces: list[Samples]) -> Samples:
         """All ``pieces`` as one batch."""
-        columns = {k: [getattr(p, k) for p in pieces] for k, _ in pieces[0]._columns()}
-        return Samples(**{k: None if v[0] is None else torch.cat(v) for k, v in columns.items()})
+        columns: dict[str, Any] = {f.name: [getattr(p, f.name) for p in pieces] for f in fields(Samples)}
+        columns |= {name: None if parts[0] is None else torch.cat(parts) for name, parts in columns.items()}
+        return Samples(**columns)
 
-    def _columns(self) -> list[tuple[str, Tensor | None]]:
-        return [(f.name, getattr(self, f.name)) for f in fields(self)]
+    def _map(self, change: Callable[[Tensor], Tensor]) -> Samples:
+        """With each column there is ``change``d."""
+        columns: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        columns |= {name: change(column) for name, column in columns.items() if column is not None}
+        return Samples(**columns)

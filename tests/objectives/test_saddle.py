@@ -15,8 +15,10 @@ from ocp_torch.objectives import Phase, primal, saddle
 from ocp_torch.objectives.saddle import AugmentedSaddle, Saddle
 from ocp_torch.problems import Manufactured
 from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from support import zoo
+from support.exact import lattice
 
 SMOOTH = {
     "drift": Manufactured(dim=2, initial_contrast=0.3),
@@ -114,6 +116,24 @@ def test_the_density_player_works_on_states_that_carry_weight_and_on_so_many_at_
     torch.testing.assert_close(loss(batch, 40), loss(drawn.take(slice(40)), None))
     with pytest.raises(InputError, match="method.density_batch is 0"):
         loss(batch, 0)
+
+
+@pytest.mark.parametrize("coupling", [0.5, 2.0])
+def test_the_coupling_is_the_value_times_the_residual_it_is_the_multiplier_of(coupling):
+    """By parts, on a grid that integrates smooth functions exactly: the value player earns `c E[V r]`."""
+    problem = Manufactured(dim=2, initial_contrast=0.3)
+    samples = Samples.of(problem, lattice(2))
+    wave = lambda x: (2.0 * math.pi * (x[:, 0] - 2.0 * x[:, 1])).cos()
+    V = lambda x: problem.exact_value(x) + 0.1 * wave(x)
+    w, log_mu = lambda x: 0.2 * problem.exact_control(x), lambda x: 0.3 * wave(x)
+    fields = Fields({"value": Function(V), "control_density": Function(w), "log_occupation": Function(log_mu)})
+    generator = Generator.of(problem, samples)
+    r = generator.control_inflow(w)[1] - generator.occupation_outflow(log_mu)[1]
+    phase = Phase(resolve_constants(problem))
+    loss = lambda c: saddle(problem, coupling=c, warm_start=0.0).losses(fields, samples, phase)
+    earned = loss(0.0)["value"] - loss(coupling)["value"]
+    assert abs(float((V(samples.x) * r).mean())) > 1e-3
+    torch.testing.assert_close(earned, coupling * (V(samples.x) * r).mean(), rtol=1e-6, atol=1e-12)
 
 
 class WithoutDivergences(Manufactured):

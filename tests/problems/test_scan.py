@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ocp_torch.certificate.estimate import replicated_samples
-from ocp_torch.certificate.sides import lower_side
+from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.problems import Circle, Problem
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.scan import odd_states
@@ -43,12 +43,35 @@ def test_a_needle_within_the_usual_range_of_the_data_is_found(where, dim, radius
     assert float(short_way(found, problem.centre).norm(dim=-1).min()) < radius
 
 
+class Rugged(Problem):
+    """Many wells and peaks, or those turned upside down."""
+
+    def __init__(self, seed: int, sign: float) -> None:
+        super().__init__(dim=1)
+        generator = torch.Generator().manual_seed(seed)
+        self.sizes, self.phases = (torch.rand(12, generator=generator, dtype=torch.float64) for _ in range(2))
+        self.sign = sign
+
+    def state_cost(self, x):
+        waves = 2.0 * math.pi * torch.arange(1, 13).to(x)
+        return 12.0 + self.sign * ((waves * (x + self.phases)).cos() * self.sizes).sum(dim=-1)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("seed", range(5))
+def test_the_lowest_and_the_highest_state_of_all_are_found(seed, sign):
+    problem, everywhere = Rugged(seed, sign), torch.linspace(0.0, 1.0, 2**16, dtype=torch.float64).unsqueeze(-1)
+    f, found = problem.state_cost(everywhere), problem.state_cost(odd_states(problem, 2**12, seed=0))
+    assert float(found.min()) == pytest.approx(float(f.min()), abs=1e-6)
+    assert float(found.max()) == pytest.approx(float(f.max()), abs=1e-6)
+
+
 def test_a_supremum_that_only_a_scan_meets_is_used():
     problem = Needle("f", 2, 1e-3)
     V = lambda x: 1e-3 * (2.0 * math.pi * x).sin().sum(dim=-1)
     sets = replicated_samples(problem, 64, 2, seed=0, divergences=False)
     odd = odd_states(problem, 2**21, seed=0)
-    blind, seeing = (lower_side(problem, V, sets, 1.0, ascents=4, odd=states) for states in (None, odd))
+    blind, seeing = (SampledValue(problem, V, sets, ascents=4, odd=states) for states in (None, odd))
     centre = problem.centre.unsqueeze(0)
     # At the bottom of the needle V is about 0 and the conjugate hardly anything, so the slack is about -f.
     assert seeing.own.largest.value >= float(-problem.state_cost(centre)) - 0.02

@@ -42,7 +42,7 @@ def _check(functions: Functions) -> None:
         for size in SIZES:
             x = functions.states(size).to(dtype)
             for name in FORMS:
-                functions.ask(name, x)
+                functions.given(name, x)
     first = require_purity(functions)
     if not functions.simulator:
         require_differentiable(functions)

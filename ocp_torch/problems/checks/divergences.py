@@ -26,7 +26,7 @@ def require_divergences(functions: Functions) -> None:
         return
     x = functions.exact_states(COMPARED, BRANCH)
     for name, source in SOURCES.items():
-        claimed = functions.ask(name, x)
+        claimed = functions.given(name, x)
         if claimed is None:
             continue
         claimed = claimed.reshape(len(x), -1)
@@ -46,7 +46,7 @@ def require_divergences(functions: Functions) -> None:
 
 def _differences(functions: Functions, source: str, x: Tensor, step: float) -> Tensor:
     """The divergence of each column, ``(N, columns)``, by central differences."""
-    total = 0.0
+    total = torch.zeros((), dtype=x.dtype)
     for i in range(x.shape[1]):
         moved = torch.zeros_like(x)
         moved[:, i] = step

@@ -49,7 +49,13 @@ class Functions:
         """States that survive both precisions and a few periods to the bit (see `GRID`), ``(count, d)``."""
         return ((self.states(count, branch) * (GRID // 2)).floor() * 2.0 + 1.0) / GRID
 
-    def ask(self, name: str, x: Tensor) -> Tensor | None:
+    def ask(self, name: str, x: Tensor) -> Tensor:
+        """As `given`, of a function that must give a tensor."""
+        answer = self.given(name, x)
+        assert answer is not None
+        return answer
+
+    def given(self, name: str, x: Tensor) -> Tensor | None:
         """What the function ``name`` gives at ``x`` ``(N, d)``; `None` only where it may.
 
         Raises `ProblemError` where it raises, changes ``x``, or gives another type, shape, precision or device.

@@ -14,6 +14,7 @@ from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import Branch, derive_seed, fixed_generator
 from ocp_torch.problems.checks.functions import Functions
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.simulator.simulator import Simulator
 
 Density = Callable[[Tensor], Tensor]
 
@@ -62,7 +63,7 @@ def require_mass(functions: Functions) -> None:
     """Raise where `mu0` certainly does not integrate to 1."""
     problem = functions.problem
     uniform = type(problem).initial_density is Problem.initial_density
-    if uniform or (functions.simulator and not problem._oracle.gives_mu0):
+    if uniform or (isinstance(problem, Simulator) and not problem._oracle.gives_mu0):
         return
     found = sampled_mass(lambda x: functions.ask("initial_density", x), problem.dim, functions.count // 4)
     if found.wrong:

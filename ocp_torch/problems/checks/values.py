@@ -55,20 +55,25 @@ def _special(functions: Functions) -> Tensor:
 def require_signs(functions: Functions) -> None:
     """`f >= 0` and `mu0 >= 0`, at states and downhill from the least; and `f` within the bound the problem declares."""
     x = functions.states(functions.count, SIGN_BRANCH)
-    for name in ("state_cost", "initial_density"):
-        function = getattr(functions.problem, name)
-        values = functions.ask(name, x)
-        lowest = x[values.topk(min(DESCENTS, len(x)), largest=False).indices]
-        found = supremum(lambda at, f=function: -f(at), lowest, ascents=DESCENTS, steps=STEPS, differentiable=False)
-        least, largest = -found.value, float(values.abs().max())
-        if not least >= -ROUNDING * largest:
-            raise ProblemError(
-                f"{name} of {functions.name} is {least:.6g} at {place(found.x)}, but must be at least 0"
-                + ("; a constant added to it changes no optimal control." if name == "state_cost" else ".")
-            )
-        bound = functions.problem.state_cost_bound
-        if name == "state_cost" and bound is not None and not largest <= bound + ROUNDING * abs(largest):
-            at = place(x[int(values.argmax())])
-            raise ProblemError(
-                f"state_cost of {functions.name} is {largest:.6g} at {at}, above its state_cost_bound = {float(bound):.6g}."
-            )
+    largest, at = _require_sign(functions, "state_cost", x, "; a constant added to it changes no optimal control.")
+    bound = functions.problem.state_cost_bound
+    if bound is not None and not largest <= bound + ROUNDING * abs(largest):
+        raise ProblemError(
+            f"state_cost of {functions.name} is {largest:.6g} at {place(at)}, above its state_cost_bound = "
+            f"{float(bound):.6g}."
+        )
+    _require_sign(functions, "initial_density", x, ".")
+
+
+def _require_sign(functions: Functions, name: str, x: Tensor, hint: str) -> tuple[float, Tensor]:
+    """The function ``name`` is not negative; the largest size of its values at ``x``, and where it is largest."""
+    function = getattr(functions.problem, name)
+    values = functions.ask(name, x)
+    lowest = x[values.topk(min(DESCENTS, len(x)), largest=False).indices]
+    found = supremum(lambda at: -function(at), lowest, ascents=DESCENTS, steps=STEPS, differentiable=False)
+    least, largest = -found.value, float(values.abs().max())
+    if not least >= -ROUNDING * largest:
+        raise ProblemError(
+            f"{name} of {functions.name} is {least:.6g} at {place(found.x)}, but must be at least 0{hint}"
+        )
+    return largest, x[int(values.argmax())]

@@ -59,10 +59,10 @@ class Torus(Problem):
         excess = rho - d * self._rate
         self.state_cost_bound = 0.25
         self.value_bound = d * self._alpha / 4.0
-        self.control_bound = math.sqrt(d) * self._alpha / rho
+        self.control_bound = reach = math.sqrt(d) * self._alpha / rho
         self.occupation_bound = rho / excess if excess > CRITICAL * rho else math.inf
         self.exact_optimum = d * self._alpha / 12.0
-        self._exact = control_limit is None or self.control_bound <= self.control_limit
+        self._exact = control_limit is None or reach <= control_limit
         if not self._exact:
             # Another problem: only what bounds every problem with this cost is still known.
             self.value_bound = self.occupation_bound = self.exact_optimum = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -20,7 +22,7 @@ class WavyMatrix:
     """
 
     def __init__(self, dim: int, control_dim: int, varies: bool, generator: torch.Generator) -> None:
-        form = dict(generator=generator, dtype=torch.float64)
+        form: dict[str, Any] = dict(generator=generator, dtype=torch.float64)
         self.varies = varies
         self.mean = torch.eye(dim, control_dim, dtype=torch.float64)
         self.mean += MIX * torch.randn(dim, control_dim, **form) / dim**0.5

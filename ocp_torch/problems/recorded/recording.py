@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -75,7 +76,9 @@ def write(path: str | Path, samples: Samples, numbers: dict[str, float | None], 
         raise InputError(f"out is {str(path)!r}, but must be a file ending in {' or '.join(SUFFIXES)}.")
     columns = {name: getattr(samples, name) for name in ("x", "f", "a", "B", "div_a", "div_B", "mu0")}
     columns["density"] = density
-    arrays = {k: np.ascontiguousarray(v.detach().cpu().numpy()) for k, v in columns.items() if v is not None}
+    arrays: dict[str, Any] = {
+        k: np.ascontiguousarray(v.detach().cpu().numpy()) for k, v in columns.items() if v is not None
+    }
     arrays |= {k: np.float64(v) for k, v in numbers.items() if v is not None}
 
     def fill(temporary: Path) -> None:

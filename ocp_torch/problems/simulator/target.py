@@ -25,6 +25,8 @@ def resolved(target: str) -> Callable:
                 raise InputError(f"problem.target names {source}, which does not exist.")
             require_file(source)
             spec = importlib.util.spec_from_file_location(Path(source).stem, source)
+            assert spec is not None  # as for every .py file
+            assert spec.loader is not None
             module = importlib.util.module_from_spec(spec)
             sys.modules.setdefault(Path(source).stem, module)
             spec.loader.exec_module(module)

@@ -80,4 +80,5 @@ def main(requests: int, lifeline: int, parent: int, mortal: bool) -> None:
 
 if __name__ == "__main__":
     sys.path.pop(0)  # this file's folder, whose names are nobody's
-    main(*map(int, sys.argv[1:]))
+    pipe, lifeline, parent, mortal = map(int, sys.argv[1:])
+    main(pipe, lifeline, parent, bool(mortal))

@@ -2,6 +2,8 @@ r"""A planar arm of `n` revolute joints under joint-velocity control: reach a ta
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -32,8 +34,8 @@ class Arm(Linkage):
         self,
         dim: int = 2,
         lengths: list[float] | None = None,
-        target: list[float] = TARGET,
-        obstacles: list[list[float]] = OBSTACLES,
+        target: Sequence[float] = TARGET,
+        obstacles: Sequence[Sequence[float]] = OBSTACLES,
         clearance: float = 0.2,
         target_weight: float = 1.0,
         obstacle_weight: float = 3.0,

@@ -3,6 +3,7 @@ r"""Dubins' vehicle in a periodic plane: constant speed, only the turn rate is c
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -33,8 +34,8 @@ class Dubins(PlanarVehicle):
     def __init__(
         self,
         size: float = 4.0,
-        target: list[float] = TARGET,
-        obstacles: list[list[float]] = OBSTACLES,
+        target: Sequence[float] = TARGET,
+        obstacles: Sequence[Sequence[float]] = OBSTACLES,
         clearance: float = 0.3,
         target_weight: float = 1.0,
         obstacle_weight: float = 2.0,

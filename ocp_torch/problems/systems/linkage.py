@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -28,8 +29,8 @@ class Linkage(Problem, ABC):
         self,
         dim: int,
         space: int,
-        target: list[float],
-        obstacles: list[list[float]],
+        target: Sequence[float],
+        obstacles: Sequence[Sequence[float]],
         clearance: float,
         target_weight: float,
         obstacle_weight: float,

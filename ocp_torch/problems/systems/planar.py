@@ -3,6 +3,7 @@ r"""What vehicles in a periodic plane share: position and heading, a target, rou
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -25,8 +26,8 @@ class PlanarVehicle(Problem):
         self,
         control_dim: int,
         size: float,
-        target: list[float],
-        obstacles: list[list[float]],
+        target: Sequence[float],
+        obstacles: Sequence[Sequence[float]],
         clearance: float,
         target_weight: float,
         obstacle_weight: float,

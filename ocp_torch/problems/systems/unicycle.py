@@ -3,6 +3,7 @@ r"""A unicycle in a periodic plane: speed and turn rate are the controls, a targ
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -26,8 +27,8 @@ class Unicycle(PlanarVehicle):
     def __init__(
         self,
         size: float = 4.0,
-        target: list[float] = TARGET,
-        obstacles: list[list[float]] = OBSTACLES,
+        target: Sequence[float] = TARGET,
+        obstacles: Sequence[Sequence[float]] = OBSTACLES,
         clearance: float = 0.3,
         target_weight: float = 1.0,
         obstacle_weight: float = 4.0,

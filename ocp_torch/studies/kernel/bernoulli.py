@@ -41,7 +41,8 @@ class BernoulliKernel:
     def derivatives(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`kappa`, `kappa'` and `kappa''` at each entry of ``t``."""
         t = t - np.floor(t)
-        return tuple(_horner(polynomial, t) for polynomial in self._polynomials)
+        value, slope, curvature = (_horner(polynomial, t) for polynomial in self._polynomials)
+        return value, slope, curvature
 
     def jets(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Of `K(x, y)`, ``(..., d)`` each: value and derivatives in `x` by value and derivatives in `y`.

@@ -6,6 +6,8 @@ jets at one state. ``mark`` and ``restore`` go back to where a look-ahead began.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -36,7 +38,7 @@ class FeatureExpansion:
     def mark(self) -> np.ndarray:
         return self.theta
 
-    def restore(self, mark: np.ndarray) -> None:
+    def restore(self, mark: Any) -> None:
         self.theta = mark
 
     def visit(self) -> None:
@@ -95,7 +97,7 @@ class KernelExpansion:
     def mark(self) -> tuple[np.ndarray, np.ndarray]:
         return self.coefficients[:, : self.known].copy(), self.squared_norm
 
-    def restore(self, mark: tuple[np.ndarray, np.ndarray]) -> None:
+    def restore(self, mark: Any) -> None:
         """States met since then stay, with the coefficient 0: the average may hold them."""
         coefficients, self.squared_norm = mark
         kept = coefficients.shape[1]

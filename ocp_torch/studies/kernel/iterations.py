@@ -47,11 +47,13 @@ class Iteration:
         features = None if features is None else features.double()
         self.stream = Stream(problem, seeds, features, self.rule.needs_divergences)
         outputs = {VALUE: 1, CONTROL_DENSITY: problem.control_dim}
-        if features is not None:
-            make = lambda o: FeatureExpansion(features, len(seeds), o, radius)
-        else:
-            make = lambda o: KernelExpansion(kernel, problem.dim, len(seeds), o, capacity, radius)
-        self.expansions = {name: make(outputs[name]) for name in self.rule.fields}
+        self.expansions: dict[str, FeatureExpansion | KernelExpansion] = {}
+        for name in self.rule.fields:
+            if features is not None:
+                self.expansions[name] = FeatureExpansion(features, len(seeds), outputs[name], radius)
+            elif kernel is not None:
+                form = problem.dim, len(seeds), outputs[name], capacity, radius
+                self.expansions[name] = KernelExpansion(kernel, *form)
 
     @property
     def advance(self) -> Callable[[np.ndarray], None]:

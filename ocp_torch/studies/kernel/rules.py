@@ -9,6 +9,7 @@ Proposition 9 of the paper). The closed forms are Lemmas 2 and 3, written throug
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import numpy as np
 
@@ -118,4 +119,4 @@ class SaddleRule(Rule):
         return {VALUE: up, CONTROL_DENSITY: down}
 
 
-RULES = {"dual": DualRule, "primal": PrimalRule, "pd": SaddleRule}
+RULES: dict[str, Callable[[Problem, Constants], Rule]] = {"dual": DualRule, "primal": PrimalRule, "pd": SaddleRule}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,8 +27,8 @@ class Datum:
     a: np.ndarray  # (R, d)
     B: np.ndarray  # (R, d, m)
     mu0: np.ndarray  # (R,)
-    div_B: np.ndarray | None  # (R, m)
-    jets: np.ndarray | None  # (R, 1 + d, F)
+    div_B: Any  # (R, m); None where no rule reads them
+    jets: Any  # (R, 1 + d, F); None without features
 
 
 class Stream:
@@ -50,7 +51,8 @@ class Stream:
             x = torch.stack([sampler.draw(BLOCK) for sampler in self.samplers], dim=1).flatten(0, 1)
             samples = Samples.of(self.problem, x, divergences=self.divergences)
             jets = None if self.features is None else self.features.jets(x)
-            columns = (samples.x, samples.f, samples.a, samples.B, samples.mu0, samples.div_B, jets)
+            columns: tuple[Any, ...] = (samples.x, samples.f, samples.a, samples.B, samples.mu0, samples.div_B, jets)
             arrays = [None if c is None else c.reshape(BLOCK, runs, *c.shape[1:]).numpy() for c in columns]
             for i in range(BLOCK):
-                yield Datum(*(None if column is None else column[i] for column in arrays))
+                row: list[Any] = [None if column is None else column[i] for column in arrays]
+                yield Datum(*row)

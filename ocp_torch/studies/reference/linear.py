@@ -30,16 +30,16 @@ def solve_fixed_point(W: csr_array, beta: float, c: Tensor, start: Tensor, toler
     from scipy.sparse import identity
     from scipy.sparse.linalg import bicgstab, spsolve
 
-    A, c, start = (identity(len(c)) - beta * W).tocsc(), c.numpy(), start.numpy()
-    if len(c) <= DIRECT:
-        return torch.from_numpy(spsolve(A, c))
-    residual = lambda v: float(np.abs(c - A @ v).max())
-    found, _ = bicgstab(A.tocsr(), c, x0=start, rtol=0.0, atol=tolerance, maxiter=KRYLOV_ITERATIONS)
-    best = min(start, found, key=lambda v: residual(v) if np.isfinite(v).all() else math.inf)
+    A, right, first = (identity(len(c)) - beta * W).tocsc(), c.numpy(), start.numpy()
+    if len(right) <= DIRECT:
+        return torch.from_numpy(spsolve(A, right))
+    residual = lambda v: float(np.abs(right - A @ v).max())
+    found, _ = bicgstab(A.tocsr(), right, x0=first, rtol=0.0, atol=tolerance, maxiter=KRYLOV_ITERATIONS)
+    best = min(first, found, key=lambda v: residual(v) if np.isfinite(v).all() else math.inf)
     v, size = best, residual(best)
     sweeps = math.ceil(PATIENCE * max(math.log(max(size, tolerance) / tolerance), 0.0) / -math.log(beta))
     for _ in range(sweeps):
-        following = beta * (W @ v) + c
+        following = beta * (W @ v) + right
         change = float(np.abs(following - v).max())
         if change < size:
             best, size = v, change

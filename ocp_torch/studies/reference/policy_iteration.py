@@ -51,7 +51,8 @@ def solve(scheme: SemiLagrangian, value: Tensor, control: Tensor, relative: floa
     """Policy iteration from ``value`` ``(n,)`` and ``control`` ``(n, m)`` until one more policy changes `V` by less than
     ``relative`` of the oscillation of `f`, or no longer gets closer."""
     goal = relative * max(scheme.scale, 1e-300)
-    residuals, best = [], None
+    residuals: list[float] = []
+    best: tuple[Tensor, Tensor, float, int] | None = None
     for policies in range(1, MOST_POLICIES + 1):
         control, right = improve(scheme, value, control)
         residuals.append(float((right - value).abs().max()) / scheme.gain)
@@ -61,6 +62,7 @@ def solve(scheme: SemiLagrangian, value: Tensor, control: Tensor, relative: floa
         if residuals[-1] <= goal or (stuck and not scheme.monotone):
             break
         value = evaluate(scheme, value, control, scheme.gain * min(EVALUATED * residuals[-1], goal))
+    assert best is not None
     value, control, residual, policies = best
     return GridSolution(scheme.grid, scheme.step, value, control, residual, defect(scheme, value, control), policies)
 

@@ -95,7 +95,7 @@ def solve_reference(problem: Problem, side: int | None = None, memory: float = 4
     uneven = "the three grids do not approach evenly" if result.error is None else None
     unknown = between.sentence or uneven
     error = None
-    if unknown is None:
+    if unknown is None and result.error is not None:
         error = result.error + noise + between.cost + between.mass * float(start.value.abs().max())
     unsettled = max(s.residual for s in solutions)
     return Reference(problem, result.optimum, error, result.order, sides, estimates, change, unsettled, start, unknown)

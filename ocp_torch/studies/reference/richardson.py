@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 # Order of the scheme where V is smooth, by which the leading error is removed.
@@ -27,9 +28,7 @@ class Extrapolation:
     order: float
 
 
-def extrapolate(
-    spacings: tuple[float, float, float], numbers: tuple[float, float, float], noise: float = 0.0
-) -> Extrapolation:
+def extrapolate(spacings: Sequence[float], numbers: Sequence[float], noise: float = 0.0) -> Extrapolation:
     r"""Richardson's extrapolation of ``numbers`` on grids of ``spacings`` `h_1 > h_2 > h_3`, taken as `Q + C h^2`.
 
     With `X_12`, `X_23` from the two pairs of grids and `Q_3` the finest number the stated error is
@@ -47,7 +46,7 @@ def extrapolate(
     return Extrapolation(optimum, error if settled or not math.isnan(order) else None, order)
 
 
-def observed_order(spacings: tuple[float, float, float], numbers: tuple[float, float, float]) -> float:
+def observed_order(spacings: Sequence[float], numbers: Sequence[float]) -> float:
     """`p` with `(Q_1 - Q_2) / (Q_2 - Q_3) = (h_1^p - h_2^p) / (h_2^p - h_3^p)`, which increases in `p`; NaN if there is none
     between `ORDERS`, as where the changes have opposite signs."""
     from scipy.optimize import brentq
