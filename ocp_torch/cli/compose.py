@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ocp_torch.cli.explain import CHECKOUT, CONFIGS, explain
+from ocp_torch.cli.required import require_places, require_sections
 from ocp_torch.errors import InputError
 from ocp_torch.runs.configuration import next_subfolder
 from ocp_torch.runs.resume import find_run, resumed_configuration
@@ -79,7 +80,7 @@ def composed(config_name: str, overrides: list[str], roots: tuple[Path, ...] = (
 
 def configuration(config_name: str, overrides: list[str]) -> DictConfig:
     """The composed configuration with Hydra's own part, `hydra`. Raises `InputError`."""
-    require_places(overrides)
+    require_places(parsed(overrides))
     try:
         with initialize_config_dir(str(CONFIGS), job_name=config_name, version_base="1.3"):
             return compose(config_name, overrides, return_hydra_config=True)
@@ -128,27 +129,4 @@ def run_data(data: dict, overrides: list[str], roots: tuple[Path, ...] = ()) -> 
         data = {**data, "resume": str(run) if run else None}
     if data.get("resume") is not None:
         data = resumed_configuration(data, named)
-    return data
-
-
-def require_places(overrides: list[str]) -> None:
-    """Raise `InputError` where a field or a group of ours is left out: defaults stand in the configuration alone. A class of
-    a user's own may do without some of the problem's, or all."""
-    own = any(o.lstrip("+").startswith("problem._target_=") for o in overrides)
-    for override in parsed(overrides):
-        name = override.key_or_group
-        if own and name == "problem":
-            continue
-        if override.is_delete() and not name.startswith(("hydra", "problem.", "experiment")):
-            raise InputError(f"~{name} leaves out {name}, which is needed; set it to another value instead.")
-
-
-def require_sections(data: dict, config_name: str) -> dict:
-    """``data``, if each group and field at the top of the configuration has a place in it; else `InputError`."""
-    file = OmegaConf.to_container(OmegaConf.load(CONFIGS / f"{config_name}.yaml"), resolve=False)
-    chosen = [item for entry in file.pop("defaults", []) if isinstance(entry, dict) for item in entry.items()]
-    groups = [(key.partition("@")[2] or key).split(".")[0] for key, choice in chosen if choice is not None]
-    for name in dict.fromkeys([*groups, *file]):
-        if name not in data and not name.startswith(("hydra", "override ")):
-            raise InputError(f"{name} is missing; give {name}=... on the command line.")
     return data

@@ -9,8 +9,9 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
-from ocp_torch.cli.compose import configuration, parsed, plain, require_places, run_data
+from ocp_torch.cli.compose import configuration, parsed, plain, run_data
 from ocp_torch.cli.explain import explain, is_choice
+from ocp_torch.cli.required import require_places
 from ocp_torch.errors import InputError, require_flag, require_section, shown
 
 MOST_TRIED = 8  # jobs of a sweep that are tried for one value
@@ -20,7 +21,7 @@ def check_sweep(config_name: str, overrides: list[str], check: Callable[[dict], 
     """Raise `InputError` where a job of the sweep would not even compose, every value of every field, one at a time; or
     where ``check`` lets none through that has a value of some kind: words are, and numbers by their sign. What the problem
     makes of numbers, a sweep may be there to find out."""
-    require_places(overrides)
+    require_places(parsed(overrides))
     try:
         options = BasicSweeper.split_arguments(parsed(overrides), None)[0]
     except HydraException as error:

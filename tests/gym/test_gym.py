@@ -10,8 +10,9 @@ import torch
 from PIL import Image
 
 from ocp_torch.errors import InputError
+from ocp_torch.gym.agent import Agent
 from ocp_torch.gym.environment import clocks, make_environment, observe, require_gymnasium, state_of
-from ocp_torch.gym.rollout import Agent, made, play, rollout_job, save_gif
+from ocp_torch.gym.rollout import made, play, rollout_job, save_gif
 from ocp_torch.problems import PROBLEMS, Dataset, Manufactured
 from ocp_torch.runs.record import Recorder
 from support import zoo

@@ -29,7 +29,7 @@ def require_finite(functions: Functions) -> None:
         special = _special(functions).to(dtype)
         for name in FORMS:
             for x in (spread, special) if name in DATA else (spread[:FEWER_STATES],):
-                values = functions.ask(name, x)
+                values = functions.given(name, x)
                 if values is None:
                     continue
                 bad = ~torch.isfinite(values).reshape(len(x), -1).all(dim=-1)
