@@ -179,7 +179,7 @@ def _section(saved: dict, config: dict) -> dict:
     section = current_section(config.get("problem"))
     target = str(section.get("_target_")) if isinstance(section, dict) else ""
     name = str(current_name(saved["name"], config.get("problem")))
-    if target.rpartition(".")[2].lower() == name.rpartition(".")[2]:
+    if isinstance(section, dict) and target.rpartition(".")[2].lower() == name.rpartition(".")[2]:
         return section
     return saved["parameters"]
 
