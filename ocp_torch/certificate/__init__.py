@@ -1,13 +1,21 @@
 """Bounds, performances and what they assume; needs no trainer."""
 
-from ocp_torch.certificate.certificate import Certificate, Run
-from ocp_torch.certificate.certify import Trained, certify_fields, in_float64
-from ocp_torch.certificate.external.external import certify_policy
+from ocp_torch.certificate.bound import LOWER, PERFORMANCE, UPPER, Bound
+from ocp_torch.certificate.bounds import BOUNDS
+from ocp_torch.certificate.certificate import Certificate
+from ocp_torch.certificate.certify import certify_fields, certify_policy
 from ocp_torch.certificate.report import table
+from ocp_torch.certificate.run import Run
 from ocp_torch.certificate.settings import CertificateSettings
+from ocp_torch.certificate.trained import Trained, in_float64
 from ocp_torch.certificate.upper.policy_evaluation import StageSettings
 
 __all__ = [
+    "BOUNDS",
+    "LOWER",
+    "PERFORMANCE",
+    "UPPER",
+    "Bound",
     "Certificate",
     "CertificateSettings",
     "Run",

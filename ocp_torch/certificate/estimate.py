@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.student import t_factor
+from ocp_torch.errors import require_integer, require_number
 from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
@@ -17,6 +18,19 @@ from ocp_torch.problems.starts import evaluation_distribution
 
 # How often an interval covers the truth where nobody asks for another level.
 CONFIDENCE = 0.95
+
+
+@cache
+def t_factor(level: float, degrees: int) -> float:
+    """The `t` with `P(|T| <= t) = level` for Student's `T` of so many ``degrees`` of freedom: how many standard errors lie
+    on each side of a mean of ``degrees + 1`` replicates. Raises `InputError` unless ``level`` is in (0, 1) and ``degrees`` at
+    least 1."""
+    require_number("level", level, above=0.0, at_most=1.0 - 1e-9)
+    require_integer("degrees", degrees, 1)
+    from scipy.special import stdtrit  # takes a third of a second to import, and only certificates need it
+
+    # The lower tail: near 1 a probability has few digits left.
+    return -float(stdtrit(degrees, 0.5 * (1.0 - level)))
 
 
 @dataclass(frozen=True)
@@ -69,6 +83,11 @@ class Estimate:
         if level is not None:
             extra |= {"half_width": self.half_width(level), "interval": list(self.interval(level))}
         return {"value": self.value, "se": self.se, **extra}
+
+
+def known(estimate: Estimate | None) -> bool:
+    """Whether there is a number."""
+    return estimate is not None and estimate.finite
 
 
 @torch.no_grad()

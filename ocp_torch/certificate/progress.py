@@ -1,4 +1,4 @@
-"""What a certifier tells while it works: the name of each stage as it begins. It prints nothing itself."""
+"""What a certifier tells while it works: the name of each part as it begins. It prints nothing itself."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from collections.abc import Callable
 Progress = Callable[[str], None]
 
 
-def silent(stage: str) -> None:
+def silent(part: str) -> None:
     """Nobody wants to know."""

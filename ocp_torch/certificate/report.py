@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from ocp_torch.certificate.certificate import LONGEST_NAME
+from ocp_torch.certificate import bounds
+from ocp_torch.certificate.bound import LOWER, PERFORMANCE, UPPER
+from ocp_torch.certificate.run import LONGEST_NAME
 from ocp_torch.errors import visible
 
 
@@ -23,19 +25,20 @@ def table(certificate: dict, searches: list[str] = ()) -> str:
         half = estimate["interval"][1] - estimate["value"] if "interval" in estimate else estimate["se"]
         lines.append(f"{label:26}{estimate['value']:14.8f}{half:11.1e}{bias}{against}")
 
-    for kind in ("F_M", "shifted", "rigorous"):
-        bound = certificate["lower"].get(kind)
-        row(f"lower: {kind}{standing(bound or {})}", bound)
+    def rows(side: str, order=list) -> None:
+        for kind, listed in order(bounds.on(side).items()):
+            found = certificate[side].get(kind)
+            row(f"{side}: {listed.label}{standing(found or {})}", found)
+
+    rows(LOWER)
     if exact is not None:
         lines.append(f"{'OPT (exact)':26}{exact:14.8f}")
     row("Perf: controller from V", certificate["perf"].get("value"))
     row("Perf: controller w/mu", certificate["perf"].get("density"))
-    for kind, estimate in certificate.get("perf_lower", {}).items():
+    for kind, estimate in certificate.get(PERFORMANCE, {}).items():
         row(f"Perf, at least: {visible(kind, LONGEST_NAME)}", estimate)
     row("Perf: this controller", certificate["perf"].get("given"))
-    for name, label in (("lagrangian", "Lagrangian"), ("evaluation", "evaluation"), ("G", "G"), ("J", "J")):
-        bound = certificate["upper"].get(name)
-        row(f"upper: {label}{standing(bound or {})}", bound)
+    rows(UPPER, reversed)  # the sharper ones stand late in the list
     row("Perf: doing nothing", certificate["baseline"]["zero"])
     lines.append("-" * len(header))
     gap, share = certificate["gap"], certificate["share"]

@@ -74,7 +74,7 @@ class Fields(nn.Module):
 ORDINARY = 1e4
 # States that a problem's units are estimated from; a spread below so much of the mean is rounding.
 SIZED, CONSTANT = 1024, 1e-12
-# What was found for a problem: the search takes seconds in eight dimensions, and fits to closed loops build networks too.
+# What was found for a problem: the search takes seconds in eight dimensions, and policy evaluation builds networks again.
 _found: WeakKeyDictionary[Problem, dict[int, Tensor]] = WeakKeyDictionary()
 
 

@@ -19,8 +19,9 @@ from ocp_torch.problems.starts import drawn_starts, starts_narrowly
 OCCUPATION_GUESS = 4.0
 # And where training aims at the bound without M: what won on flows that contract onto a goal.
 OCCUPATION_WEIGHT = 40.0
-# States a problem is searched at for what it does not say.
-SURVEYED = 2**13
+# States a problem is searched at for what it does not say: for f and mu0, for a and B, whose pseudo-inverse takes longer, and
+# starts where mu0 is narrow.
+PROBED, PROBED_MATRICES, PROBED_STARTS = 2**13, 2**11, 2**8
 # States scanned for a spike of `f`, for each that `Problem.scan_factor` asks for.
 SCANNED = 2**15
 
@@ -118,7 +119,7 @@ def state_cost_supremum(problem: Problem) -> float:
     given = problem.state_cost_bound
     if given is not None and not (problem.has_simulator and problem.scan_factor):
         return given
-    (x,) = problem.probe(SURVEYED, 1, "x")
+    (x,) = problem.probe(PROBED, 1, "x")
     if problem.has_simulator:
         x = torch.cat([x, odd_states(problem, SCANNED * problem.scan_factor, 0)])
     found = supremum(problem.state_cost, x, differentiable=False)
@@ -136,17 +137,17 @@ def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
     total = 2.0 * conjugate * state_cost_supremum(problem)
     if problem.driftless:
         return total ** (1.0 / q), "Proposition 2 of the paper with a sampled sup f"
-    B, a = problem.probe(SURVEYED // 4, 1, "B", "a")
+    B, a = problem.probe(PROBED_MATRICES, 1, "B", "a")
     alpha = torch.linalg.pinv(B) @ a.unsqueeze(-1)
     largest = float(alpha.squeeze(-1).norm(dim=-1).max())
     return (total + 2.0**q * (conjugate - 1.0) * largest) ** (1.0 / q), "Proposition 2 with a least-squares alpha"
 
 
 def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
-    (mu0,) = problem.probe(SURVEYED, 1, "mu0")
+    (mu0,) = problem.probe(PROBED, 1, "mu0")
     guess = OCCUPATION_WEIGHT if is_unbounded(problem) else OCCUPATION_GUESS
     if problem.has_simulator and starts_narrowly(problem):
-        mu0 = problem.initial_density(drawn_starts(problem, SURVEYED // 32, 1))
+        mu0 = problem.initial_density(drawn_starts(problem, PROBED_STARTS, 1))
     return guess * float(mu0.max()), f"a guess to train with, {guess:g} times sup mu0"
 
 

@@ -16,9 +16,10 @@ from ocp_torch.errors import require_number
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.control_cost import PowerCost, norm_power
 
-# How far, relative to the limit, rounding may carry a control beyond it.
-SLACK = {torch.float64: 1e-9}
-COARSE_SLACK = 1e-4
+# How far, relative to the limit, rounding may carry a control beyond it: in double, and in any other precision.
+ROOM, COARSE_ROOM = 1e-9, 1e-4
+# Limits whose powers up to the second, and one over them, stay far from the ends of single precision.
+SMALLEST, LARGEST = 1e-9, 1e9
 
 
 class LimitedCost(PowerCost):
@@ -29,12 +30,12 @@ class LimitedCost(PowerCost):
 
     def __init__(self, exponent: float, limit: float) -> None:
         super().__init__(exponent)
-        self.limit = require_number("problem.control_limit", limit, above=0.0, at_least=1e-9, at_most=1e9)
+        self.limit = require_number("problem.control_limit", limit, above=0.0, at_least=SMALLEST, at_most=LARGEST)
         self.knee = self.limit ** (self.q - 1.0)  # where |grad R*(p)| reaches the limit
         self.largest = self.limit**self.q / self.q  # R at the limit
 
     def cost(self, u: Tensor) -> Tensor:
-        allowed = norm_power(u.detach(), 1.0) <= self.limit * (1.0 + _slack(u))
+        allowed = norm_power(u.detach(), 1.0) <= self.limit * (1.0 + _room(u))
         return torch.where(allowed, super().cost(u), math.inf)
 
     def conjugate(self, p: Tensor) -> Tensor:
@@ -52,7 +53,7 @@ class LimitedCost(PowerCost):
 
     def perspective(self, w: Tensor, mu: Tensor) -> Tensor:
         """`mu R_c(w / mu)`: infinite where `|w| > c mu`, beyond rounding, so also where `mu = 0` and `w != 0`."""
-        allowed = norm_power(w.detach(), 1.0) <= self.limit * (1.0 + _slack(w)) * mu.detach()
+        allowed = norm_power(w.detach(), 1.0) <= self.limit * (1.0 + _room(w)) * mu.detach()
         # Only what is allowed goes in: an infinite cost would spoil the gradients of the branch that is not taken.
         inside = super().perspective(torch.where(allowed.unsqueeze(-1), w, 0.0), mu)
         return torch.where(allowed, inside, math.inf)
@@ -89,11 +90,11 @@ class LimitedCost(PowerCost):
         clipped = super().saddle_occupation(w.detach(), beta.detach(), occupation_bound) < least
         at_limit = least * (beta + self.largest)
         found = torch.where(clipped, at_limit, super().saddle_minimum(w, beta, occupation_bound))
-        return torch.where(least > occupation_bound * (1.0 + _slack(w)), math.inf, found)
+        return torch.where(least > occupation_bound * (1.0 + _room(w)), math.inf, found)
 
 
-def _slack(like: Tensor) -> float:
-    return SLACK.get(like.dtype, COARSE_SLACK)
+def _room(like: Tensor) -> float:
+    return ROOM if like.dtype == torch.float64 else COARSE_ROOM
 
 
 def control_cost(exponent: float, limit: float | None = None) -> PowerCost:

@@ -5,8 +5,6 @@ minimise  rho E_{x0 ~ mu0} int_0^inf e^{-rho t} (f(x_t) + |u_t|^q / q) dt,   dx/
 
 from __future__ import annotations
 
-import inspect
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -17,15 +15,21 @@ from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.control_limit import control_cost
 from ocp_torch.problems.lipschitz import Lipschitz
+from ocp_torch.problems.reproducible import Reproducible
 from ocp_torch.problems.samples import Samples
 
-# Beyond this, B alone would fill the memory.
+# With more, `B` alone would take over 8 GB for a batch of a thousand states.
 MOST_COORDINATES = 1024
-# Head-room on a sampled supremum that is going to be used as a bound.
+# Discounts per unit of time outside these are taken for a mistake in the unit.
+LEAST_DISCOUNT, LARGEST_DISCOUNT = 1e-6, 1e6
+# Head-room on a sampled supremum that is going to be used as a bound, since a search meets less than the supremum.
 MARGIN = 1.05
+# States scanned for narrow features of a user's own data, for each at which a bound is evaluated: more find narrower ones,
+# and take longer.
+SCAN_FACTOR = 32
 
 
-class Problem:
+class Problem(Reproducible):
     """Base class: override `state_cost`, and whatever else differs from `dx/dt = u` with a uniform start.
 
     All methods are batched, take states ``(N, d)``, work in the precision and on the device of their argument, and have
@@ -35,7 +39,8 @@ class Problem:
 
     Attributes a subclass may set, each `None` where unknown: ``state_cost_bound >= sup f``; ``occupation_bound >= sup
     mu*`` (`math.inf` when known to be unbounded); ``control_bound >= sup |u*|``; ``value_bound >= sup V*``;
-    ``exact_optimum``, the number `OPT`; ``lipschitz``, constants of the data (`Lipschitz`).
+    ``exact_optimum``, the number `OPT`; ``lipschitz``, constants of the data (`Lipschitz`), from which a lower bound can be
+    proved in one and two dimensions (a class may have sharper models: see `ocp_torch.certificate.proof.enclosures`).
     """
 
     # Whether the functions can be called at any state; a data set knows them at its own only (see `samples`).
@@ -44,12 +49,6 @@ class Problem:
     knows_control_matrix: bool = True
     # Arguments that say where the data come from, not what they are: another run may give others.
     incidental: tuple[str, ...] = ()
-    _given: tuple[tuple, dict]  # the arguments it was made with, for `parameters`
-
-    def __new__(cls, *args, **kwargs) -> Problem:
-        made = super().__new__(cls)
-        made._given = args, kwargs
-        return made
 
     def __init__(
         self,
@@ -65,7 +64,9 @@ class Problem:
             if control_dim is None
             else require_integer("problem.control_dim", control_dim, 1, maximum=MOST_COORDINATES)
         )
-        self.discount = require_number("problem.discount", discount, above=0.0, at_least=1e-6, at_most=1e6)
+        self.discount = require_number(
+            "problem.discount", discount, above=0.0, at_least=LEAST_DISCOUNT, at_most=LARGEST_DISCOUNT
+        )
         self.exponent = require_number("problem.exponent", exponent, above=1.0, at_most=2.0)
         self.control_cost = control_cost(self.exponent, control_limit)
         self.control_limit = None if control_limit is None else float(control_limit)
@@ -98,7 +99,7 @@ class Problem:
     def scan_factor(self) -> int:
         """How many states are scanned for narrow features of the data, for each at which a bound is evaluated. The package's
         own problems have none narrower than those states show."""
-        return 0 if type(self).__module__.startswith("ocp_torch.") else 32
+        return 0 if type(self).__module__.startswith("ocp_torch.") else SCAN_FACTOR
 
     @property
     def driftless(self) -> bool:
@@ -160,7 +161,8 @@ class Problem:
 
     @property
     def validation_view(self) -> Problem:
-        """The problem as looks by which choices are made see it: itself, where fresh states cost nothing."""
+        """The problem as evaluations during training see it, by which choices are made: itself, where fresh states cost
+        nothing; a data set gives other samples than the certificate's."""
         return self
 
     def velocity(self, x: Tensor, u: Tensor) -> Tensor:
@@ -180,20 +182,6 @@ class Problem:
         raise InputError(
             f"{type(self).__name__} does not know the environment {env}: it must define from_observation and to_action."
         )
-
-    @property
-    def parameters(self) -> dict:
-        """The arguments that make this problem again: each `__init__` argument is read from the attribute of its name, or,
-        where there is none, is what was given."""
-        args, kwargs = self._given
-        signature = inspect.signature(type(self).__init__)
-        bound = signature.bind(self, *args, **kwargs)
-        bound.apply_defaults()
-        found = dict(list(bound.arguments.items())[1:])
-        for name, parameter in signature.parameters.items():
-            if parameter.kind is parameter.VAR_KEYWORD:
-                found |= found.pop(name)
-        return {name: getattr(self, name, value) for name, value in found.items()}
 
     def _like(self, x: Tensor, name: str, constant: Tensor) -> Tensor:
         """``constant`` in the precision and on the device of ``x``, converted once."""

@@ -15,15 +15,19 @@ from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import climb
 from ocp_torch.problems.problem import Problem
 
-# States scanned at once, states kept for each column and kind of oddity, and how far off a neighbour is.
-CHUNK, KEPT, NEARBY = 2**16, 16, 0.02
+# States scanned at once, which bounds the memory.
+CHUNK = 2**16
+# States kept for each column and kind of oddity: each costs an ascent of every supremum later.
+KEPT = 16
+# How far off the neighbour is that a column is compared with: narrower features differ from it, wider ones are met anyway.
+NEARBY = 0.02
 # Steps downhill and uphill, along gradients where there are some and then in random directions.
 STEPS = 60
 
 
 def odd_states(problem: Problem, count: int, seed: int) -> Tensor:
     """States ``(K, d)`` in float64 at which the data of ``problem`` are odd, found among ``count`` uniform ones; found once
-    for a problem, so that looks on the way cost no more."""
+    for a problem, so that evaluations during training cost no more."""
     kept = vars(problem).setdefault("_odd_states", {})
     if (count, seed) not in kept:
         kept[count, seed] = _odd_states(problem, count, seed)

@@ -17,16 +17,17 @@ from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.simulator import Simulator
 
-# Parts that stay uniform: of starts, for mass that the search missed; and of the states of bounds, most of whose integrands
-# are large elsewhere too.
+# Parts that stay uniform: of starts, for mass that the search missed; and of the states that bounds are evaluated at, since
+# most of their integrands are large elsewhere too.
 UNIFORM_STARTS, UNIFORM_STATES = 0.125, 0.5
 # Part of the starts that is near spikes of `f`, which others meet by chance.
 SPIKE_STARTS = 0.125
-# A state cost whose uniform states are worth that part of their number leaves them alone.
+# `f` is taken for broad, and adds no starts, where uniform states estimate its mean as well as this part of their number of
+# ideal ones would.
 BROAD_COST = 0.05
-# Candidates for each start that is to carry as much mass as all others.
+# Weighted starts drawn for each that is kept: more follow `mu0` closer.
 CANDIDATES = 16
-# States at which a simulator is asked, each of which may cost milliseconds, where a formula is looked at `SCANNED`.
+# States at which a simulator is scanned, each of which may cost milliseconds; formulas are scanned at `SCANNED`.
 ASKED = 2**12
 
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields, table
-from ocp_torch.certificate.certify import in_float64
 from ocp_torch.certificate.checks.possible import require_possible
+from ocp_torch.certificate.trained import in_float64
 from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.control.policies import Policy, trained_policies
 from ocp_torch.errors import InputError, require_integer, require_section

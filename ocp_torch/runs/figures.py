@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.certify import in_float64
 from ocp_torch.certificate.lower.shifted import slack_function
-from ocp_torch.certificate.simulated.simulation import rate_at
+from ocp_torch.certificate.trained import in_float64
 from ocp_torch.control.policies import NETWORK, occupation_density, trained_policies
 from ocp_torch.fields import Fields
 from ocp_torch.files.storage import write_atomically
+from ocp_torch.maths.runge_kutta import rate_at
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems import Problem

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings
-from ocp_torch.certificate.certify import in_float64
+from ocp_torch.certificate.trained import in_float64
 from ocp_torch.control.controller import Controller
 from ocp_torch.control.policies import Policy, trained_policies
 from ocp_torch.errors import InputError, StorageError

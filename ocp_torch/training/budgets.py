@@ -14,7 +14,7 @@ from ocp_torch.problems.constants import is_unbounded
 
 @dataclass(frozen=True)
 class Budget:
-    """One row: up to ``dim`` coordinates, for a run and for its policy evaluation."""
+    """One row: up to ``dim`` coordinates, for a run and for the policy evaluation of its certificate."""
 
     dim: float
     steps: int

@@ -51,16 +51,22 @@ class Evaluator:
         return cast(Fields, self.state.average.module)
 
     def certify(
-        self, run: Run, settings: CertificateSettings, fields: Fields | None = None, tell: Progress = silent
+        self,
+        run: Run,
+        settings: CertificateSettings,
+        fields: Fields | None = None,
+        tell: Progress = silent,
+        problem: Problem | None = None,
     ) -> Certificate:
         """The certificate of ``fields``, or of the averaged ones; ``tell`` is given the name of each stage of it."""
-        return self._certify(self.problem, run, settings, fields, tell)
+        trained = Trained(fields or self.fields, self.occupation, self.network)
+        return certify_fields(problem or self.problem, trained, self.state.constants, settings, run, tell)
 
     def quick(self, run: Run, settings: CertificateSettings, fields: Fields | None = None) -> Certificate:
         """The same on states that neither training nor `certify` uses: these certificates choose between fields, and on
         states of their own they cannot flatter the full certificate of their choice."""
         elsewhere = replace(run, seed=derive_seed(self.seed, Branch.VALIDATION))
-        return self._certify(self.problem.validation_view, elsewhere, settings, fields, silent)
+        return self.certify(elsewhere, settings, fields, problem=self.problem.validation_view)
 
     def evaluate(self, run: Run) -> Certificate:
         """A quick certificate of the averaged fields; made anew only once they have changed."""
@@ -102,9 +108,3 @@ class Evaluator:
     def forget(self) -> None:
         """The state was replaced: what was seen of another at the same step says nothing."""
         self._latest = None
-
-    def _certify(
-        self, problem: Problem, run: Run, settings: CertificateSettings, fields: Fields | None, tell: Progress
-    ) -> Certificate:
-        trained = Trained(fields or self.fields, self.occupation, self.network)
-        return certify_fields(problem, trained, self.state.constants, settings, run, tell)

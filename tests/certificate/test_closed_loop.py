@@ -8,8 +8,8 @@ import torch
 
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.simulated.performance import simulate_performance
-from ocp_torch.certificate.simulated.simulation import discounted_integral
-from ocp_torch.certificate.upper.lagrangian import Terms, _integrands, best_multiples, closed_loop_bounds
+from ocp_torch.certificate.upper.lagrangian import _integrands, closed_loop_bounds
+from ocp_torch.certificate.upper.multiples import Terms, best_multiples
 from ocp_torch.certificate.upper.policy_evaluation import (
     StageSettings,
     fit_closed_loop,
@@ -19,6 +19,7 @@ from ocp_torch.certificate.upper.policy_evaluation import (
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.maths import jets
+from ocp_torch.maths.runge_kutta import discounted_integral
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.generator import Generator

@@ -10,7 +10,7 @@ from ocp_torch.certificate import Run, Trained, certify_fields
 from ocp_torch.certificate.checks.hidden import Flux, hidden_divergence
 from ocp_torch.certificate.checks.regularity import largest_jump
 from ocp_torch.certificate.estimate import replicated_samples
-from ocp_torch.certificate.sides import upper_side
+from ocp_torch.certificate.upper.density import density_bounds
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.policies import CLOSED, NETWORK
 from ocp_torch.fields import Fields, PeriodicMLP
@@ -106,7 +106,7 @@ def test_no_alarm_where_there_is_no_jump(problem):
     assert largest_jump(network, problem.dim, problem=problem).size == 0.0
     sets = replicated_samples(problem, 256, 4, 1, divergences=True)
     density = log_density(problem.dim)
-    assert upper_side(problem, network, lambda x: density(x).exp(), sets, 2.0).hidden is None
+    assert density_bounds(problem, network, lambda x: density(x).exp(), sets, 2.0).hidden is None
 
 
 @zoo.on(("circle rho=2", "torus 2-d chain"))

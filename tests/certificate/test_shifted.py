@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lower.mollified import DIRECTIONS, EVALUATIONS, Mollified
 from ocp_torch.certificate.lower.recombined import Program, recombined
+from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.lower.shifted import TOP, SlackParts, climbed, scaled_by, slack_function
 from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.certificate.sides import lower_side
 from ocp_torch.fields import PeriodicMLP
 from ocp_torch.maths.jets import jet
 from ocp_torch.problems import Circle
@@ -59,14 +59,14 @@ def test_scaling_never_loses_and_never_passes_the_optimum(name, seed, size):
     problem = zoo.build(name)
     V = near(problem, seed, size)
     sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
-    found = lower_side(problem, V, sets, 1.0, ascents=8)
+    found = SampledValue(problem, V, sets, ascents=8)
     pieces = [
         SlackParts.of(Generator.of(problem, s), jet(V, s.x)) for s in sets
     ]  # the multiple 1, as it was before there was a choice
     plain = climbed(problem, V, SlackParts.join(pieces), 1.0, 8)
     initial = sum(found.initial) / len(found.initial)
-    assert found.shifted.value >= initial - max(plain.value, 0.0) - 1e-12
-    assert found.shifted.value <= problem.exact_optimum + 6.0 * found.shifted.se + 1e-9
+    assert found.best.estimate.value >= initial - max(plain.value, 0.0) - 1e-12
+    assert found.best.estimate.value <= problem.exact_optimum + 6.0 * found.best.estimate.se + 1e-9
 
 
 @pytest.mark.nightly
@@ -75,9 +75,9 @@ def test_scaling_never_loses_and_never_passes_the_optimum(name, seed, size):
 def test_averaging_never_loses_and_never_passes_the_optimum(name, seed, size):
     problem = zoo.build(name)
     sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
-    found = lower_side(problem, near(problem, seed, size), sets, 1.0, ascents=8, search=True)
+    found = SampledValue(problem, near(problem, seed, size), sets, ascents=8, search=True)
     assert found.best.bound >= found.own.bound
-    assert found.shifted.value <= problem.exact_optimum + 6.0 * found.shifted.se + 1e-9
+    assert found.best.estimate.value <= problem.exact_optimum + 6.0 * found.best.estimate.se + 1e-9
 
 
 class Wave:
@@ -117,13 +117,13 @@ def test_a_narrow_spike_of_the_slack_is_averaged_out():
     bump = lambda x: torch.exp(-((x[:, 0] - at) / 2e-3).square())
     V = lambda x: problem.exact_value(x) + 2e-3 * bump(x)
     sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
-    plain, averaged = (lower_side(problem, V, sets, 1.0, ascents=8, search=m) for m in (False, True))
+    plain, averaged = (SampledValue(problem, V, sets, ascents=8, search=m) for m in (False, True))
     assert plain.best.radius == 0.0 < averaged.best.radius
     assert "averaged" in averaged.best.sentence
     assert "averaged" not in plain.best.sentence
-    lost = problem.exact_optimum - torch.tensor([plain.shifted.value, averaged.shifted.value])
+    lost = problem.exact_optimum - torch.tensor([plain.best.estimate.value, averaged.best.estimate.value])
     assert lost[1] < 0.7 * lost[0]
-    assert lost[1] >= -6.0 * averaged.shifted.se
+    assert lost[1] >= -6.0 * averaged.best.estimate.se
 
 
 @pytest.mark.parametrize(
@@ -154,23 +154,23 @@ def test_large_sets_are_thinned_to_the_budget():
 @zoo.on(zoo.FEW)
 def test_a_value_function_of_the_wrong_size_is_put_right(problem):
     sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
-    found = lower_side(problem, lambda x: 0.8 * problem.exact_value(x), sets, 1.0)
+    found = SampledValue(problem, lambda x: 0.8 * problem.exact_value(x), sets)
     assert found.own.theta == pytest.approx(1.25, abs=0.02)
-    assert found.shifted.value == pytest.approx(problem.exact_optimum, rel=5e-3, abs=6.0 * found.shifted.se)
+    assert found.best.estimate.value == pytest.approx(problem.exact_optimum, rel=5e-3, abs=6.0 * found.best.estimate.se)
 
 
 @zoo.on(zoo.FEW)
 def test_a_subsolution_with_room_is_shifted_up(problem):
     sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
-    found = lower_side(problem, lambda x: problem.exact_value(x) - 5.0, sets, 1.0)
-    assert found.shifted.value == pytest.approx(problem.exact_optimum, rel=5e-3, abs=6.0 * found.shifted.se)
+    found = SampledValue(problem, lambda x: problem.exact_value(x) - 5.0, sets)
+    assert found.best.estimate.value == pytest.approx(problem.exact_optimum, rel=5e-3, abs=6.0 * found.best.estimate.se)
 
 
 def test_a_useless_value_function_still_gives_about_the_smallest_cost():
     problem = Circle()
     sets = replicated_samples(problem, 512, 2, seed=0, divergences=False)
-    rough = lower_side(problem, zoo.rough_network(1, 0, size=50.0), sets, 1.0)
-    assert -1e-3 < rough.shifted.value < problem.exact_optimum
+    rough = SampledValue(problem, zoo.rough_network(1, 0, size=50.0), sets)
+    assert -1e-3 < rough.best.estimate.value < problem.exact_optimum
     assert rough.own.theta < 0.1
 
 
@@ -182,9 +182,9 @@ class Negative(Circle):
 def test_where_the_cost_is_negative_nothing_is_scaled():
     problem = Negative()
     sets = replicated_samples(problem, 512, 2, seed=0, divergences=False)
-    found = lower_side(problem, zoo.rough_network(1, 0), sets, 1.0)
+    found = SampledValue(problem, zoo.rough_network(1, 0), sets)
     assert found.own.theta == 1.0
-    assert found.shifted.value <= problem.exact_optimum - 0.1
+    assert found.best.estimate.value <= problem.exact_optimum - 0.1
 
 
 class Perturbed(PeriodicMLP):
@@ -225,10 +225,10 @@ def test_a_last_layer_chosen_anew_finds_the_subsolution_that_it_can_represent(na
     problem = zoo.build(name)
     value = perturbed(problem)
     sets = replicated_samples(problem, 1024, 8, seed=0, divergences=False)
-    found = lower_side(problem, value, sets, 1.0, ascents=8, search=True)
+    found = SampledValue(problem, value, sets, ascents=8, search=True)
     lost = problem.exact_optimum - found.own.bound, problem.exact_optimum - found.best.bound
     assert lost[1] < 0.1 * lost[0]
-    assert lost[1] > -6.0 * found.shifted.se - 1e-9
+    assert lost[1] > -6.0 * found.best.estimate.se - 1e-9
     assert "recombined" in found.best.sentence
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from ocp_torch.certificate.checks.assumptions import occupation_along_flow
+from ocp_torch.certificate.simulated.occupation import occupation_along_flow
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance
-from ocp_torch.certificate.simulated.simulation import discounted_integral, refined
+from ocp_torch.maths.runge_kutta import discounted_integral, refined
 from ocp_torch.maths.sampling import evaluation_points
 from support import zoo
 

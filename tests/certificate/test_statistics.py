@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from ocp_torch.certificate import CertificateSettings
-from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.certificate.student import t_factor
+from ocp_torch.certificate.estimate import Estimate, t_factor
 from ocp_torch.errors import InputError
 from ocp_torch.maths.sampling import evaluation_points
 

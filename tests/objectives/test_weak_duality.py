@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
+from ocp_torch.certificate.lower.penalised import penalised
+from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.lower.shifted import slack_function
-from ocp_torch.certificate.sides import lower_side, upper_side
+from ocp_torch.certificate.upper.density import density_bounds
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.policies import CLOSED, NETWORK, occupation_density
 from ocp_torch.fields import Fields
@@ -69,7 +71,7 @@ def test_no_value_function_gives_a_penalised_bound_above_the_optimum(name, seed,
 @given(**case)
 def test_no_value_function_gives_a_shifted_bound_above_the_optimum(name, seed, size, near):
     problem, value = zoo.build(name), random_value(name, seed, size, near)
-    shifted = lower_side(problem, value, sets_of(name), problem.occupation_bound).shifted
+    shifted = SampledValue(problem, value, sets_of(name)).best.estimate
     assert shifted.value <= problem.exact_optimum + ERRORS * shifted.se + 1e-9
 
 
@@ -83,7 +85,7 @@ def test_no_densities_give_an_upper_bound_below_the_optimum(name, seed, size, ne
         exact_w = lambda x: problem.exact_occupation(x).unsqueeze(-1) * problem.exact_control(x)
         w = lambda x: exact_w(x) + fields.control_density(x)
         mu = lambda x: problem.exact_occupation(x) * fields.log_occupation(x).exp()
-    J, G, *_ = upper_side(problem, w, mu, sets_of(name), problem.value_bound)
+    J, G, *_ = density_bounds(problem, w, mu, sets_of(name), problem.value_bound)
     assert J.value >= problem.exact_optimum - ERRORS * J.se - 1e-9
     assert (G is None) == (not problem.driftless)
     if G is not None:
@@ -128,17 +130,17 @@ def test_losses_are_the_numbers_of_the_certificate(name, seed, size):
         Estimate.of([float(objective.losses(fields, s, phase)[player]) for s in sets]).value
     )
     # One set at a time: with several the certificate takes off what plane waves explain of their noise.
-    alone = [lower_side(problem, fields.value, [s], constants.M, ascents=1).F_M.value for s in sets]
+    alone = [penalised(SampledValue(problem, fields.value, [s], ascents=1), constants.M).value for s in sets]
     F_M = Estimate.of(alone).value
     assert mean(paper_dual(problem), "value") == pytest.approx(-F_M, rel=1e-9, abs=1e-9)
-    J, G, *_ = upper_side(
+    J, G, *_ = density_bounds(
         problem, fields.control_density, occupation_density(NETWORK, problem, fields, constants), sets, constants.C_V
     )
     assert mean(NetworkPrimal(problem), "density") == pytest.approx(J.value, rel=1e-9)
     if problem.driftless:
         assert mean(ClosedPrimal(problem), "density") == pytest.approx(G.value, rel=1e-9)
         closed = occupation_density(CLOSED, problem, fields, constants)
-        attained, least, *_ = upper_side(problem, fields.control_density, closed, sets, constants.C_V)
+        attained, least, *_ = density_bounds(problem, fields.control_density, closed, sets, constants.C_V)
         assert attained.value == pytest.approx(least.value, rel=1e-9)
 
 
@@ -197,9 +199,9 @@ def test_the_shifted_bound_undoes_a_constant_that_violates_the_constraint(proble
     network = random_fields(problem, seed=1).value
     above = 1.0 - float(slack_function(problem, network)(samples.x).max())
     found = [
-        lower_side(problem, lambda x, c=c: network(x) + c, [samples] * 2, 1.0, ascents=1) for c in (above, above + 3.0)
+        SampledValue(problem, lambda x, c=c: network(x) + c, [samples] * 2, ascents=1) for c in (above, above + 3.0)
     ]
-    change = found[1].shifted.value - found[0].shifted.value
+    change = found[1].best.estimate.value - found[0].best.estimate.value
     # Sampled, the mean of mu0 is not quite 1; what is left of that enters with the multiple of V that is shifted.
     low, high = sorted(3.0 * (float(samples.mu0.mean()) - 1.0) * side.own.theta for side in found)
     assert low - 1e-6 <= change <= high + 1e-6
@@ -209,8 +211,8 @@ def test_the_shifted_bound_undoes_a_constant_that_violates_the_constraint(proble
 def test_an_occupation_bound_below_one_gives_no_lower_bound(problem):
     """What `M >= sup mu*` is for: it is at least 1, and with less a large constant is rewarded."""
     sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
-    lower = lower_side(problem, lambda x: problem.exact_value(x) + 100.0, sets, 0.9, ascents=1)
-    assert lower.F_M.value > problem.exact_optimum + 1.0
+    found = penalised(SampledValue(problem, lambda x: problem.exact_value(x) + 100.0, sets, ascents=1), 0.9)
+    assert found.value > problem.exact_optimum + 1.0
 
 
 class Relabelled(Problem):
@@ -246,9 +248,9 @@ def test_relabelling_the_coordinates_changes_nothing(name):
     mu = occupation_density(NETWORK, problem, fields, constants)
     moved = [Samples.of(other, s.x[:, order]) for s in sets]
     read = lambda field: lambda y: field(y[:, other.inverse])
-    here = lower_side(problem, fields.value, sets, constants.M, ascents=4)
-    there = lower_side(other, read(fields.value), moved, constants.M, ascents=4)
-    assert there.F_M.value == pytest.approx(here.F_M.value, rel=1e-11)
-    J, *_ = upper_side(problem, fields.control_density, mu, sets, constants.C_V)
-    J_there, *_ = upper_side(other, read(fields.control_density), read(mu), moved, constants.C_V)
+    here = penalised(SampledValue(problem, fields.value, sets, ascents=4), constants.M)
+    there = penalised(SampledValue(other, read(fields.value), moved, ascents=4), constants.M)
+    assert there.value == pytest.approx(here.value, rel=1e-11)
+    J, *_ = density_bounds(problem, fields.control_density, mu, sets, constants.C_V)
+    J_there, *_ = density_bounds(other, read(fields.control_density), read(mu), moved, constants.C_V)
     assert J_there.value == pytest.approx(J.value, rel=1e-11)

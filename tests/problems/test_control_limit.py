@@ -11,11 +11,13 @@ from hypothesis import strategies as st
 from ocp_torch.certificate import CertificateSettings, StageSettings
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.external.black_box import BlackBox
+from ocp_torch.certificate.lower.penalised import penalised
+from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.proof.box import Box
 from ocp_torch.certificate.proof.enclosures import conjugate_model
 from ocp_torch.certificate.proof.obstacle import obstacle
 from ocp_torch.certificate.proof.rigorous import rigorous_lower_bound
-from ocp_torch.certificate.sides import lower_side, upper_side
+from ocp_torch.certificate.upper.density import density_bounds
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.controller import load_controller
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, admissible_density, occupation_density, trained_policies
@@ -213,10 +215,10 @@ def test_the_exact_truth_solves_its_equations_with_the_limit_reached(problem):
 def test_the_bounds_at_the_exact_truth_are_the_optimum(problem):
     grid = lattice(problem.dim)
     sets = [Samples.of(problem, grid), Samples.of(problem, grid + 0.37)]
-    lower = lower_side(problem, problem.exact_value, sets, problem.occupation_bound)
+    lower = SampledValue(problem, problem.exact_value, sets)
     w = lambda x: problem.exact_occupation(x).unsqueeze(-1) * problem.exact_control(x)
-    J, *_ = upper_side(problem, w, problem.exact_occupation, sets, problem.value_bound)
-    for estimate in (lower.F_M, lower.shifted):
+    J, *_ = density_bounds(problem, w, problem.exact_occupation, sets, problem.value_bound)
+    for estimate in (penalised(lower, problem.occupation_bound), lower.best.estimate):
         assert estimate.value == pytest.approx(problem.exact_optimum, rel=1e-9)
     # Where u* has kinks the integrand of J is only continuous: the lattice is not exact for it.
     assert J.value == pytest.approx(problem.exact_optimum, rel=5e-3)
@@ -235,11 +237,11 @@ def test_random_networks_obey_weak_duality_and_the_limit(name, seed, size):
     problem, fields = zoo.build(name), random_fields(zoo.build(name), seed, size)
     constants = resolve_constants(problem)
     sets = replicated_samples(problem, 256, 8, seed=seed, divergences=True)
-    lower = lower_side(problem, fields.value, sets, constants.M, ascents=4)
-    for low in (lower.F_M, lower.shifted):
+    lower = SampledValue(problem, fields.value, sets, ascents=4)
+    for low in (penalised(lower, constants.M), lower.best.estimate):
         assert low.value <= problem.exact_optimum + ERRORS * low.se + 1e-9
     form = (NETWORK, problem, fields, constants)
-    J, *_ = upper_side(problem, admissible_density(*form), occupation_density(*form), sets, constants.C_V)
+    J, *_ = density_bounds(problem, admissible_density(*form), occupation_density(*form), sets, constants.C_V)
     assert math.isfinite(J.value)
     assert J.value >= problem.exact_optimum - ERRORS * J.se - 1e-9
     phase = Phase(constants)
@@ -259,7 +261,7 @@ def test_without_drift_the_closed_occupation_carries_any_flux(seed, size, limit)
     fields, constants = random_fields(problem, seed, size), resolve_constants(problem)
     sets = replicated_samples(problem, 256, 4, seed=seed, divergences=True)
     form = (CLOSED, problem, fields, constants)
-    J, G, *_ = upper_side(problem, admissible_density(*form), occupation_density(*form), sets, constants.C_V)
+    J, G, *_ = density_bounds(problem, admissible_density(*form), occupation_density(*form), sets, constants.C_V)
     assert J.value == pytest.approx(G.value, rel=1e-9)
     phase = Phase(constants)
     mean = Estimate.of([float(ClosedPrimal(problem).losses(fields, s, phase)["density"]) for s in sets]).value

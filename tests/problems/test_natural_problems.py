@@ -8,9 +8,9 @@ import pytest
 import torch
 from scipy.linalg import solve_continuous_are
 
-from ocp_torch.certificate.simulated.simulation import discounted_integral
 from ocp_torch.control.controller import problem_name
 from ocp_torch.errors import InputError
+from ocp_torch.maths.runge_kutta import discounted_integral
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems import PROBLEMS, Arm, Dubins, Kuramoto, Pendulum, PhaseNeurons, RobotArm, Unicycle
 from ocp_torch.problems.exact.local import occupation_bound_at_rest, optimal_contraction

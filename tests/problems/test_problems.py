@@ -6,7 +6,9 @@ import math
 import pytest
 import torch
 
-from ocp_torch.certificate.sides import lower_side, upper_side
+from ocp_torch.certificate.lower.penalised import penalised
+from ocp_torch.certificate.lower.sampled import SampledValue
+from ocp_torch.certificate.upper.density import density_bounds
 from ocp_torch.errors import InputError
 from ocp_torch.maths import jets
 from ocp_torch.maths.sampling import evaluation_points
@@ -122,10 +124,10 @@ def test_the_bounds_at_the_exact_truth_are_the_optimum(problem):
     """`F_M(V*) = OPT = J(w*, mu*)` by a quadrature that is exact; also the shifted bound, for `V*` is a subsolution."""
     grid = lattice(problem.dim)
     sets = [Samples.of(problem, grid), Samples.of(problem, grid + 0.37)]
-    lower = lower_side(problem, problem.exact_value, sets, problem.occupation_bound)
+    lower = SampledValue(problem, problem.exact_value, sets)
     w = lambda x: problem.exact_occupation(x).unsqueeze(-1) * problem.exact_control(x)
-    J, G, *_ = upper_side(problem, w, problem.exact_occupation, sets, problem.value_bound)
-    for estimate in (lower.F_M, lower.shifted, J):
+    J, G, *_ = density_bounds(problem, w, problem.exact_occupation, sets, problem.value_bound)
+    for estimate in (penalised(lower, problem.occupation_bound), lower.best.estimate, J):
         assert estimate.value == pytest.approx(problem.exact_optimum, rel=1e-9)
     assert G is None
 
@@ -135,7 +137,7 @@ def test_the_upper_bounds_at_the_exact_truth_are_the_optimum_without_drift(probl
     """`mu*`, and `w*` with it, vanishes where `u*` jumps: the flux has no singular part that sampled states would miss."""
     sets = [Samples.of(problem, evaluation_points(2**13, problem.dim, r, seed=0)) for r in range(8)]
     w = lambda x: problem.exact_occupation(x).unsqueeze(-1) * problem.exact_control(x)
-    for estimate in upper_side(problem, w, problem.exact_occupation, sets, problem.value_bound)[:2]:
+    for estimate in density_bounds(problem, w, problem.exact_occupation, sets, problem.value_bound)[:2]:
         assert abs(estimate.value - problem.exact_optimum) <= 5.0 * estimate.se + 1e-9
 
 

@@ -7,6 +7,7 @@ from PIL import Image
 
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Arm, RobotArm
+from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.runs.metrics import classical_policy, metrics
 from ocp_torch.runs.pictures import motion
 
@@ -110,6 +111,11 @@ def test_without_a_file_it_is_a_six_joint_arm_that_can_reach_its_target():
         (slope,) = torch.autograd.grad(robot.state_cost(best.unsqueeze(0)).sum(), best)
         best = (best - 0.01 * slope).detach().requires_grad_(True)
     assert float(robot.distance(best.detach().unsqueeze(0))) < 1e-3
+
+
+def test_a_linkage_without_joints_is_no_problem():
+    with pytest.raises(TypeError, match="abstract.*jacobian.*joints"):
+        Linkage(2, 2, [0.0, 0.0], [], 0.1, 1.0, 1.0, 1.0, 1.0, 2.0, None)
 
 
 def test_wrong_arguments_are_refused():

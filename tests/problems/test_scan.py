@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ocp_torch.certificate.estimate import replicated_samples
-from ocp_torch.certificate.sides import lower_side
+from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.problems import Circle, Problem
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.scan import odd_states
@@ -71,7 +71,7 @@ def test_a_supremum_that_only_a_scan_meets_is_used():
     V = lambda x: 1e-3 * (2.0 * math.pi * x).sin().sum(dim=-1)
     sets = replicated_samples(problem, 64, 2, seed=0, divergences=False)
     odd = odd_states(problem, 2**21, seed=0)
-    blind, seeing = (lower_side(problem, V, sets, 1.0, ascents=4, odd=states) for states in (None, odd))
+    blind, seeing = (SampledValue(problem, V, sets, ascents=4, odd=states) for states in (None, odd))
     centre = problem.centre.unsqueeze(0)
     # At the bottom of the needle V is about 0 and the conjugate hardly anything, so the slack is about -f.
     assert seeing.own.largest.value >= float(-problem.state_cost(centre)) - 0.02

@@ -8,7 +8,7 @@ import torch
 
 from ocp_torch.certificate.checks.wellposed import check_problem
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
-from ocp_torch.certificate.sides import lower_side
+from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
 from ocp_torch.control.policies import zero_policy
 from ocp_torch.gym.environment import make_environment
@@ -59,7 +59,7 @@ def test_the_random_horizon_starts_there_too():
 def test_the_lower_side_knows_its_mean_over_a_narrow_start(narrow):
     sets = replicated_samples(narrow, 2048, 8, seed=0, divergences=False)
     V = lambda x: 3.0 + (TURN * x).cos().mean(dim=-1)
-    assert_near(Estimate.of(lower_side(narrow, V, sets, 1.0, ascents=4).initial), 3.0 + narrow.mean_wave(), 0.15)
+    assert_near(Estimate.of(SampledValue(narrow, V, sets, ascents=4).initial), 3.0 + narrow.mean_wave(), 0.15)
 
 
 def test_the_mass_of_a_narrow_start_is_found_to_be_one(narrow):

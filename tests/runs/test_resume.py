@@ -151,7 +151,7 @@ def finished(tmp_path_factory):
 
 
 def resuming(folder, *overrides: str):
-    """What `prepare` makes of a resume of ``folder``, or the sentence it is refused with."""
+    """What `training_run` makes of a resume of ``folder``, or the sentence it is refused with."""
     try:
         return training_run(composed("train", [f"resume={folder}", *overrides])).trainer
     except InputError as error:

@@ -25,7 +25,7 @@ def quickly():
 
     def compose(config_name, overrides=(), **options):
         files = tuple(o for o in overrides if not is_field(o))
-        fields = composition.parsed([o for o in overrides if is_field(o) and not o.startswith("hydra.run.dir=")])
+        fields = composition.parsed([o for o in overrides if is_field(o)])
         if any(o.is_sweep_override() or o.is_delete() or o.is_add() for o in fields):
             return real(config_name, list(overrides), **options)
         if (config_name, files) not in kept:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import product
 
-from ocp_torch.certificate.certificate import Certificate, known
-from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.certificate import Certificate
+from ocp_torch.certificate.estimate import Estimate, known
+from ocp_torch.problems.needs import GUESSED
 
 # Bounds contradict each other where their intervals at this joint level are apart,
 LEVEL = 0.999
@@ -40,8 +41,8 @@ def examined(certificate: Certificate) -> Certificate:
         if apart(under, over, level):
             condition = " and ".join(need.condition for need in certificate.needs(low))
             note = f"{low} = {under.value:.6g} is above {high} = {over.value:.6g}: it is not so that {condition}."
-            wrong = replace(certificate.assumptions, occupation_holds=False)
-            return replace(certificate, assumptions=wrong, warnings=[*certificate.warnings, note])
+            wrong = {need.name for need in certificate.needs(low) if need.basis == GUESSED}
+            return replace(certificate, refuted=certificate.refuted | wrong, warnings=[*certificate.warnings, note])
     return certificate
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.student import t_factor
+from ocp_torch.certificate.estimate import t_factor
 from ocp_torch.maths.seeds import fixed_generator
 
 # Waves along each of the first axes, and in random directions.

@@ -9,7 +9,7 @@ from ocp_torch.problems.problem import Problem
 
 DOUBLE = 8  # bytes of a number
 # Numbers that a simulated trajectory and a state of the occupation's supremum have in memory at once, at least, per
-# coordinate of states and controls: the stages of a Runge-Kutta step.
+# coordinate of states and controls: those of a Runge-Kutta step.
 AT_ONCE = 4
 
 

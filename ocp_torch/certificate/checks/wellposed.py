@@ -26,6 +26,9 @@ MASS_TOLERANCE, MASS_LEVEL = 1e-4, 0.9999
 # What the states' masses must be worth, as a part of as many equal ones: below, a few states carry mu0 and no mass is known.
 LEAST_WORTH = 0.02
 
+# How many of the lowest states a function is followed downhill from, in search of a negative value, and for how many steps.
+DESCENTS, DESCENT_STEPS = 16, 40
+
 
 @dataclass(frozen=True)
 class WellPosed:
@@ -125,7 +128,6 @@ def _seams(problem: Problem, sizes: dict[str, float]) -> dict[str, float]:
 def _smallest(function, sets: list[Samples], name: str) -> float:
     """The smallest value of ``function``: on ``sets``, and downhill from the lowest of those states."""
     values, states = torch.cat([getattr(s, name) for s in sets]), torch.cat([s.x for s in sets])
-    lowest = states[values.topk(min(16, len(values)), largest=False).indices]
-    return min(
-        -supremum(lambda x: -function(x), lowest, ascents=16, steps=40, differentiable=False).value, float(values.min())
-    )
+    lowest = states[values.topk(min(DESCENTS, len(values)), largest=False).indices]
+    found = supremum(lambda x: -function(x), lowest, ascents=DESCENTS, steps=DESCENT_STEPS, differentiable=False)
+    return min(-found.value, float(values.min()))

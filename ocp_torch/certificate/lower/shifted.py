@@ -10,18 +10,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from ocp_torch.certificate.bound import LOWER, Bound, sentence_on
+from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.simulated.control_variate import integrals
 from ocp_torch.maths.jets import Field, Jet, chunked_jet, jet
 from ocp_torch.maths.supremum import Extremum, minimiser, supremum
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.generator import Generator, hjb_slack
+from ocp_torch.problems.needs import Need
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
+
+if TYPE_CHECKING:
+    from ocp_torch.certificate.context import Context
 
 # The largest theta that is tried.
 TOP = 1.5
@@ -59,6 +66,11 @@ def slack_parts(problem: Problem, value: Field, sets: list[Samples]) -> list[Sla
     return [SlackParts.of(Generator.of(problem, s), chunked_jet(value, s.x)) for s in sets]
 
 
+def initials(sets: list[Samples], parts: list[SlackParts]) -> list[float]:
+    """`E[V mu0]`, per set."""
+    return integrals([s.x for s in sets], [p.initial for p in parts], [s.weight for s in sets])
+
+
 @dataclass(frozen=True)
 class Shift:
     """`E[theta W mu0] - sup Q_{theta W}`, for `W` the average of `V` at ``radius``, or `V` itself where that is 0."""
@@ -79,9 +91,12 @@ class Shift:
         ascents: int,
         radius: float = 0.0,
         beside: Sequence[SlackParts] = (),
+        initial: list[float] | None = None,
     ) -> Shift:
-        """The best multiple of ``value``, whose ``parts`` on ``sets`` are known; the supremum is sought ``beside`` too."""
-        initial = integrals([s.x for s in sets], [p.initial for p in parts], [s.weight for s in sets])
+        """The best multiple of ``value``, whose ``parts`` on ``sets`` are known; the supremum is sought ``beside`` too.
+
+        ``initial`` is `E[W mu0]` per set, if that is known."""
+        initial = initial or initials(sets, parts)
         everywhere = SlackParts.join([*parts, *beside])
         theta, largest = best_shift(problem, value, everywhere, sum(initial) / len(initial), ascents)
         return cls(theta, largest, initial, radius)
@@ -147,3 +162,21 @@ def best_shift(
 def scaled_by(parts: SlackParts, initial: float) -> float:
     """The `theta` in `[0, TOP]` that maximises the sampled bound, concave in `theta`."""
     return minimiser(lambda theta: float(parts.slack(theta).max()) - theta * initial, 0.0, TOP)
+
+
+class Shifted(Bound):
+    """The best shifted bound that was found of functions made of `V` (`SampledValue.best`)."""
+
+    name, side, label = "shifted", LOWER, "shifted"
+
+    def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
+        return (found_by_search("sup Q"),)
+
+    def evaluate(self, context: Context) -> Estimate | None:
+        return None if context.sampled_value is None else context.sampled_value.best.estimate
+
+    def searches(self, context: Context) -> list[str]:
+        if context.sampled_value is None:
+            return []
+        best = context.sampled_value.best
+        return [sentence_on(best.sentence, best.largest)]

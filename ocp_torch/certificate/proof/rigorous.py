@@ -16,14 +16,13 @@ import time
 from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.lower.shifted import slack_function
 from ocp_torch.certificate.proof.cover import CHUNK, Cover
 from ocp_torch.certificate.proof.obstacle import obstacle
 from ocp_torch.certificate.proof.rounding import ROUNDING, upward
-from ocp_torch.certificate.sides import LowerSide
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.mlp import PeriodicMLP
 from ocp_torch.maths.sampling import scrambled_sobol
@@ -165,12 +164,3 @@ def _size(problem: Problem, value: PeriodicMLP, theta: float, x: Tensor) -> floa
     """The size of `theta V mu0`, which tolerances are relative to; not much below that of the costs."""
     initial, cost = theta * value(x) * problem.initial_density(x), problem.state_cost(x)
     return max(float(initial.abs().mean()), LEAST_SIZE * float(cost.abs().mean()), 1e-300)
-
-
-def proved_lower(problem: Problem, value: nn.Module, lower: LowerSide) -> tuple[RigorousBound | None, list[str]]:
-    """The proved counterpart of ``lower.own``, or a warning that says why there is none."""
-    why = obstacle(problem, value)
-    if why is not None:
-        return None, [f"no rigorous lower bound: {why}."]
-    bound = rigorous_lower_bound(problem, value, theta=lower.own.theta, sampled_slack=lower.own.largest.value)
-    return bound, [] if bound else ["no rigorous lower bound: nothing finite was proved within the budget of cells."]

@@ -8,8 +8,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.simulated.simulation import Dynamics, discounted_integral
 from ocp_torch.control.policies import Policy
+from ocp_torch.maths.runge_kutta import Dynamics, discounted_integral
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -18,8 +18,15 @@ from ocp_torch.problems.problem import Problem
 # The integral over the past is taken in pieces of so many discount times, until the last one adds next to nothing; what
 # has not settled after so many pieces is extrapolated.
 PIECE, PIECES, SETTLED = 5.0, 8, 1e-2
+# Steps of a piece: in each no more than that part of a discount time passes, and no state moves farther than that part of a
+# turn, but so few and so many at least and at most; more are more exact and take longer.
+DISCOUNTED, MOVED, FEWEST_STEPS, MOST_STEPS = 0.25, 0.1, 20, 150
+# The logarithm at which the growth of a density is cut off, so that it stays a number: e^60 is unbounded to any check.
+LARGEST_GROWTH = 60.0
 # Of the states looked at, the highest are looked at again from close by.
 TOP, NEARBY = 6, 48
+# Ascents to the suprema of the a-priori bound, which is shown beside the density itself and decides nothing.
+ASCENTS, ASCENT_STEPS = 16, 20
 # Step of a difference quotient of the velocity: truncation is then about 1e-7 of its second derivatives, rounding 1e-9.
 DIFFERENCE = 1e-7
 
@@ -42,7 +49,7 @@ def _backward(problem: Problem, policy: Policy) -> Dynamics:
         y, log_factor = state[:, :-1], state[:, -1]
         forward, spread = velocity_and_divergence(velocity, y)
         motion = torch.cat([-forward, -spread.unsqueeze(-1)], dim=-1)
-        return motion, problem.initial_density(y) * log_factor.clamp_max(60.0).exp()
+        return motion, problem.initial_density(y) * log_factor.clamp_max(LARGEST_GROWTH).exp()
 
     return backward
 
@@ -68,7 +75,8 @@ def settled_occupation(problem: Problem, policy: Policy, x: Tensor) -> Tensor:
     horizon = PIECE / rho
     with torch.no_grad():
         speed = float(problem.velocity(x, policy(x)).norm(dim=-1).max())
-    steps = int(min(150, max(20, math.ceil(horizon * max(rho / 0.25, speed / 0.1)))))
+    wanted = math.ceil(horizon * max(rho / DISCOUNTED, speed / MOVED))
+    steps = int(min(MOST_STEPS, max(FEWEST_STEPS, wanted)))
     state = torch.cat([x, x.new_zeros(len(x), 1)], dim=-1)
     pieces: list[Tensor] = []
     for _ in range(PIECES):
@@ -112,6 +120,8 @@ def a_priori_sup_occupation(problem: Problem, policy: Policy, points: Tensor) ->
     if not problem.gives_divergences:
         return None
     loop = ClosedLoop(problem, policy)
-    largest = lambda function: supremum(function, points, ascents=16, steps=20, differentiable=False).value
+    largest = lambda function: (
+        supremum(function, points, ascents=ASCENTS, steps=ASCENT_STEPS, differentiable=False).value
+    )
     excess = problem.discount - max(0.0, largest(lambda x: -loop.drift_divergence(x)))
     return problem.discount * largest(problem.initial_density) / excess if excess > 0.0 else None

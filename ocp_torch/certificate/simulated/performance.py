@@ -4,9 +4,7 @@ For any smooth `V`, `V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt` exactly alo
 `Q_u = V - f - R(u) - grad V . (a + B u) / rho`. So `Perf(u) = E[V mu0] - E int rho e^{-rho t} Q_u`, and what is left to
 simulate, with all its errors, is as small as `Q_u`.
 
-On a sliding mode, where a controller jumps to and fro at a kink of `V`, no step is small enough for `grad V . (a + B u)` to
-be the rate at which `V` changes: the sum of it is carried along, and taken for `V` where the two do not
-become the same (`Sliding`).
+Where a controller slides along a kink of `V` that rate is not the one at which `V` changes (see `Sliding`).
 
 The infinite horizon is truncated, with the tail bounded; or each trajectory stops at a time `T ~ Exp(rho)` of its own,
 and `E[rate(x_T)]` is the discounted integral, without a tail.
@@ -23,10 +21,11 @@ from torch import Tensor
 from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
-from ocp_torch.certificate.simulated.simulation import Dynamics, Integrate, discounted_integral, rate_at, refined
+from ocp_torch.certificate.simulated.sliding import Sliding
 from ocp_torch.control.policies import Policy, ValuePolicy
 from ocp_torch.maths import jets
 from ocp_torch.maths.jets import Field
+from ocp_torch.maths.runge_kutta import Dynamics, discounted_integral, rate_at, refined
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
@@ -35,14 +34,15 @@ from ocp_torch.problems.starts import initial_points
 
 # A kink of V is met at the start of a trajectory or never, and what is late counts little: early steps are shorter.
 GRADING = 2.0
+# The first steps, before any is halved: so many at least, in each of which no more than that part of a discount time passes,
+# and no trajectory moves farther than that part of a turn. Coarser ones are halved more often, finer ones cost more at once.
+FEWEST_STEPS, DISCOUNTED, MOVED = 8, 0.4, 0.2
 # Simulation sets come after those of the bounds in the stream of evaluation points.
 SIMULATION_REPLICATE = 1000
 # What is left of the discount when simulation stops, times the rate's supremum, relative to the answer.
 TAIL = 2e-5
 # The answer is taken to be at least this part of the mean state cost at the starts.
 LEAST = 0.1
-# What the sum of `grad V . g` is off `V` by must shrink to that part of it when steps are halved; a sixteenth is expected.
-SETTLING = 0.25
 # States to which the starts' mean cost is compared, how many standard errors apart the two must be, and by how many times
 # that the interval is widened: trajectories may stay where no start was.
 COMPARED, UNLIKELY, UNSEEN_ROOM = 2**15, 2.5, 2.0
@@ -79,31 +79,6 @@ def _dynamics(problem: Problem, policy: Policy, value: Field | None) -> Dynamics
         return torch.cat([velocity, change], dim=-1), torch.stack([-slack, summed - V.value], dim=-1)
 
     return dynamics
-
-
-class Sliding:
-    """Results by `-Q_u`, or, where the sum `z` of `grad V . g` stays off `V` however fine the steps, with that taken off.
-
-    For every `z` with `z = V` at the start, the integral of `f + R(u) - z + z' / rho`, discounted, is the cost less that `V`.
-    On a sliding mode, where a controller jumps to and fro at a kink of `V`, no step is small enough for `grad V . g` to be
-    the rate at which `V` changes. Along smooth trajectories `z - V` vanishes with the steps.
-    """
-
-    def __init__(self, integrate: Integrate, count: int, allowed: float) -> None:
-        self.integrate, self.allowed = integrate, allowed
-        self.off = torch.full((count,), math.inf, dtype=torch.float64)
-        self.stays = torch.zeros(count, dtype=torch.bool)
-
-    def __call__(self, rows: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        rates, end = self.integrate(rows, steps)
-        off = rates[:, 1].abs()
-        self.stays[rows] = (off > self.allowed) & (off > SETTLING * self.off[rows])
-        self.off[rows] = off
-        return self.corrected(rates, rows), end
-
-    def corrected(self, rates: Tensor, rows: Tensor) -> Tensor:
-        """The first column of ``rates`` ``(n, 2)`` of ``rows``, less the second where that is to be taken off."""
-        return torch.where(self.stays[rows], rates[:, 0] - rates[:, 1], rates[:, 0])
 
 
 def starting_points(
@@ -173,7 +148,7 @@ def simulate_performance(
     if value is not None:
         integrate = Sliding(integrate, len(x0), tolerance * size)
     speed = float(velocity.norm(dim=-1).max())
-    steps = max(8, 2 * math.ceil(0.5 * longest * max(rho / 0.4, speed / 0.2)))
+    steps = max(FEWEST_STEPS, 2 * math.ceil(0.5 * longest * max(rho / DISCOUNTED, speed / MOVED)))
     generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT))
     means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
     noise = lambda results: Estimate.of(means(results).tolist()).se

@@ -19,25 +19,28 @@ Write `Q_u` for the Bellman slack of `V` and `r = mu0 - mu - div(mu g_u) / rho` 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from ocp_torch.certificate.bound import PERFORMANCE, UPPER, Bound, sentence_on
+from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
 from ocp_torch.certificate.checks.hidden import Flux, Hidden, hidden_divergence
 from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.lower.shifted import slack_function
+from ocp_torch.certificate.upper.multiples import Terms, best_multiples
 from ocp_torch.maths.jets import CHUNK, Field, chunked_jet
-from ocp_torch.maths.supremum import Extremum, batched, minimiser, supremum
+from ocp_torch.maths.supremum import Extremum, batched, supremum
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.generator import Generator
+from ocp_torch.problems.needs import Need
 from ocp_torch.problems.samples import Samples
 
-# Multiples of mu that are tried.
-MULTIPLES = (0.0, 2.0)
+if TYPE_CHECKING:
+    from ocp_torch.certificate.context import Context
 
 
 @dataclass(frozen=True)
@@ -119,51 +122,6 @@ def closed_loop_bounds(
     )
 
 
-@dataclass(frozen=True)
-class Terms:
-    """What the bounds on one set of states are made of: `V`, `mu Q_u` and `r`, each ``(N,)``."""
-
-    samples: Samples
-    v: Tensor
-    spent: Tensor
-    r: Tensor
-
-    def residual(self, scale: float) -> Tensor:
-        """The residual of ``scale`` times `mu`."""
-        return self.samples.mu0 - scale * (self.samples.mu0 - self.r)
-
-    def lagrangian(self, scale: float, hi: float, lo: float) -> float:
-        """`E[hi max(r, 0) + lo max(-r, 0) - mu Q_u]` of ``scale`` times `mu`: the bound of 2. without `E[V mu0]`."""
-        return integral(self.samples, self.lagrangian_integrand(scale, hi, lo))
-
-    def lagrangian_integrand(self, scale: float, hi: float, lo: float) -> torch.Tensor:
-        """What `lagrangian` is the mean of, ``(N,)``."""
-        r = self.residual(scale)
-        return hi * r.clamp_min(0.0) + lo * (-r).clamp_min(0.0) - scale * self.spent
-
-    def J(self, scale: float, C_V: float) -> float:
-        """The bound of 4., without `E[V mu0]`."""
-        return integral(self.samples, self.J_integrand(scale, C_V))
-
-    def J_integrand(self, scale: float, C_V: float) -> torch.Tensor:
-        """What `J` is the mean of, ``(N,)``."""
-        r = self.residual(scale)
-        return C_V * r.clamp_min(0.0) - self.v * r - scale * self.spent
-
-    @staticmethod
-    def join(terms: list[Terms]) -> Terms:
-        """All states of ``terms`` in one."""
-        columns = (torch.cat([getattr(t, name) for t in terms]) for name in ("v", "spent", "r"))
-        return Terms(Samples.concatenate([t.samples for t in terms]), *columns)
-
-
-def best_multiples(terms: list[Terms], bound: Callable[[Terms, float], float]) -> list[float]:
-    """``bound`` of each of ``terms`` with the multiple of `mu` that makes it smallest on the other half of them."""
-    halves = [Terms.join(terms[k::2]) for k in (0, 1)]
-    scales = [minimiser(partial(bound, half), *MULTIPLES) for half in halves]
-    return [bound(t, scales[1 - i % 2]) for i, t in enumerate(terms)]
-
-
 @torch.no_grad()
 def _integrands(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples):
     """`V`, `mu Q_u`, `r` and `Q_u` at the states of ``samples``, and the flux `mu g_u`."""
@@ -180,3 +138,35 @@ def _climbed(function, values: torch.Tensor, states: torch.Tensor, ascents: int)
     start = states[values.topk(min(ascents, len(values))).indices]
     found = supremum(function, start, ascents=ascents)
     return Extremum(max(found.value, 0.0), found.x, len(states), found.ascents)
+
+
+class Lagrangian(Bound):
+    """The Lagrangian bound of the controller handed out, from the density that was fitted to its closed loop."""
+
+    name, side, label = "lagrangian", UPPER, "Lagrangian"
+
+    def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
+        return found_by_search("sup |Q_u|"), assumptions.regular
+
+    def evaluate(self, context: Context) -> Estimate | None:
+        return context.closed_loop.lagrangian if context.closed_loop else None
+
+    def searches(self, context: Context) -> list[str]:
+        return slack_searches(context.closed_loop)
+
+
+class LagrangianBelow(Lagrangian):
+    """The same with the signs turned: it bounds the performance of a given controller from below."""
+
+    side = PERFORMANCE
+
+    def applies(self, context: Context) -> bool:
+        return context.external
+
+    def evaluate(self, context: Context) -> Estimate | None:
+        return context.closed_loop.below if context.closed_loop else None
+
+
+def slack_searches(found: ClosedLoopBounds | None) -> list[str]:
+    """How the two suprema of the slack behind ``found`` were found."""
+    return [] if found is None else [sentence_on("eps_hi", found.eps_hi), sentence_on("eps_lo", found.eps_lo)]

@@ -1,4 +1,4 @@
-"""The certification stage: fit `mu` (and `V`, where there is none) to the closed loop of the controller handed out."""
+"""Policy evaluation: fit `mu` (and `V`, where there is none) to the closed loop of the controller handed out."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from ocp_torch.certificate.upper.lagrangian import MULTIPLES, Terms
+from ocp_torch.certificate.upper.multiples import MULTIPLES, Terms
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
@@ -31,15 +31,15 @@ from ocp_torch.steppers.optimizers import LARGEST_RATE
 POOL = 2**16
 # Beyond that ratio of the two suprema of the slack the residual is not weighed any more lopsidedly.
 MOST_LOPSIDED = 16.0
-# Where the stage looks at its own excess after a round.
+# States at which the excess is computed after a round: what decides on a next one need not be exact.
 EXCESS_STATES = 4096
 
 
 @dataclass(frozen=True)
 class StageSettings:
-    """Budget of the certification stage. Raises `InputError` on a wrong value."""
+    """Budget of policy evaluation, `certificate.stage` of a configuration. Raises `InputError` on a wrong value."""
 
-    steps: int = 600  # least-squares steps in the first round; 0 for no stage
+    steps: int = 600  # least-squares steps in the first round; 0 for none at all
     rounds: int = (
         2  # rounds at most, each twice as long as the one before; the next starts only while `good_excess` is not met
     )

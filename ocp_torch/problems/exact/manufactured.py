@@ -19,8 +19,10 @@ from ocp_torch.problems.exact.trigonometric import TrigonometricPolynomial, rand
 from ocp_torch.problems.exact.wavy_matrix import WavyMatrix
 from ocp_torch.problems.problem import Problem
 
-# States searched for the extrema of u* and f, before local ascent.
+# States searched for the extrema of u* and f, and the ascents from the best of them with their steps: the truth claimed is as
+# exact as these extrema.
 SEARCH_POINTS = 2**14
+ASCENTS = dict(ascents=64, steps=100)
 
 
 class Manufactured(Problem):
@@ -31,7 +33,10 @@ class Manufactured(Problem):
     ``initial_contrast`` that of `mu0`; with ``state_dependent_control`` each entry of `B` varies with one coordinate;
     ``interaction`` is how many coordinates one trigonometric term couples; ``seed`` draws all coefficients. With a
     ``control_limit`` below ``control_size``, which is then the largest control an unlimited optimum would use, `u*` stays
-    at the limit on a part of the torus, and everything is as exact as before.
+    at the limit on a part of the torus, and everything is as exact as before. Raises `InputError` for wrong arguments.
+
+    Attributes: trigonometric polynomials ``V0``, ``mu`` (`mu*`), ``mu0``, ``phi`` and ``stream`` (the components of `h`); the
+    matrix ``B``; and the number ``c``.
     """
 
     def __init__(
@@ -108,15 +113,15 @@ class Manufactured(Problem):
         """Scale `V0` so that `sup |u*| = control_size`, then find the smallest `c` with `f >= 0`, and the bounds."""
         points = scrambled_sobol(SEARCH_POINTS, self.dim, 0, torch.float64)
         push = lambda x: self._pull_back(x).norm(dim=-1)
-        steepest = supremum(push, points, ascents=64, steps=100).value
+        steepest = supremum(push, points, **ASCENTS).value
         if steepest <= 0.0:
             raise InputError(
                 f"problem.seed = {self.seed} gives a value function the control cannot change; take another."
             )
         self.V0 = self.V0.scaled(self.control_size ** (self.exponent - 1.0) / steepest)
         self.c = 0.0
-        self.c = supremum(lambda x: -self.state_cost(x), points, ascents=64, steps=100).value
-        self.state_cost_bound = supremum(self.state_cost, points, ascents=64, steps=100).value
+        self.c = supremum(lambda x: -self.state_cost(x), points, **ASCENTS).value
+        self.state_cost_bound = supremum(self.state_cost, points, **ASCENTS).value
         self.value_bound = self.c + float(self.V0.amplitudes.abs().sum())
         self.control_bound = self.control_limit if self.limited else self.control_size
         self.occupation_bound = 1.0 + self.contrast

@@ -19,10 +19,12 @@ __all__ = ["Oracle", "asked", "resolved"]
 SAME = 1e-6
 # Single precision is forgiven that much more.
 SAME_IN_FLOAT32 = 1e3
-# The seam is looked at from so far on both sides; what changes by more than that part of the answer's size jumps there.
-SEAM_STEP, SEAM_JUMP, SEAM_PROBES, MOST_SEAMS = 1e-7, 1e-3, 4, 32
-# That size is the largest answer at so many states of the whole torus: at the seam a function that is odd is nearly 0.
-SIZED = 32
+# At the seam, where a coordinate passes from 1 to 0, states this far on both sides are compared: so many for each coordinate,
+# and at most so many coordinates.
+SEAM_STEP, SEAM_PROBES, MOST_SEAMS = 1e-7, 4, 32
+# What changes across the seam by more than that part of the answer's size jumps there. The size is the largest answer at so
+# many states of the whole torus: at the seam itself an odd function is nearly 0.
+SEAM_JUMP, SIZED = 1e-3, 32
 NAMES = ("f", "a", "B", "mu0")
 
 
@@ -47,7 +49,7 @@ class Oracle:
         self._kept: tuple[Tensor, dict] | None = None
         self.one_by_one = self.driftless = self.gives_mu0 = self.in_float32 = False
         self._understand()
-        self._look_at_the_seam()
+        self._check_the_seam()
         if isinstance(target, str) and workers > 1:
             self._pool = Workers(target, workers)
 
@@ -155,7 +157,7 @@ class Oracle:
             self._failure(x, complaints[0])
         ) from None
 
-    def _look_at_the_seam(self) -> None:
+    def _check_the_seam(self) -> None:
         everywhere = self.checked(scrambled_sobol(SIZED, self._dim, 0, torch.float64))
         for i in range(min(self._dim, MOST_SEAMS)):
             after = scrambled_sobol(SEAM_PROBES, self._dim, 1 + i, torch.float64)

@@ -11,8 +11,11 @@ from ocp_torch.errors import require_flag
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.oracle import Oracle
 
-# Half the distance of the two states of a difference quotient, by what the oracle computes in.
+# Half the distance of the two states of a difference quotient, by what the oracle computes in: near the cube root of its
+# rounding, which balances what rounding and what curvature cost.
 STEPS = {"float64": 1e-5, "float32": 2e-3}
+# States scanned for narrow features for each at which a bound is evaluated, where the oracle takes batches.
+SCAN_FACTOR = 8
 
 
 class Simulator(Problem):
@@ -49,8 +52,8 @@ class Simulator(Problem):
 
     @property
     def scan_factor(self) -> int:
-        """Few states more where each is a call of its own."""
-        return 0 if self._oracle.one_by_one or self.workers > 1 else 8
+        """None where each state is a call of its own."""
+        return 0 if self._oracle.one_by_one or self.workers > 1 else SCAN_FACTOR
 
     @property
     def driftless(self) -> bool:

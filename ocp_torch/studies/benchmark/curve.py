@@ -6,8 +6,10 @@ import math
 import statistics
 from dataclasses import dataclass, field
 
-# The keys of `measure.Judge` that are performances of controllers, and those that are bounds from above.
-PERFORMANCES, UPPER = ("value", "density", "policy"), ("J", "G")
+from ocp_torch.certificate import LOWER, UPPER, bounds
+
+# The keys of `measure.Judge` that are performances of controllers.
+PERFORMANCES = ("value", "density", "policy")
 
 
 @dataclass(frozen=True)
@@ -26,9 +28,10 @@ class Point:
 
     @property
     def gap(self) -> float:
-        """`(min(J, G) - F_M) / F_M`: infinite where one side is missing or `F_M` is not positive."""
-        upper = min((self.numbers[n] for n in UPPER if n in self.numbers), default=math.inf)
-        lower = max(self.numbers.get("F_M", -math.inf), self.numbers.get("shifted", -math.inf))
+        """From the highest lower bound to the lowest upper one, relative to the former: infinite where one is missing, or the
+        lower is not positive."""
+        upper = min((self.numbers[n] for n in bounds.on(UPPER) if n in self.numbers), default=math.inf)
+        lower = max((self.numbers[n] for n in bounds.on(LOWER) if n in self.numbers), default=-math.inf)
         return (upper - lower) / lower if lower > 0.0 else math.inf
 
 

@@ -81,7 +81,7 @@ class KernelContender:
         return Curve(self.name, seed, points, certified.gap["certified"], time.process_time() - started)
 
     def certify(self, fields, seed: int, iteration: Iteration, settings: CertificateSettings) -> Certificate:
-        """The full certificate, its second stage with a network: a kernel method is given the same help as the others."""
+        """The full certificate, its policy evaluation with a network: a kernel method gets the same help as the others."""
         network = lambda **form: PeriodicMLP(modes=6, **form)
         trained = Trained(fields, OCCUPATION[self.method], network)
         run = Run(type(self.problem).__name__.lower(), self.method, seed, iteration.n, iteration.samples)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.certify import in_float64
+from ocp_torch.certificate import BOUNDS, LOWER, UPPER, CertificateSettings, Run, StageSettings
 from ocp_torch.certificate.estimate import replicated_samples
-from ocp_torch.certificate.sides import lower_side, upper_side
 from ocp_torch.certificate.simulated.performance import simulate_performance
-from ocp_torch.control.policies import Policy, admissible_density, occupation_density, trained_policies
+from ocp_torch.certificate.trained import Trained
+from ocp_torch.certificate.trained_context import TrainedContext
+from ocp_torch.certificate.upper.density import DensityBounds
+from ocp_torch.control.policies import Policy
 from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
 from ocp_torch.maths.jets import Field
@@ -19,9 +24,34 @@ from ocp_torch.problems.samples import Samples
 
 # Integrals and simulations of one measurement: enough for 0.02 % on a curve, and beyond one dimension where there is a V.
 POINTS, TRAJECTORIES, REPLICATES, TOLERANCE = 2048, 256, 2, 2e-4
+ASCENTS = 8  # from the worst states, in search of a supremum: a quarter of what a certificate takes
 # In one dimension a policy is simulated from a table of so many states, with straight lines between them: more
 # trajectories cost nothing then, and a policy that is steep where they part needs them.
 TABLE, ON_THE_CIRCLE = 2**14, 2048
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Measured(TrainedContext):
+    """A context as cheap as can be: the same ``sets`` for every bound, which are not drawn anew where few states carry a
+    mean, no simulation, and none of the checks."""
+
+    sets: list[Samples]
+    settings: CertificateSettings = CertificateSettings(
+        ascents=ASCENTS, trajectories=0, occupation_states=0, mollify=False, stage=StageSettings(steps=0)
+    )
+    run: Run = Run("measured", "measured")
+
+    odd = None
+
+    @property
+    def wide(self) -> list[Samples]:
+        return self.sets
+
+    few = wide
+
+    @cached_property
+    def densities(self) -> DensityBounds | None:
+        return self.densities_on(self.few) if self.has_densities else None
 
 
 class Judge:
@@ -35,25 +65,17 @@ class Judge:
 
     @torch.no_grad()
     def __call__(self, fields: Fields, occupation: str | None, perf: bool = True) -> dict[str, float]:
-        """`F_M` and `shifted` (with `V`), `J` and, without drift, `G` (with `w`), and the performances that can be had.
-
-        The keys are those of `certificate.json`: `F_M`, `shifted`, `J`, `G`, `value`, `density`.
-        """
-        problem, constants, fields = self.problem, self.constants, in_float64(fields)
-        numbers: dict[str, float] = {}
-        initial = None
-        if fields.value is not None:
-            lower = lower_side(problem, fields.value, self.sets, constants.M, ascents=8)
-            initial = lower.initial
-            numbers |= {"F_M": lower.F_M.value, "shifted": lower.shifted.value}
-        if fields.control_density is not None and problem.gives_divergences:
-            mu = occupation_density(occupation, problem, fields, constants)
-            w = admissible_density(occupation, problem, fields, constants)
-            J, G, *_ = upper_side(problem, w, mu, self.sets, constants.C_V)
-            numbers |= {"J": J.value} | ({"G": G.value} if G is not None else {})
+        """The values of the listed bounds on `OPT` that ``fields`` give, `F_M`, `shifted`, `J` and `G` among them, and with
+        ``perf`` of the controllers' performances, `value` and `density`, all by their keys in `certificate.json`."""
+        trained = Trained(fields, occupation, None)
+        context = Measured(problem=self.problem, constants=self.constants, trained=trained, sets=self.sets)
+        listed = [bound for bound in BOUNDS if bound.side in (LOWER, UPPER) and bound.applies(context)]
+        found = {bound.name: bound.evaluate(context) for bound in listed}
+        numbers = {name: estimate.value for name, estimate in found.items() if estimate is not None}
         if perf:
-            for name, policy in trained_policies(occupation, problem, fields, constants).items():
-                numbers[name] = self.performance(policy, fields.value, initial)
+            initial = None if context.value is None else context.sampled_value.initial
+            for name, policy in context.policies.items():
+                numbers[name] = self.performance(policy, context.value, initial)
         return numbers
 
     def performance(self, policy: Policy, value: Field | None = None, initial: list[float] | None = None) -> float:

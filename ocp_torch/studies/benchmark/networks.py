@@ -49,7 +49,7 @@ class NetworkContender:
         return f"{self.config['model']['name']} {self.config['method']['name']}"
 
     def run(self, seed: int, judge: Judge, certificate: CertificateSettings | None) -> Curve:
-        """Train with the default budget; ``certificate``'s counts are taken, its stage is the configuration's."""
+        """Train with the default budget; the certificate at the end, if there is one, is the configuration's."""
         trainer = build_trainer({**self.config, "seed": seed})
         recorder = Recorder()
         trainer.fit(recorder)

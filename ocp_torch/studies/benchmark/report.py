@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ocp_torch.certificate import LOWER, UPPER, bounds
 from ocp_torch.runs.canvas import blank_figure
 from ocp_torch.studies.benchmark.curve import Curve, Point, median_and_spread
 
@@ -26,8 +27,14 @@ def reference(curves: list[Curve], exact: float | None) -> tuple[float, str]:
     """What sub-optimality is relative to: `OPT`, or where it is unknown the best lower bound any run certified."""
     if exact is not None:
         return exact, "OPT"
-    constants = [p.numbers[n] for c in curves for p in c.points for n in ("F_M", "shifted") if n in p.numbers]
-    return max(constants, default=math.nan), "the best lower bound found"
+    found = [p.numbers[n] for c in curves for p in c.points for n in bounds.on(LOWER) if n in p.numbers]
+    return max(found, default=math.nan), "the best lower bound found"
+
+
+def columns(curves: list[Curve]) -> list[str]:
+    """The names of the listed bounds on `OPT` that any of ``curves`` ends with."""
+    ends = [c.points[-1].numbers for c in curves]
+    return [n for side in (LOWER, UPPER) for n in bounds.on(side) if any(n in numbers for numbers in ends)]
 
 
 def by_contender(curves: list[Curve]) -> dict[str, list[Curve]]:
@@ -39,15 +46,17 @@ def contest_table(curves: list[Curve], exact: float | None) -> str:
     """A Markdown table: at each contender's end, median over seeds and, where there are several, smallest to largest."""
     optimum, what = reference(curves, exact)
     off = lambda number: 100.0 * (number / optimum - 1.0)
+    names = columns(curves)
+    heads = ["contender", "samples", "seconds", *names, "Perf", "gap, certified", "times smaller"]
+    heads += ["1 % on Perf after samples", "seconds"]
     lines = [
         f"Per cent are relative to {what} = {optimum:.8g}; the gap is that of the full certificate at the end, relative "
         f"to the lower bound, and `times smaller` holds its median against that of {BASELINE}; where a certificate uses no "
-        "upper bound (a controller that jumps), (min(J, G) - F_M) / F_M stands in for it, marked *; seconds are CPU "
+        "upper bound (a controller that jumps), the gap between the columns stands in for it, marked *; seconds are CPU "
         "seconds of training, those of the certificate after the sign +.",
         "",
-        "| contender | samples | seconds | F_M | J | G | Perf | gap, certified | times smaller "
-        "| 1 % on Perf after samples | seconds |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        f"| {' | '.join(heads)} |",
+        "|---" * len(heads) + "|",
     ]
     widest = gaps(by_contender(curves).get(BASELINE, []))
     for name, own in by_contender(curves).items():
@@ -64,9 +73,7 @@ def contest_table(curves: list[Curve], exact: float | None) -> str:
             name,
             spread([float(p.samples) for p in ends], ",.0f", ""),
             seconds + (f" + {median_and_spread(later)[0]:.3g}" if later else ""),
-            number("F_M"),
-            number("J"),
-            number("G"),
+            *map(number, names),
             spread([off(p.perf) for p in ends if math.isfinite(p.perf)], "+.3g", " %"),
             spread(certified, ".3g", " %") + ("*" if certified and any(c.certified is None for c in own) else ""),
             f"{ratio:.3g}" if math.isfinite(ratio) else "-",
@@ -113,7 +120,7 @@ def plot(curves: list[Curve], exact: float | None) -> Figure:
     optimum, what = reference(curves, exact)
     rows = {
         f"Perf above {what}, %": lambda p: 100.0 * (p.perf / optimum - 1.0),
-        "(min(J, G) - F_M) / F_M, %": lambda p: 100.0 * p.gap,
+        "gap between the best bounds, %": lambda p: 100.0 * p.gap,
     }
     columns = {"samples": lambda p: float(p.samples), "CPU seconds of training": lambda p: p.seconds}
     figure = blank_figure(11.0, 8.0)

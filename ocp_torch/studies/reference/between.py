@@ -15,15 +15,20 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import start_distribution
 from ocp_torch.studies.reference.grid import Grid
 
-# States looked at for each node, and at least and at most; in pieces that a stencil of 64 nodes fits.
-PER_NODE, FEWEST, MOST, PIECE = 4, 2**16, 2**18, 2**13
+# States evaluated for each node, and at least and at most.
+PER_NODE, FEWEST, MOST = 4, 2**16, 2**18
+# States worked on at once: the stencils of 64 nodes of a piece fit the memory.
+PIECE = 2**13
+# And more of them where `mu0` or `f` is narrow.
 NEAR_STARTS = 2**10
+# Ascents from the states that stand out most, and steps of each.
 ASCENTS, STEPS = 32, 60
-# So much of a function's oscillation, unseen by the nodes around, makes the error unknown; so much missing mass of mu0 too.
+# A feature that no node shows, of this part of a function's oscillation, makes the error unknown; so does as much mass of mu0
+# that the nodes miss.
 UNSEEN = 0.02
 # Oscillations below that part of the largest value are rounding.
 FLAT = 1e-9
-# What the nodes around differ by shows a kink; its tip is within that part of it.
+# Beside a kink the nodes around differ, and its tip rises above them by less than this part of that: such tips do not count.
 KINK = 0.5
 
 

@@ -12,12 +12,16 @@ from ocp_torch.studies.reference.semi_lagrangian import PIECE, running_cost
 
 MOST_DIMENSIONS = 3
 FEWEST_NODES = 8
-# Ratio of the sides of successive grids, and the finest side by dimension.
+# Ratio of the sides of successive grids, and the finest side, by dimension: in three dimensions a grid half as fine as one
+# that is affordable shows little.
 RATIO = {1: 2.0, 2: 2.0, 3: 1.5}
 FINEST = {1: 1024, 2: 192, 3: 40}
 # Index, weights and their copies, per entry of the interpolation matrix.
 BYTES_PER_ENTRY = 40
+# A function that changes by more, relative to its size, over one period has not period 1.
 TOLERANCE = 1e-6
+# Single states and controls at which functions and the control cost are tried.
+PROBED, CONTROLS = 256, 64
 
 
 def grid_sides(dim: int, side: int | None, memory: float) -> tuple[int, int, int]:
@@ -52,7 +56,7 @@ def require_solvable(problem: Problem, grid: Grid) -> None:
     period 1, and its control costs `|u|^q / q`."""
     d, m = problem.dim, problem.control_dim
     shapes = {"state_cost": (), "drift": (d,), "control_matrix": (d, m), "initial_density": ()}
-    probe = torch.rand(256, d, generator=fixed_generator(), dtype=torch.float64)
+    probe = torch.rand(PROBED, d, generator=fixed_generator(), dtype=torch.float64)
     nodes = grid.nodes()
     for name, shape in shapes.items():
         function = getattr(problem, name)
@@ -75,7 +79,7 @@ def require_solvable(problem: Problem, grid: Grid) -> None:
             moved[:, k] += 1.0
             if float((function(moved) - first).abs().max()) > TOLERANCE * max(size, 1e-12):
                 raise InputError(f"{name} does not have period 1 in x_{k + 1}, but all of a problem on the torus must.")
-    u = 3.0 * torch.randn(64, m, generator=fixed_generator(1), dtype=torch.float64)
+    u = 3.0 * torch.randn(CONTROLS, m, generator=fixed_generator(1), dtype=torch.float64)
     if problem.control_limit is not None:
         u = problem.control_limit * u / (1.0 + u.norm(dim=-1, keepdim=True))
     own, power = problem.control_cost.cost(u), running_cost(u, problem.exponent)

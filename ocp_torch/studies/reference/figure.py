@@ -16,6 +16,7 @@ from ocp_torch.studies.reference.reference import Reference
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# States along a curve, along each side of a map, and arrows along each side of it.
 LINE_POINTS, MAP_POINTS, ARROWS = 400, 96, 16
 
 

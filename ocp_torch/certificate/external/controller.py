@@ -1,0 +1,135 @@
+r"""The context of one given controller, wherever it comes from: what it costs, and how far from optimal it is.
+
+`V^u` and `mu^u` are fitted to its closed loop by least squares (P(u) and D(u), section 5.4 of the paper); the fitted `V`
+is the control variate of the simulation and, with the suprema of its Bellman slack, bounds `V^u` on both sides. A second
+`V`, trained for the optimum, gives the lower bound on `OPT` and a controller to compare with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import nn
+
+from ocp_torch.certificate.checks.hidden import Hidden
+from ocp_torch.certificate.checks.observed import Observed, observe
+from ocp_torch.certificate.context import Context
+from ocp_torch.certificate.estimate import Estimate, integral
+from ocp_torch.certificate.external.black_box import BlackBox
+from ocp_torch.certificate.simulated.candidates import few_trajectories
+from ocp_torch.certificate.simulated.performance import Simulated, simulate_performance
+from ocp_torch.certificate.trained import in_float64
+from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
+from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
+from ocp_torch.control.policies import Policy, ValuePolicy, zero_policy
+from ocp_torch.fields.fields import Fields
+from ocp_torch.maths.jets import Field
+
+# The name under which its performance stands in a certificate.
+GIVEN = "given"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ControllerContext(Context):
+    """``policy`` is the controller; ``value`` (float64), any `V`, says how far from optimal it is at most; ``network`` makes
+    the networks for `V^u` and `mu^u`. Raises `InputError` where the policy fails."""
+
+    policy: Policy
+    value: Field | None
+    network: Callable[..., nn.Module]
+
+    external = True
+    kind = subject = GIVEN
+    divergent = "J and the Lagrangian bound"
+
+    @property
+    def coarse(self) -> bool:
+        return isinstance(self.policy, BlackBox) and self.policy.precision is torch.float32
+
+    @cached_property
+    def _fit(self) -> Fields | None:
+        """`V^u` and `log mu^u`, in float64."""
+        if not self.settings.stage.steps:
+            return None
+        self.progress("closed-loop fit")
+        if not self.problem.gives_divergences:
+            return None
+        how = self.constants, self.settings.stage, self.seed
+        return in_float64(fit_closed_loop(self.problem, self.policy, None, self.network, *how))
+
+    @cached_property
+    def _initial(self) -> list[float] | None:
+        """`E[V^u mu0]`, per set."""
+        if self._fit is None:
+            return None
+        with torch.no_grad():
+            return [integral(s, self._fit.value(s.x) * s.mu0) for s in self.wide]
+
+    @cached_property
+    def fitted(self) -> ClosedLoopBounds | None:
+        if self._fit is None:
+            return None
+        return self.bounds_of(self.policy, self._fit.value, self._fit.log_occupation, self._initial)
+
+    @property
+    def hidden(self) -> Hidden | None:
+        return self.fitted.hidden if self.fitted is not None else None
+
+    @property
+    def proved_C_V(self) -> float | None:
+        return self.fitted.C_V if self.fitted is not None else None
+
+    @cached_property
+    def _simulated(self) -> tuple[dict[str, Simulated], Estimate | None]:
+        number = self.settings.trajectories
+        if not number:
+            return {}, None
+        own = None if self._fit is None else self._fit.value
+        found = {GIVEN: (self.policy, own, self._initial)}
+        if self.value is not None:
+            found["value"] = (ValuePolicy(self.problem, self.value), self.value, self.sampled_value.initial)
+        self.progress("simulation")
+        zero = self._simulate(zero_policy(self.problem), few_trajectories(self.settings))
+        return {name: self._simulate(policy, number, *rest) for name, (policy, *rest) in found.items()}, zero.perf
+
+    def _simulate(
+        self, policy: Policy, number: int, value: Field | None = None, initial: list[float] | None = None
+    ) -> Simulated:
+        settings, horizon = self.settings, (self.settings.horizon, self.settings.tolerance)
+        return simulate_performance(
+            self.problem, policy, number, settings.replicates, self.seed, value, initial, *horizon
+        )
+
+    @property
+    def perf(self) -> dict[str, Estimate | None]:
+        return {name: simulated.perf for name, simulated in self._simulated[0].items()}
+
+    @property
+    def zero(self) -> Estimate | None:
+        return self._simulated[1]
+
+    @cached_property
+    def observed(self) -> Observed:
+        found, _ = self._simulated
+        self.progress("assumptions")
+        met = observe(self.problem, self.policy, found.get(GIVEN), self.few, self.posed, 0)
+        if "value" not in found:
+            return met
+        # M is about the optimal controller, which the one from V is nearer to than anybody's.
+        best, states = ValuePolicy(self.problem, self.value), self.settings.occupation_states
+        near = observe(self.problem, best, found["value"], self.few, self.posed, states)
+        return replace(met, sup_occupation=near.sup_occupation, a_priori_occupation=near.a_priori_occupation)
+
+    @property
+    def notes(self) -> list[str]:
+        return []
+
+    @property
+    def remarks(self) -> list[str]:
+        notes = [] if self.value is not None else ["no lower bound: there is no V to give one."]
+        if self.settings.stage.steps and self.fitted is None:
+            notes.append("no bound on Perf without simulation: this problem gives no divergences of a and B.")
+        return notes

@@ -1,0 +1,155 @@
+r"""The context of recorded samples: expectations on samples held out, nothing simulated, no state evaluated anew.
+
+`F_M(V)` and `J(w, mu)` are expectations over the torus of pointwise functions of the data, so weighted means over independent
+samples estimate them without bias, with errors from their scatter. What a supremum is needed for cannot be had this way: the
+shifted and the Lagrangian bound are left out, and `M` and `C_V` are estimates, and said to be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+
+from ocp_torch.certificate.checks.assumptions import Assumptions
+from ocp_torch.certificate.checks.hidden import Hidden
+from ocp_torch.certificate.checks.observed import Observed
+from ocp_torch.certificate.checks.regularity import largest_jump
+from ocp_torch.certificate.checks.wellposed import WellPosed
+from ocp_torch.certificate.context import Context
+from ocp_torch.certificate.trained import Trained
+from ocp_torch.certificate.upper.recorded import RecordedFit, fit_recorded
+from ocp_torch.control.policies import NETWORK, Policy, trained_policies
+from ocp_torch.fields.fields import Fields
+from ocp_torch.maths.jets import Field
+from ocp_torch.problems.needs import SEARCHED
+from ocp_torch.problems.recorded.dataset import Dataset
+from ocp_torch.problems.samples import Samples
+
+# Held-out samples are put into so many groups: the scatter of their means gives the standard error, with nearly as many
+# degrees of freedom as there are groups.
+GROUPS, FEWEST = 64, 8
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RecordedContext(Context):
+    """Fields trained on the recorded samples of ``problem``, held against those that were held out."""
+
+    problem: Dataset
+    trained: Trained
+
+    recorded = True
+    exact = sampled_value = fitted = zero = None
+
+    @property
+    def perf(self) -> dict[str, None]:
+        return {"value": None, "density": None}
+
+    @cached_property
+    def fields(self) -> Fields:
+        return self.trained.in_float64()
+
+    @property
+    def value(self) -> Field | None:
+        return self.fields.value
+
+    @cached_property
+    def sets(self) -> list[Samples]:
+        """The held-out samples in groups."""
+        return groups(self.problem.held_out)
+
+    @property
+    def kind(self) -> str | None:
+        """From `V` where `B` is known everywhere, else `w / mu` of two networks, else there is no controller."""
+        trained = self.trained
+        if trained.fields.value is not None and self.problem.knows_control_matrix:
+            return "value"
+        return "density" if trained.fields.control_density is not None and trained.occupation == NETWORK else None
+
+    @property
+    def subject(self) -> str | None:
+        return self.kind
+
+    def policy_of(self, fields: Fields) -> Policy | None:
+        """The controller handed out, in the precision of ``fields``."""
+        if self.kind is None:
+            return None
+        return trained_policies(self.trained.occupation, self.problem, fields, self.constants)[self.kind]
+
+    @cached_property
+    def policy(self) -> Policy | None:
+        return self.policy_of(self.fields)
+
+    @cached_property
+    def _fit(self) -> tuple[RecordedFit | None, list[str]]:
+        """`J` of the controller, or a warning that says why there is none."""
+        if self.kind is None:
+            why = "B varies over the samples, so that from V is known at them only; use method=pd"
+            return None, [f"no controller: {why}."]
+        if not self.problem.gives_divergences:
+            return None, ["no upper bound: the recording holds no div_a (and, where B varies, no div_B)."]
+        if not self.settings.stage.steps:
+            return None, []
+        try:
+            return fit_recorded(self), []
+        except ArithmeticError as error:
+            return None, [f"the certification stage failed: {error}"]
+
+    @property
+    def fit(self) -> RecordedFit | None:
+        return self._fit[0]
+
+    @property
+    def hidden(self) -> Hidden | None:
+        return self.fit.hidden if self.fit else None
+
+    @property
+    def uses(self) -> tuple[bool, bool]:
+        return self.value is not None, self.fit is not None and self.hidden is None
+
+    @cached_property
+    def posed(self) -> WellPosed:
+        """What reading the file has checked already; the seam between two samples nobody can see."""
+        samples, recording = self.problem.held_out, self.problem.recording
+        mass = float(recording.samples.mean(recording.samples.mu0))
+        return WellPosed(True, True, True, float(samples.f.min()), mass, [])
+
+    @cached_property
+    def observed(self) -> Observed:
+        occupation = self.fit.sup_occupation if self.fit else None
+        if self.policy is None:
+            return Observed(sup_occupation=occupation, problem=self.posed)
+        with torch.no_grad():
+            control = max(float(self.policy(s.x).norm(dim=-1).max()) for s in self.sets)
+        jump = largest_jump(self.policy, self.problem.dim)
+        return Observed(sup_occupation=occupation, sup_control=control, jump=jump, problem=self.posed)
+
+    @cached_property
+    def assumptions(self) -> Assumptions:
+        _, has_J = self.uses
+        basis = self.checked.basis | {"C_V": SEARCHED}
+        return replace(self.checked, C_V=self.fit.C_V if has_J else None, basis=basis)
+
+    @property
+    def notes(self) -> list[str]:
+        weighted = bool((self.problem.held_out.weight != 1.0).any())
+        return [
+            f"from {sum(map(len, self.sets)):,} held-out samples, taken for independent draws from "
+            f"{'the density given with them' if weighted else 'the uniform law'}; nothing was simulated.",
+            *self.problem.recording.notes,
+            *self._fit[1],
+        ]
+
+    @property
+    def remarks(self) -> list[str]:
+        if not self.settings.rigorous:
+            return []
+        return ["no rigorous lower bound: samples say nothing about the states between them."]
+
+
+def groups(samples: Samples) -> list[Samples]:
+    """Disjoint groups of equal size, in the random order of the split; the few left over are not used."""
+    count = max(2, min(GROUPS, len(samples) // FEWEST))
+    size = len(samples) // count
+    return [samples.take(slice(k * size, (k + 1) * size)) for k in range(count)]

@@ -1,0 +1,41 @@
+r"""`F_M(V) = E[V mu0 - M max(Q, 0)] <= OPT` for every `M >= sup mu*` (section 4.1 of the paper)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from ocp_torch.certificate.bound import LOWER, Bound
+from ocp_torch.certificate.checks.assumptions import Assumptions
+from ocp_torch.certificate.checks.tails import rarity
+from ocp_torch.certificate.context import Context
+from ocp_torch.certificate.estimate import Estimate, integral
+from ocp_torch.certificate.lower.sampled import SampledValue
+from ocp_torch.problems.needs import Need
+
+
+class PenalisedDual(Bound):
+    """`F_M` of a `V` that is known everywhere."""
+
+    name, side, label = "F_M", LOWER, "F_M"
+
+    def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
+        return (assumptions.M_is_large,)
+
+    def applies(self, context: Context) -> bool:
+        return not context.recorded
+
+    def evaluate(self, context: Context) -> Estimate | None:
+        V = context.sampled_value
+        return None if V is None else penalised(V, context.constants.M)
+
+
+def penalised(V: SampledValue, M: float) -> Estimate:
+    """`F_M`, its interval widened where a few states carry `E[max(Q, 0)]`."""
+    violation = [part.slack(1.0).clamp_min(0.0) for part in V.parts]
+    pairs = zip(V.initial, V.sets, violation, strict=True)
+    found = Estimate.of([e - M * integral(samples, v) for e, samples, v in pairs])
+    spread = torch.cat([samples.weight * v for samples, v in zip(V.sets, violation, strict=True)])
+    rare = rarity(spread, sum(V.initial) / len(V.initial) / M)
+    return replace(found, bias=M * rare) if rare > 0.0 else found

@@ -1,0 +1,68 @@
+r"""`J` and `G` of a flux `w` and a density `mu`, at the same states: what the bounds of trained densities share."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+from ocp_torch.certificate.checks.hidden import Flux, Hidden, hidden_divergence
+from ocp_torch.certificate.checks.tails import widened
+from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.control.policies import Density
+from ocp_torch.maths.jets import CHUNK, Field
+from ocp_torch.problems.generator import Generator
+from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.samples import Samples
+
+
+class DensityBounds(NamedTuple):
+    """`J`, `G` where there is no drift, and a divergence that neither sees, if one was found: they stand without."""
+
+    J: Estimate
+    G: Estimate | None
+    hidden: Hidden | None
+    contributions: list[list[torch.Tensor]] = []  # of `J` and `G`, as parts of each
+
+
+def density_bounds(
+    problem: Problem, control_density: Field, occupation: Density, sets: list[Samples], C_V: float
+) -> DensityBounds:
+    r"""`J(w, mu) = E[(f + R(w/mu)) mu + C_V max(mu0 - mu - div(a mu + B w)/rho, 0)]` and, without drift, `G = min_mu J`.
+
+    `OPT <= J` for every `w` and `mu >= 0` once `C_V >= sup V*`; `Perf(w/mu) <= J` once `C_V >= sup V^u` (Proposition 6).
+    """
+    fluxes, of = [], {"J": [], "G": []}
+    for samples in sets:
+        parts = [_upper_integrands(problem, control_density, occupation, s, C_V) for s in samples.split(CHUNK)]
+        of["J"].append(samples.weight * torch.cat([j for j, *_ in parts]))
+        if problem.driftless:
+            of["G"].append(samples.weight * torch.cat([g for _, g, *_ in parts]))
+        moved = (torch.cat(columns) / problem.discount for columns in list(zip(*parts, strict=True))[2:])
+        fluxes.append(Flux(samples.x, samples.weight, *moved))
+    means = {
+        name: widened(Estimate.of([float(v.mean()) for v in values]), values) for name, values in of.items() if values
+    }
+    parts_of = [[v / (abs(means[name].value) or 1.0) for v in of[name]] for name in means]
+    return DensityBounds(means["J"], means.get("G"), hidden_divergence(fluxes), parts_of)
+
+
+@torch.no_grad()
+def _upper_integrands(problem, control_density, occupation, samples: Samples, C_V: float):
+    """The integrands of `J` and, without drift, `G`; `div(a mu + B w)` and `a mu + B w`."""
+    cost, rho = problem.control_cost, problem.discount
+    generator = Generator.of(problem, samples)
+    w, inflow = generator.control_inflow(control_density)
+    spread, pushed = rho * (samples.mu0 - inflow), torch.einsum("ndm,nm->nd", samples.B, w)
+    if problem.driftless:
+        mu = occupation(samples.x)
+        # An infinite mu stands still at no cost where f = 0: the closed minimum has that limit, J needs the number.
+        J = torch.where(
+            torch.isfinite(mu),
+            generator.primal_integrand(w, torch.where(torch.isfinite(mu), mu, 1.0), inflow - mu, C_V),
+            cost.primal_minimum(w, samples.f, C_V, inflow),
+        )
+        return J, cost.primal_minimum(w, samples.f, C_V, inflow), spread, pushed
+    mu, drifted = generator.drift_flux_divergence(occupation)
+    J = generator.primal_integrand(w, mu, inflow - mu - drifted / rho, C_V)
+    return J, None, spread + drifted, pushed + mu.unsqueeze(-1) * samples.a

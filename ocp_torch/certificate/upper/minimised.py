@@ -1,0 +1,36 @@
+r"""`G(w) = min_mu J(w, mu)`, pointwise and in closed form where there is no drift (Lemma 2 of the paper)."""
+
+from __future__ import annotations
+
+from ocp_torch.certificate.bound import UPPER, Bound
+from ocp_torch.certificate.checks.assumptions import Assumptions
+from ocp_torch.certificate.context import Context
+from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.control.policies import CLOSED
+from ocp_torch.problems.needs import Need
+
+
+class MinimisedPrimal(Bound):
+    """`G` of a trained `w`."""
+
+    name, side, label = "G", UPPER, "G"
+
+    def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
+        return assumptions.C_V_is_large, assumptions.cost_is_positive
+
+    def evaluate(self, context: Context) -> Estimate | None:
+        return context.densities.G if context.densities else None
+
+    def valid(self, context: Context) -> bool:
+        """It takes the divergence of `B w`: `w` is smooth, so that jumps of the problem alone make it wrong."""
+        jumps = context.observed.jump.in_problem or not context.posed.smooth_seam
+        return context.hidden is None and not jumps
+
+    def speaks(self, context: Context) -> bool:
+        """`G` bounds the performance of `w` over the `mu` of Lemma 2; of nothing else."""
+        return context.kind == "density" and context.occupation == CLOSED and context.checked.value_holds
+
+    def notes(self, context: Context, shown: Estimate | None) -> list[str]:
+        if shown is None or self.speaks(context):
+            return []
+        return ["G bounds OPT, but not the controller that is handed out: the gap does not use it."]

@@ -1,0 +1,28 @@
+"""An object that can be made again: what a checkpoint or a saved controller keeps of a problem."""
+
+from __future__ import annotations
+
+import inspect
+
+
+class Reproducible:
+    """Remembers what it was made of, so that ``type(x)(**x.parameters)`` makes it again."""
+
+    def __new__(cls, *args, **kwargs) -> Reproducible:
+        made = super().__new__(cls)
+        made._given = args, kwargs
+        return made
+
+    @property
+    def parameters(self) -> dict:
+        """The arguments that make this object again: each `__init__` argument is read from the attribute of its name, or,
+        where there is none, is what was given."""
+        args, kwargs = self._given
+        signature = inspect.signature(type(self).__init__)
+        bound = signature.bind(self, *args, **kwargs)
+        bound.apply_defaults()
+        found = dict(list(bound.arguments.items())[1:])
+        for name, parameter in signature.parameters.items():
+            if parameter.kind is parameter.VAR_KEYWORD:
+                found |= found.pop(name)
+        return {name: getattr(self, name, value) for name, value in found.items()}
