@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -65,8 +66,8 @@ def with_own_defaults(config_name: str, overrides: list[str]) -> list[str]:
 
 @cache
 def _has_problem_group(config_name: str) -> bool:
-    defaults = OmegaConf.to_container(OmegaConf.load(CONFIGS / f"{config_name}.yaml")).get("defaults", [])
-    return any(isinstance(choice, dict) and choice.get("problem") for choice in defaults)
+    file: Any = OmegaConf.to_container(OmegaConf.load(CONFIGS / f"{config_name}.yaml"))
+    return any(isinstance(choice, dict) and choice.get("problem") for choice in file.get("defaults", []))
 
 
 def composed(config_name: str, overrides: list[str], roots: tuple[Path, ...] = ()) -> dict:
@@ -102,8 +103,9 @@ def plain(config: DictConfig, config_name: str, overrides: list[str], whole: boo
 
 def resolved(config: DictConfig, whole: bool = True) -> dict:
     """``config`` as plain data without Hydra's own part; OmegaConf raises where it cannot be resolved or is not ``whole``."""
-    own = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
-    return OmegaConf.to_container(own, resolve=True, throw_on_missing=whole)
+    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    data: Any = OmegaConf.to_container(own, resolve=True, throw_on_missing=whole)
+    return data
 
 
 def _told(error: Exception, config_name: str, overrides: list[str]) -> InputError:

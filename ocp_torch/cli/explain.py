@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException, MissingConfigException, OverrideParseException
@@ -34,10 +35,8 @@ def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -
     if isinstance(error, ConfigCompositionException) and override:
         field = override.group(1)
         if is_choice(field):
-            known = ", ".join(choices(field))
-            return (
-                f"{field} is a group, not a field: {field}=... takes one of {known}, and {field}.<field>=... a value."
-            )
+            takes = f"{field}=... takes one of {', '.join(choices(field))}, and {field}.<field>=... a value"
+            return f"{field} is a group, not a field: {takes}."
         hint = field_hint(field, config_name, overrides)
         return f"{field} is not a field of the configuration{hint}; write +{field}=... to add an argument of your own."
     missing = re.search(r"Missing mandatory value: ([\w.]+)", text)
@@ -77,7 +76,7 @@ def field_hint(field: str, config_name: str, overrides: Iterable[str]) -> str:
 def known_fields(config_name: str, chosen: tuple[str, ...] = ()) -> list[str]:
     """Dotted names of all fields and groups of the configuration with these groups ``chosen``, or of the default one."""
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        config = OmegaConf.to_container(compose(config_name, list(chosen)), resolve=False)
+        config: Any = OmegaConf.to_container(compose(config_name, list(chosen)), resolve=False)
 
     def names(node: dict, prefix: str = "") -> list[str]:
         own = [f"{prefix}{k}" for k in node]

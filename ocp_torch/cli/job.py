@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ from ocp_torch.training.signals import Preempted
 log = logging.getLogger(__name__)
 
 
-def job(check: Callable[[dict], object], work: Callable[[object, Path], object], config: DictConfig) -> None:
+def job(check: Callable[[dict], object], work: Callable[..., object], config: DictConfig) -> None:
     """A job that Hydra has started: ``work(check(data), folder)``."""
     logging.setLogRecordFactory(Record)  # the process may be one that a launcher started
     hydra = HydraConfig.get()
@@ -47,7 +48,7 @@ def job(check: Callable[[dict], object], work: Callable[[object, Path], object],
 class Job:
     """What Hydra says of a job, and the folder it works in."""
 
-    hydra: DictConfig
+    hydra: Any  # Hydra's own part of the configuration
     folder: Path
 
     @property

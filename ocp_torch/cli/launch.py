@@ -31,7 +31,7 @@ def launch(
     entry: Callable,
     config_name: str,
     check: Callable[[dict], object],
-    work: Callable[[object, Path], object],
+    work: Callable[..., object],
 ) -> None:
     """Run the command line: ``work(check(data), folder)``, where ``data`` is the composed configuration ``config_name``.
 

@@ -52,11 +52,11 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
             require_unlinked(folder)
         made = check(data)
     except OSError as error:  # a name that no file can have, a device that gives nothing
-        told = blamed(error)
+        blame = blamed(error)
         named = f"{shown(str(error.filename))} cannot be used" if error.filename else "a file cannot be used"
-        raise told or InputError(f"{named}: {error.strerror or error}.") from None
+        raise blame or InputError(f"{named}: {error.strerror or error}.") from None
     except (Exception, SystemExit) as error:
-        told = blamed(error)
+        told: InputError | None = blamed(error)
         if told is None and isinstance(error, SystemExit):  # somebody's module would end the run without a word
             told = InputError(f"the code that the command line names asks Python to exit (status {error.code}).")
         raise told or error from None
@@ -76,7 +76,7 @@ def require_places_to_write(arguments: list[str], name: str) -> None:
         require_writable(name, Path(re.split(r"[^/]*\$\{", str(value))[0]))
 
 
-def carry_out(command: Checked, work: Callable[[object, Path], object]) -> None:
+def carry_out(command: Checked, work: Callable[..., object]) -> None:
     """`Hydra.run` for what is composed already: make the folder, begin its log, and do the ``work`` on what was built."""
     config = command.config
 

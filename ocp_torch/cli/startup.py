@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 from torch.optim import Optimizer
 
@@ -23,7 +24,8 @@ def spare_imports() -> None:
         if method is not None and not hasattr(method, "__dynamo_disable"):
             method.__dynamo_disable = method  # what `torch._disable_dynamo` looks for before it imports the compiler
     hidden = [name for name in DISTRIBUTED if name not in sys.modules]
-    sys.modules.update(dict.fromkeys(hidden))  # an import of what is None there fails
+    modules: dict[str, Any] = sys.modules
+    modules.update(dict.fromkeys(hidden))  # an import of what is None there fails
     try:
         import pytorch_optimizer  # noqa: F401
     finally:

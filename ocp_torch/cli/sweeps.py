@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.types import Override
@@ -74,13 +75,13 @@ def representatives(overrides: list[Override]) -> list[str]:
         if not override.is_sweep_override() or name.startswith(("hydra", "problem.", "resume")) or is_choice(name):
             continue
         for one in BasicSweeper.split_arguments([override], None)[0]:
-            value = parsed(one)[0].value()
+            value: Any = parsed(one)[0].value()
             number = isinstance(value, int | float) and not isinstance(value, bool)
             found.setdefault((name, type(value), value > 0 if number else str(value)), one[0])
     return list(found.values())
 
 
-def require_kinds(data: object, default: object, name: str = "") -> None:
+def require_kinds(data: Any, default: Any, name: str = "") -> None:
     """Raise `InputError` where a number, a flag or a group of fields of ``default`` is something else in ``data``."""
     if isinstance(default, dict):
         for key in default.keys() & require_section(name, data).keys():

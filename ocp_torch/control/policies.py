@@ -36,7 +36,7 @@ class ValuePolicy:
         return self.problem.control_cost.argmax(-pull_back(B, V.gradient) / self.problem.discount)
 
 
-def admissible_density(kind: str, problem: Problem, fields: Fields, constants: Constants) -> Field:
+def admissible_density(kind: str | None, problem: Problem, fields: Fields, constants: Constants) -> Field:
     """`w` of trained fields, within what a limit on the control allows: `mu` of Lemma 2 leaves room for any `w` already."""
     w = fields.control_density
     return (
@@ -63,7 +63,7 @@ def zero_policy(problem: Problem) -> Policy:
     return lambda x: x.new_zeros(len(x), problem.control_dim)
 
 
-def occupation_density(kind: str, problem: Problem, fields: Fields, constants: Constants) -> Density:
+def occupation_density(kind: str | None, problem: Problem, fields: Fields, constants: Constants) -> Density:
     """`mu(x)` of trained fields: ``closed`` (Lemma 2, no drift), ``saddle`` (Lemma 3) or ``network`` (`exp log mu`)."""
     cost, rho = problem.control_cost, problem.discount
 
@@ -77,12 +77,13 @@ def occupation_density(kind: str, problem: Problem, fields: Fields, constants: C
         beta = problem.state_cost(x) - V.value + (V.gradient * problem.drift(x)).sum(dim=-1) / rho
         return cost.saddle_occupation(fields.control_density(x), beta, constants.M)
 
-    return {CLOSED: closed, SADDLE: saddle, NETWORK: lambda x: fields.log_occupation(x).exp()}[kind]
+    network = lambda x: fields.log_occupation(x).exp()
+    return {CLOSED: closed, SADDLE: saddle, NETWORK: network}[kind or NETWORK]
 
 
 def trained_policies(kind: str | None, problem: Problem, fields: Fields, constants: Constants) -> dict[str, Policy]:
     """The controllers trained fields give: ``value`` if they hold `V`, ``density`` if they hold `w`."""
-    policies = {}
+    policies: dict[str, Policy] = {}
     if fields.value is not None:
         policies["value"] = ValuePolicy(problem, fields.value)
     # Lemmas 2 and 3 give mu from the cost at the state itself.

@@ -4,10 +4,12 @@ A class is made from ``dim``, ``outputs`` (`None` for a scalar field), ``shift``
 represents, and from arguments of its own that `model` configures; ``defaults(dim, worst_state)`` gives those that are null.
 """
 
+from typing import Any
+
 from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fields
 from ocp_torch.fields.mlp import PeriodicMLP
 from ocp_torch.fields.sobolev import SobolevField
 
-MODELS = {"mlp": PeriodicMLP, "sobolev": SobolevField}
+MODELS: dict[str, Any] = {"mlp": PeriodicMLP, "sobolev": SobolevField}
 
 __all__ = ["CONTROL_DENSITY", "LOG_OCCUPATION", "MODELS", "VALUE", "Fields", "PeriodicMLP", "SobolevField"]

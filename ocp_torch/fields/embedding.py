@@ -18,6 +18,9 @@ class FourierEmbedding(nn.Module):
     precision.
     """
 
+    wave_numbers: Tensor
+    mixed: Tensor | None
+
     def __init__(self, dim: int, modes: int, waves: int = 0) -> None:
         super().__init__()
         modes = require_integer("model.modes", modes, 1, maximum=1024)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
@@ -33,7 +34,7 @@ class Fields(nn.Module):
         An embedding with room for them gets the problem's `prominent_waves`.
         """
         cost, control = typical_sizes(problem)
-        forms = {
+        forms: dict[str, dict[str, Any]] = {
             VALUE: dict(outputs=None, shift=cost[0], scale=cost[1]),
             CONTROL_DENSITY: dict(outputs=problem.control_dim, shift=0.0, scale=control),
             LOG_OCCUPATION: dict(outputs=None, shift=0.0, scale=1.0),
@@ -41,24 +42,23 @@ class Fields(nn.Module):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             fields = cls({name: network(dim=problem.dim, **forms[name]) for name in names})
-        embeddings = [m for m in fields.modules() if isinstance(m, FourierEmbedding) and m.mixed is not None]
-        if embeddings and not embeddings[0].mixed.is_meta:
-            for embedding in embeddings:
+        for embedding in (m for m in fields.modules() if isinstance(m, FourierEmbedding)):
+            if embedding.mixed is not None and not embedding.mixed.is_meta:
                 embedding.mix(_waves(problem, len(embedding.mixed)))
         return fields
 
     @property
-    def value(self) -> nn.Module | None:
-        """`V`: ``(N, d) -> (N,)``."""
+    def value(self) -> Any:
+        """`V`: ``(N, d) -> (N,)``; like the others `None` where there is none, which whoever asks knows of its method."""
         return self._get(VALUE)
 
     @property
-    def control_density(self) -> nn.Module | None:
+    def control_density(self) -> Any:
         """`w`: ``(N, d) -> (N, m)``."""
         return self._get(CONTROL_DENSITY)
 
     @property
-    def log_occupation(self) -> nn.Module | None:
+    def log_occupation(self) -> Any:
         """`log mu`: ``(N, d) -> (N,)``."""
         return self._get(LOG_OCCUPATION)
 

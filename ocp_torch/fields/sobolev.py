@@ -54,6 +54,8 @@ class SobolevFeatures(nn.Module):
     there would be too many features.
     """
 
+    frequencies: Tensor  # (K, d)
+
     def __init__(self, dim: int, regularity: float = 2.0, kernel: str = "product", modes: int | None = None) -> None:
         super().__init__()
         self.kernel = require_choice("model.kernel", kernel, KERNELS)
@@ -125,6 +127,9 @@ class SobolevField(nn.Module):
     scale; without it they are 0 and 1, as in the paper, whose step sizes mean something only then.
     """
 
+    shift: Tensor
+    scale: Tensor
+
     def __init__(
         self,
         dim: int,
@@ -155,7 +160,7 @@ class SobolevField(nn.Module):
 
     def _make(self, features: SobolevFeatures, outputs: int | None, shift: float, scale: float, scaled: bool) -> None:
         self.features, self.scalar = features, outputs is None
-        shape = (self.features.count,) if self.scalar else (outputs, self.features.count)
+        shape = (self.features.count,) if outputs is None else (outputs, self.features.count)
         self.coefficients = nn.Parameter(torch.zeros(shape))
         self.register_buffer("shift", torch.tensor(float(shift) if scaled else 0.0))
         self.register_buffer("scale", torch.tensor(float(scale) if scaled else 1.0))

@@ -9,8 +9,7 @@ import pickletools
 import re
 import zipfile
 from collections.abc import Iterator
-from io import BufferedReader
-from typing import BinaryIO, cast
+from typing import Any, BinaryIO, cast
 
 import torch
 from torch import Tensor
@@ -29,7 +28,7 @@ SHARED = 4
 class After:
     """What follows the first ``start`` bytes of an open file, as a file of its own: only what is asked for is in memory."""
 
-    def __init__(self, file: BufferedReader, start: int) -> None:
+    def __init__(self, file: BinaryIO, start: int) -> None:
         self.file, self.start = file, start
         self.size = file.seek(0, os.SEEK_END) - start
         self.seek(0)
@@ -44,13 +43,13 @@ class After:
         return self.file.read(count)
 
     def readinto(self, buffer) -> int:
-        return self.file.readinto(buffer)
+        return self.file.readinto(buffer)  # type: ignore[attr-defined] # binary files have it
 
     def seekable(self) -> bool:
         return True
 
 
-def unpacked(content: After) -> object:
+def unpacked(content: After) -> Any:
     """Plain data with tensors, as `torch.save` wrote them. Raises `pickle.UnpicklingError` where there is anything else in
     it, which is not run, `ValueError` where it is crafted, and whatever PyTorch raises where it is damaged."""
     _require_modest(content)

@@ -26,7 +26,7 @@ METADATA_KEY, DIGEST_KEY = "ocp_torch", "sha256"
 LARGEST_HEADER, MOST_TENSORS = 2**24, 2**14
 
 
-def write_atomically(path: Path, write: Callable[[Path], None], make_room: Callable[[], None] | None = None) -> None:
+def write_atomically(path: Path, write: Callable[[Path], object], make_room: Callable[[], None] | None = None) -> None:
     """Let ``write`` fill a temporary file beside ``path``, then put it in place in one step: old or new, never half.
 
     ``make_room`` is called in between, once the new file is whole and on the disk. File and folder are on the disk when it

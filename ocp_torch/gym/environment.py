@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -156,4 +157,5 @@ def clocks(x: torch.Tensor) -> np.ndarray:
         axis.plot([0.0, math.cos(angle)], [0.0, math.sin(angle)], "C0", linewidth=3.0)
         axis.set(aspect="equal", title=f"$x_{{{i + 1}}}$", xlim=(-1.1, 1.1), ylim=(-1.1, 1.1))
     figure.canvas.draw()
-    return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
+    canvas: Any = figure.canvas  # that of Agg, which has its pixels
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -81,7 +81,7 @@ def value_and_jacobian(field: Field, x: Tensor) -> tuple[Tensor, Tensor]:
         value = field(at)
         if not value.requires_grad:
             return value, x.new_zeros(value.shape[1], *x.shape)
-        options = {"create_graph": again, "retain_graph": True, "materialize_grads": True}
+        options: dict[str, Any] = {"create_graph": again, "retain_graph": True, "materialize_grads": True}
         if value.shape[1] == 1:
             jacobian = torch.autograd.grad(value.sum(), at, **options)[0].unsqueeze(0)
         else:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 PACKAGE = "ocp_torch.problems"
 # Class in an earlier version -> class now.
 RENAMED = {"Callable": "Simulator"}
 
 
-def current_target(target: object) -> object:
+def current_target(target: Any) -> Any:
     """The class that ``target``, of a configuration of any version, names now: classes of the package have had other names
     and lain in other modules of it. Anything else comes back as it is."""
     from ocp_torch import problems  # which imports this room's other modules
@@ -18,7 +20,7 @@ def current_target(target: object) -> object:
     return f"{PACKAGE}.{now}" if ours and now in problems.__all__ else target
 
 
-def current_section(section: object) -> object:
+def current_section(section: Any) -> Any:
     """``section``, the problem of a configuration, with its `current_target`; as it is where it names none."""
     if not isinstance(section, dict) or "_target_" not in section:
         return section

@@ -27,7 +27,7 @@ from ocp_torch.files.memory import require_memory
 from ocp_torch.maths.sampling import SAMPLERS, RowSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives import METHODS, Objective
-from ocp_torch.problems import Problem
+from ocp_torch.problems import Dataset, Problem
 from ocp_torch.problems.blame import in_their_words, origin, words
 from ocp_torch.problems.checks import check_once
 from ocp_torch.problems.constants import resolve_constants
@@ -82,8 +82,8 @@ def build_problem(section: object) -> Problem:
 
 def _require_room(dim: int, control_dim: object) -> None:
     """Raise `InputError` where `B` at the states at which the embedding looks for waves would not fit into the memory."""
-    given = isinstance(control_dim, int) and 1 <= control_dim <= MOST_COORDINATES
-    entries = dim * (control_dim if given else dim)
+    given = control_dim if isinstance(control_dim, int) and 1 <= control_dim <= MOST_COORDINATES else dim
+    entries = dim * given
     require_memory("the number of entries of B, problem.dim times control_dim,", entries, 8.0 * STATES)
 
 
@@ -118,6 +118,7 @@ def build_trainer(config: dict) -> Trainer:
     elif settings.target_gap is not None:
         raise InputError("trainer.target_gap is set, but a data set has no simulation to see a gap by.")
     else:  # a data set has its own samples
+        assert isinstance(problem, Dataset)
         sampler = RowSampler(problem.rows, seed, problem.recording.digest)
     batches = Batches(problem, fields, objective, sampler, settings.batch, seed, visited)
     names = (problem_name(problem), name)

@@ -67,7 +67,7 @@ def row_of(folder: Path, name: str) -> dict:
         return {
             "run": name,
             **{k: printable(certificate[k]) for k in ("problem", "method")},
-            **{k: int(number(certificate[k])) for k in ("seed", "step")},
+            **{k: int(_given(certificate[k])) for k in ("seed", "step")},
             "train_seconds": number(certificate["train_seconds"]),
             "lower": lower,
             "perf": performance(certificate),
@@ -99,12 +99,20 @@ def performance(certificate: dict) -> float | None:
     known = {name: e for name, e in certificate["perf"].items() if e is not None and number(e["value"]) is not None}
     spoken_of = [e.get("controller") for e in certificate["upper"].values() if e is not None]
     at_most = lambda name: (
-        known[name]["value"] + (number(known[name].get("bias")) or 0.0) + 2.0 * number(known[name]["se"])
+        known[name]["value"] + (number(known[name].get("bias")) or 0.0) + 2.0 * _given(known[name]["se"])
     )
     names = [name for name in (certificate.get("controller"), "given", *spoken_of) if name in known] or sorted(
         known, key=at_most
     )
     return number(known[names[0]]["value"]) if names else None
+
+
+def _given(value) -> float:
+    """A finite number; `TypeError` where there is none."""
+    found = number(value)
+    if found is None:
+        raise TypeError("a number is missing")
+    return found
 
 
 def number(value) -> float | None:

@@ -9,6 +9,7 @@ import contextlib
 import os
 import re
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -34,16 +35,17 @@ def locate(path: Path) -> tuple[Path | None, Path | None]:
     return (path.absolute().parent.parent if path.absolute().parent.name == "checkpoints" else None), path
 
 
-def load_state(path: Path) -> tuple[dict, Path, list[str]]:
+def load_state(path: Path) -> tuple[Any, Path, list[str]]:
     """The state that ``path`` names, the file it came from, and a sentence on each damaged newer one."""
     folder, checkpoint = locate(path)
     if checkpoint is not None:
         return current_state(load_checkpoint(checkpoint)), checkpoint, []
+    assert folder is not None  # what names no checkpoint is a folder
     state, checkpoint, notes = newest(folder / "checkpoints")
     return current_state(state), checkpoint, notes
 
 
-def current_state(state: object) -> object:
+def current_state(state: Any) -> Any:
     """The ``state`` of a run of any version, with the names that its problem has now."""
     config = state.get("config") if isinstance(state, dict) else None
     if not isinstance(config, dict):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -86,9 +87,7 @@ def draw(problem: Problem, fields: Fields, constants: Constants, occupation: str
 def save(figures: dict[str, Figure], folder: Path) -> None:
     """Write `figures/<name>.png`."""
     for name, figure in figures.items():
-        write_atomically(
-            folder / f"{name}.png", lambda path, figure=figure: figure.savefig(path, dpi=120, format="png")
-        )
+        write_atomically(folder / f"{name}.png", partial(figure.savefig, dpi=120, format="png"))
 
 
 def _figure(columns: int):
@@ -96,7 +95,7 @@ def _figure(columns: int):
     return figure, figure.subplots(1, columns, squeeze=False)[0]
 
 
-def _components(function: Callable[[Tensor], Tensor | None], x: Tensor) -> Tensor | None:
+def _components(function: Callable[[Tensor], Any] | None, x: Tensor) -> Tensor | None:
     """Values as columns ``(N, k)``; an infinite one becomes a gap in the plot."""
     with torch.no_grad():
         if function is None or function(x[:1]) is None:
@@ -123,8 +122,9 @@ def _map(dim: int, title: str, learned, exact, simulated=None) -> Figure:
     line = (torch.arange(MAP_POINTS, dtype=torch.float64) + 0.5) / MAP_POINTS
     x = torch.full((MAP_POINTS**2, dim), 0.5, dtype=torch.float64)
     x[:, :2] = torch.cartesian_prod(line, line)
-    panels = {"": _components(learned, x), ", exact": _components(exact, x), ", simulated": _components(simulated, x)}
-    panels = {suffix: values for suffix, values in panels.items() if values is not None}
+    functions = {"": learned, ", exact": exact, ", simulated": simulated}
+    known = {suffix: _components(function, x) for suffix, function in functions.items()}
+    panels = {suffix: values for suffix, values in known.items() if values is not None}
     # A control of several components is drawn as its size, with arrows for its first two.
     sizes = {suffix: v.norm(dim=-1) if v.shape[1] > 1 else v[:, 0] for suffix, v in panels.items()}
     low = min(float(s.nan_to_num(nan=torch.inf).min()) for s in sizes.values())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ocp_torch.certificate.run import LONGEST_NAME
 from ocp_torch.errors import visible
@@ -38,7 +38,7 @@ def interval_figure(certificate: dict) -> Figure:
         if outside != e["value"]:
             marker, side = ("<", 1) if outside == left else (">", -1)
             axis.plot(outside, y, marker, color=color, clip_on=False)
-            offset = {"xytext": (8 * side, 0), "textcoords": "offset points"}
+            offset: dict[str, Any] = {"xytext": (8 * side, 0), "textcoords": "offset points"}
             at = "left" if side > 0 else "right"
             axis.annotate(f"{e['value']:.5g}", (outside, y), va="center", ha=at, **offset)
             continue

@@ -25,9 +25,9 @@ def load_policy(source: str, problem: Problem) -> Callable | Controller:
     A .py file is code, and so is TorchScript: it can write files by itself. Only what is trusted is named here; an .onnx
     file, like one of ours, can do nothing but compute.
     """
-    path, _, name = str(source).rpartition(":")
-    if path.endswith(".py"):
-        return _function(Path(path), name)
+    file, _, name = str(source).rpartition(":")
+    if file.endswith(".py"):
+        return _function(Path(file), name)
     path = Path(str(source))
     if path.suffix == ".py":
         raise InputError(f"controller is {source!r}, but must name its function, as in {source}:function.")
@@ -60,6 +60,8 @@ def _function(path: Path, name: str) -> Callable:
         raise InputError(f"controller names {path}, which does not exist.")
     require_file(path)
     spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None  # as for every .py file
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)

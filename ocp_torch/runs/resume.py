@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from ocp_torch.certificate import table
 from ocp_torch.errors import InputError
@@ -37,7 +38,7 @@ def find_run(composed: dict, roots: Iterable[Path]) -> Path | None:
                         found[folder] = file.stat().st_mtime
                 except (InputError, OSError):
                     continue
-    return max(found, key=found.get, default=None)
+    return max(found, key=lambda folder: found[folder], default=None)
 
 
 def same(one: dict, other: dict) -> bool:
@@ -62,7 +63,7 @@ def resumed_configuration(composed: dict, named: Iterable[str]) -> dict:
     for name in named:
         _transplant(result, composed, name.split("."))
     require_modest_run(path, result, {*named})
-    problem = result.get("problem")
+    problem: Any = result.get("problem")
     target = problem.get("_target_") if isinstance(problem, dict) else None
     if target not in OWN_TARGETS and not {"problem", "problem._target_"} & set(named):
         raise ForeignProblem(
@@ -76,7 +77,7 @@ def resumed_configuration(composed: dict, named: Iterable[str]) -> dict:
     return result
 
 
-def _transplant(result: dict, source: dict, keys: list[str]) -> None:
+def _transplant(result: dict, source: Any, keys: list[str]) -> None:
     *groups, last = keys
     for key in groups:
         source = source.get(key) if isinstance(source, dict) else None
@@ -94,7 +95,7 @@ def filled_from(config: dict, made: object) -> dict:
     dimension may have changed since. The number of rounds follows the steps, as in a new run."""
     if not isinstance(made, dict):
         return config
-    filled = {}
+    filled: dict[str, Any] = {}
     for key, value in config.items():
         if isinstance(value, dict):
             filled[key] = filled_from(value, made.get(key))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import SimpleNamespace
+from typing import Any
 
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_multi_avg_fn
@@ -21,7 +22,8 @@ class Average(AveragedModel):
 
     def count(self, iterate: Sequence[Tensor]) -> None:
         """Take ``iterate``, all parameters in the order of those of the fields, into the average."""
-        self.update_parameters(SimpleNamespace(parameters=lambda: iterate, buffers=self.module.buffers))
+        alike: Any = SimpleNamespace(parameters=lambda: iterate, buffers=self.module.buffers)
+        self.update_parameters(alike)
 
 
 def averaged(fields: nn.Module, kind: str = "ema", decay: float = DECAY) -> Average:

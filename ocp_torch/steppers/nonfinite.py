@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -62,6 +64,6 @@ def _bad_data(one: Samples) -> str:
     return ""
 
 
-def _finite_gradient(loss: Tensor, parameters: list[Tensor]) -> bool:
+def _finite_gradient(loss: Tensor, parameters: Sequence[Tensor]) -> bool:
     gradients = torch.autograd.grad(loss, parameters, retain_graph=True, allow_unused=True)
     return all(g is None or bool(torch.isfinite(g).all()) for g in gradients)

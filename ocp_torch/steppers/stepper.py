@@ -7,6 +7,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -62,7 +63,9 @@ class Stepper(ABC):
         unit: float = 1.0,
     ) -> None:
         self.fields, self.objective, self.radius, self.clip, self.unit = fields, objective, radius, clip, unit
-        self.parameters = {player: fields.parameters_of(names) for player, names in objective.players.items()}
+        self.parameters: dict[str, list[Any]] = {
+            player: fields.parameters_of(names) for player, names in objective.players.items()
+        }
         self.optimizers = {player: optimizers[player](self.parameters[player]) for player in objective.players}
         delays = objective.delays
         self.schedules = {p: schedule(optimizer, delays.get(p, 0.0)) for p, optimizer in self.optimizers.items()}
@@ -120,7 +123,7 @@ class Stepper(ABC):
             for parameter, gradient in zip(parameters, gradients[player], strict=True):
                 # A bias that only shifts V gets no gradient where only grad V matters.
                 parameter.grad = torch.zeros_like(parameter) if gradient is None else gradient
-            norms[player] = torch.nn.utils.get_total_norm([p.grad for p in parameters])
+            norms[player] = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
         self._require_finite(losses, norms, samples, phase)
         if self.clip is not None:
             for player, parameters in moving.items():

@@ -53,12 +53,13 @@ def fill(config: dict, problem: Problem) -> dict:
     filled = copy.deepcopy(config)
     method = require_section("method", config.get("method") or {})
     model = MODELS[require_choice("model.name", config["model"].get("name"), MODELS)]
-    unbounded, of_method = is_unbounded(problem, method.get("occupation_bound")), {}
+    unbounded = is_unbounded(problem, method.get("occupation_bound"))
+    of_method: dict[tuple[str, ...], object] = {}
     if unbounded:
         if method.get("name") == "pd" and config["trainer"].get("batch") is None:
             of_method = {("method", "density_batch"): DENSITY_BATCH}
         budget = replace(budget, batch=max(budget.batch, LARGE_BATCH), steps=max(budget.steps, MANY_STEPS))
-    defaults = {
+    defaults: dict[tuple[str, ...], object] = {
         **{("model", name): value for name, value in model.defaults(problem.dim, worst_state=unbounded).items()},
         ("trainer", "rounds"): 2 if config["trainer"].get("steps") is None else 1,
         ("trainer", "good_gap"): budget.good_gap,

@@ -6,6 +6,7 @@ import copy
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import cast
 
 from torch import nn
 
@@ -47,7 +48,7 @@ class Evaluator:
     @property
     def fields(self) -> Fields:
         """The averaged fields as they stand."""
-        return self.state.average.module
+        return cast(Fields, self.state.average.module)
 
     def certify(
         self,
@@ -100,6 +101,7 @@ class Evaluator:
     def best_fields(self) -> Fields:
         """The averaged fields of the best evaluation so far."""
         fields = copy.deepcopy(self.fields)
+        assert self.state.health.fields is not None  # kept with the best evaluation
         fields.load_state_dict(self.state.health.fields)
         return fields
 

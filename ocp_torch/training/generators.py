@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,8 @@ def seed_generators(seed: int) -> None:
 
 def generator_states() -> dict:
     """Their states, as tensors and plain numbers that a checkpoint can hold."""
-    name, keys, *rest = np.random.get_state()  # noqa: NPY002
+    state: Any = np.random.get_state()  # noqa: NPY002
+    name, keys, *rest = state
     version, words, spare = random.getstate()
     states = {
         "torch": torch.get_rng_state(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import torch
@@ -41,10 +41,11 @@ class Evaluation:
     @classmethod
     def at(cls, step: int, certificate: Certificate) -> Evaluation:
         lower, perf = certificate.best_lower, certificate.best_perf
-        errors = certificate.lower[lower[0]].half_width(certificate.confidence) if lower else 0.0
-        errors += certificate.perf[perf[0]].half_width(certificate.confidence) if perf else 0.0
+        ends = [certificate.lower[lower[0]]] if lower else []
+        ends += [certificate.perf[perf[0]]] if perf else []
+        errors = sum(e.half_width(certificate.confidence) for e in ends if e is not None)
         gap = certificate.gap["simulated"]
-        unit = lower[1] if gap is not None else perf[1] if perf else 1.0
+        unit = lower[1] if lower and gap is not None else perf[1] if perf else 1.0
         return cls(step, gap, perf[1] if perf else None, errors / abs(unit) if unit else 0.0)
 
     def better_than(self, other: Evaluation | None, sure: bool = False) -> bool:
@@ -78,7 +79,8 @@ class Health:
         self.certificate: Certificate | None = None
         self.notes: list[str] = []
         self.warned = False  # that a certificate was no better than not having trained
-        self._unit, self._start = unit, {}
+        self._unit = unit
+        self._start: dict[str, float] = {}
 
     @classmethod
     def of(cls, problem: Problem) -> Health:
@@ -96,7 +98,7 @@ class Health:
         self.fields = {name: tensor.detach().clone() for name, tensor in fields.state_dict().items()}
         return True
 
-    def stepped(self, step: int, losses: dict[str, Tensor], parameters: dict[str, list[Tensor]]) -> list[str]:
+    def stepped(self, step: int, losses: dict[str, Tensor], parameters: Mapping[str, Sequence[Tensor]]) -> list[str]:
         """Hold sizes against those at the start; a sentence, once, on each that has grown without end."""
         sizes = {f"the loss of player {p!r}": (abs(float(loss)), GROWN_LOSS, self._unit) for p, loss in losses.items()}
         for player in losses:

@@ -95,7 +95,7 @@ class Monitor(Silent):
     def evaluated(self, trainer: Trainer, certificate: Certificate) -> None:
         record(self.writer, certificate, trainer.step)
         shown = {name: e for name, e in {**certificate.lower, **certificate.upper}.items() if e is not None}
-        values = {name: f"{shown[name].value:.6f}" for name in ("F_M", "J") if name in shown}
+        values: dict[str, str] = {name: f"{shown[name].value:.6f}" for name in ("F_M", "J") if name in shown}
         gaps = [gap for gap in (certificate.gap["certified"], certificate.gap["simulated"]) if gap is not None]
         if gaps:
             values["gap"] = f"{100 * min(gaps):.2f}%"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from typing import Any
 
 from tqdm import tqdm
 
@@ -30,7 +31,8 @@ class Stages:
     """A clock with the name of the stage, in terminals; elsewhere, and in the log, a line per stage. Call it with a name."""
 
     def __init__(self, hidden: bool | None) -> None:
-        self._hidden, self._clock = hidden, None
+        self._hidden = hidden
+        self._clock: Any = None  # the bar, once something has begun
         self._over = threading.Event()
 
     def begin(self, seconds: float | None) -> None:

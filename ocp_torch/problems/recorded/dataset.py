@@ -11,6 +11,7 @@ from torch import Tensor
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
 from ocp_torch.problems.problem import MARGIN, Problem
 from ocp_torch.problems.recorded import recording
+from ocp_torch.problems.recorded.recording import Recording
 from ocp_torch.problems.recorded.split import HELD_OUT, TRAINING, VALIDATION, split, with_divergences
 from ocp_torch.problems.samples import Samples
 
@@ -62,10 +63,9 @@ class Dataset(Problem):
             constant_matrix = first[0].tolist() if same else None
         if discount is None:
             raise InputError("problem.discount is missing: the file does not hold it; give problem.discount=...")
-        super().__init__(
-            dim=dim, control_dim=control_dim, discount=discount, exponent=exponent, control_limit=control_limit
-        )
+        super().__init__(dim, control_dim, discount, exponent, control_limit)  # type: ignore[arg-type] # refused there
         self._B = None if constant_matrix is None else torch.tensor(constant_matrix, dtype=torch.float64)
+        self.knows_control_matrix = self._B is not None
         if self._B is not None and self._B.shape != (self.dim, self.control_dim):
             raise InputError(f"problem.constant_matrix has shape {tuple(self._B.shape)}, but must be (d, m).")
         if self._recording is not None:
@@ -84,7 +84,7 @@ class Dataset(Problem):
         }
 
     @property
-    def recording(self) -> recording.Recording:
+    def recording(self) -> Recording:
         """What the file holds, read when it is first asked for."""
         if self._recording is None:
             found = recording.read(self.path, self.wrap)
@@ -93,9 +93,10 @@ class Dataset(Problem):
                     f"{self.path} is of d, m = {tuple(found.samples.B.shape[1:])}, not {(self.dim, self.control_dim)}."
                 )
             self._take_in(found)
+            return found
         return self._recording
 
-    def _take_in(self, found: recording.Recording) -> None:
+    def _take_in(self, found: Recording) -> None:
         self._recording = found
         # The largest cost among the samples, with head-room: an estimate, and the certificate calls it one.
         self.state_cost_bound = MARGIN * float(found.samples.f.max())
@@ -145,10 +146,6 @@ class Dataset(Problem):
     @property
     def gives_divergences(self) -> bool:
         return self.training.div_a is not None and self.training.div_B is not None
-
-    @property
-    def knows_control_matrix(self) -> bool:
-        return self._B is not None
 
     def control_matrix(self, x: Tensor) -> Tensor:
         if self._B is None:

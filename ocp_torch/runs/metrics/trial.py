@@ -36,7 +36,7 @@ def metrics(problem: Problem, policy: Policy, seed: int = 0, starts: int = START
         if each is None:
             continue
         path = simulate(problem, _within_limit(problem, each), x0, duration, STEPS)
-        found[name] = {**measure(problem, path), "cost": float(path.cost.mean())}
+        found[name] = {**(measure(problem, path) or {}), "cost": float(path.cost.mean())}
     return {"starts": starts, "seed": seed, "duration": duration, **found}
 
 

@@ -31,6 +31,7 @@ def animate(problem: Problem, policy: Policy, path: str | FilePath, seed: int = 
     from matplotlib.animation import PillowWriter
 
     path, shown = require_gif(problem, path), moving(problem, policy, seed)
+    assert shown is not None  # there is a scene
     figure, writer = shown.figure(), PillowWriter(fps=FRAMES_PER_SECOND)
     figure.set_layout_engine("none")  # the same axes in every frame, and not found anew for each
     try:

@@ -60,7 +60,7 @@ def _obstacles(axes: Axes, discs: list, clearance: float, period: float | None =
                 axes.add_patch(Circle((x + dx, y + dy), radius + clearance, fill=False, color="0.7", linestyle=":"))
 
 
-def _balls(axes: Axes, balls: list, clearance: float) -> None:
+def _balls(axes: Any, balls: list, clearance: float) -> None:
     """As `_obstacles`, in space."""
     along, up = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 25), np.linspace(0.0, np.pi, 13))
     sphere = np.stack([np.cos(along) * np.sin(up), np.sin(along) * np.sin(up), np.cos(up)])
@@ -84,7 +84,7 @@ def arm_scene(problem: Linkage) -> Scene:
     base = [0.0] * len(problem.shoulder)
     reach = 1.08 * max(problem.length, *(math.dist(problem.shoulder, place) for place in (problem.target, base)))
     limits = {f"{name}lim": (at - reach, at + reach) for name, at in zip("xyz", problem.shoulder, strict=False)}
-    obstacles = {2: _obstacles, 3: _balls}[len(base)]
+    obstacles = _obstacles if len(base) == 2 else _balls
 
     def draw(axes: Axes, path: Path, k: int) -> None:
         obstacles(axes, problem.obstacles, problem.clearance)

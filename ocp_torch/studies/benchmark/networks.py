@@ -7,6 +7,7 @@ import time
 from dataclasses import dataclass
 
 from ocp_torch.certificate import CertificateSettings
+from ocp_torch.fields import Fields
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.studies.benchmark.curve import Curve, Point, due
 from ocp_torch.studies.benchmark.measure import Judge
@@ -19,7 +20,7 @@ class Recorder(Silent):
     def __init__(self) -> None:
         self.due = due(10_000)
         self.next = next(self.due)
-        self.kept: list[tuple[int, float, object]] = []
+        self.kept: list[tuple[int, float, Fields]] = []
         self.started = time.process_time()
 
     @property

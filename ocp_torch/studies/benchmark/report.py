@@ -96,7 +96,7 @@ def winners(curves: list[Curve], optimum: float) -> list[str]:
     found = []
     for unit, measure in (("samples", lambda p: p.samples), ("seconds", lambda p: p.seconds)):
         medians = {name: median_and_spread([measure(hit) for hit in hits])[0] for name, hits in sure.items()}
-        first = min(medians, key=medians.get)
+        first = min(medians, key=lambda name: medians[name])
         found.append(f"1 % on Perf in the fewest {unit}: {first}, {medians[first]:,.6g}.")
     return found
 

@@ -75,11 +75,14 @@ def iterates(history: History) -> Figure:
     """What a method learns, for growing `n`, with the exact functions: `V` or `w` and the controller; all four for pd."""
     problem, constants = circle()
     kind, x = OCCUPATION[history.recipe.method], _grid()
+    u, mu = problem.exact_control(x), problem.exact_occupation(x)
+    assert u is not None  # the circle has its exact truth
+    assert mu is not None
     exact = {
-        "$\\bar w_n$": problem.exact_control(x)[:, 0] * problem.exact_occupation(x),
+        "$\\bar w_n$": u[:, 0] * mu,
         "$\\bar V_n$": problem.exact_value(x),
-        "$\\mu_n$": problem.exact_occupation(x),
-        "controller from $\\bar V_n$": problem.exact_control(x),
+        "$\\mu_n$": mu,
+        "controller from $\\bar V_n$": u,
         "controller $\\bar w_n / \\mu_n$": problem.exact_control(x),
     }
 

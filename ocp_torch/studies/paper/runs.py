@@ -17,6 +17,7 @@ from ocp_torch.studies.benchmark.kernels import OCCUPATION
 from ocp_torch.studies.benchmark.measure import Judge, relative
 from ocp_torch.studies.kernel import Iteration
 from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
+from ocp_torch.studies.kernel.expansions import KernelExpansion
 from ocp_torch.studies.paper.recipes import DISCOUNT, OCCUPATION_BOUND, VALUE_BOUND, Recipe
 
 Tick = Callable[[int], None]
@@ -90,7 +91,9 @@ def compare_with_exact(
     grid = np.linspace(0.0, 1.0, 201)[None, :, None]
     differences = {}
     for name, network in truncated.fields(0).networks.items():
-        there = exact.expansions[name].at(grid, average=True)[0, :, 0, 0]
+        expansion = exact.expansions[name]
+        assert isinstance(expansion, KernelExpansion)
+        there = expansion.at(grid, average=True)[0, :, 0, 0]
         here = network(torch.from_numpy(grid[0])).reshape(-1).numpy()
         differences[name] = float(np.abs(there - here).max() / np.abs(there).max())
     return Comparison(recipe.method, steps, modes, differences, costs)
