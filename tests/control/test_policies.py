@@ -1,0 +1,69 @@
+"""Controllers and densities at the exact truth are the exact ones, whichever way they are made of the fields."""
+
+import pytest
+import torch
+
+from ocp_torch.control.policies import (
+    CLOSED,
+    NETWORK,
+    SADDLE,
+    ValuePolicy,
+    density_policy,
+    occupation_density,
+    trained_policies,
+    zero_policy,
+)
+from ocp_torch.fields import Fields
+from ocp_torch.problems.constants import resolve_constants
+from support import zoo
+from support.exact import ROUNDING
+from support.formulas import Exactly
+
+
+def exact_fields(problem) -> Fields:
+    flux = lambda x: problem.exact_occupation(x).unsqueeze(-1) * problem.exact_control(x)
+    fields = {
+        "value": problem.exact_value,
+        "control_density": flux,
+        "log_occupation": lambda x: mu_of(problem)(x).log(),
+    }
+    return Fields({name: Exactly(formula) for name, formula in fields.items()})
+
+
+def mu_of(problem):
+    return lambda x: problem.exact_occupation(x).clamp_min(1e-300)
+
+
+@zoo.on((*zoo.EXACT, *zoo.LIMITED))
+def test_the_controller_of_the_exact_value_is_the_exact_one(problem):
+    x = zoo.states(problem, 500, off_kinks=True)
+    torch.testing.assert_close(ValuePolicy(problem, problem.exact_value)(x), problem.exact_control(x), **ROUNDING)
+
+
+KINDS = [(CLOSED, n) for n in zoo.KINKED] + [(k, n) for n in (*zoo.SMOOTH, *zoo.LIMITED) for k in (SADDLE, NETWORK)]
+
+
+@pytest.mark.parametrize(("kind", "name"), KINDS)
+def test_the_density_of_the_exact_fields_is_the_exact_one_and_so_is_its_controller(kind, name):
+    """Lemmas 2 and 3 at the truth; in the latter `mu` is determined where something is controlled."""
+    problem = zoo.build(name)
+    x, fields, constants = zoo.states(problem, 500, off_kinks=True), exact_fields(problem), resolve_constants(problem)
+    u = problem.exact_control(x)
+    moved = u.norm(dim=-1) > 1e-3
+    mu = occupation_density(kind, problem, fields, constants)
+    torch.testing.assert_close(mu(x)[moved], problem.exact_occupation(x)[moved], rtol=1e-6, atol=1e-9)
+    found = trained_policies(kind, problem, fields, constants)
+    assert set(found) == {"value", "density"}
+    torch.testing.assert_close(found["density"](x)[moved], u[moved], rtol=1e-6, atol=1e-9)
+
+
+def test_where_there_is_no_mass_or_mass_without_end_nothing_is_controlled():
+    problem = zoo.build("manufactured 2-d q=2")
+    x = zoo.states(problem, 3)
+    mu = torch.tensor([0.0, torch.inf, 2.0], dtype=torch.float64)
+    u = density_policy(lambda x: torch.ones_like(x), lambda x: mu, problem.control_cost)(x)
+    assert u.tolist() == [[0.0, 0.0], [0.0, 0.0], [0.5, 0.5]]
+    assert (zoo.build("manufactured 3-d m=2").control_dim, 0.0) == (
+        zero_policy(zoo.build("manufactured 3-d m=2"))(torch.rand(2, 3)).shape[1],
+        float(zero_policy(problem)(x).abs().max()),
+    )
