@@ -129,10 +129,8 @@ def _picture(env, name: str) -> np.ndarray:
 def save_gif(path: Path, frames: list[np.ndarray], rate: float) -> None:
     """Write ``frames`` as a GIF of ``rate`` pictures a second."""
     images = [Image.fromarray(frame) for frame in frames]
-    options: dict[str, Any] = dict(
-        format="GIF", save_all=True, append_images=images[1:], duration=round(1000.0 / rate), loop=0
-    )
-    write_atomically(path, lambda temporary: images[0].save(temporary, duration=round(1000.0 / rate), **options))
+    options: dict[str, Any] = dict(save_all=True, append_images=images[1:], duration=round(1000.0 / rate), loop=0)
+    write_atomically(path, lambda temporary: images[0].save(temporary, format="GIF", **options))
 
 
 def rollout_job(config: dict) -> RolloutJob:

@@ -124,7 +124,7 @@ def test_another_round_twice_as_long_starts_only_while_the_gap_is_not_good():
     assert rounds_of().step == 8
     assert rounds_of("trainer.rounds=2", "trainer.good_gap=1e9").step == 8
     longer = rounds_of("trainer.rounds=2", "trainer.good_gap=1e-9")
-    assert (longer.step, longer.round) == (24, 1)
+    assert (longer.step, longer.state.round) == (24, 1)
 
 
 def test_a_run_in_its_second_round_resumes_bitwise(tmp_path):
@@ -146,7 +146,7 @@ def test_a_run_in_its_second_round_resumes_bitwise(tmp_path):
         configured("experiment=debug", "problem=circle", "method=dual", "trainer.steps=8", *overrides)
     )
     resumed.resume(saved)
-    assert (resumed.step, resumed.round) == (13, 1)
+    assert (resumed.step, resumed.state.round) == (13, 1)
     resumed.fit(Silent())
     for left, right in zip(whole.averaged_fields.parameters(), resumed.averaged_fields.parameters(), strict=True):
         assert torch.equal(left, right)

@@ -152,9 +152,9 @@ def test_simultaneous_adam_is_adam_for_each_player():
     first, second = [np.zeros(2), np.zeros(3)], [np.zeros(2), np.zeros(3)]
     for k, X in enumerate(matrices, start=1):
         for i, g in enumerate(gradient(z, X)):
-            first[i], second[i] = 0.9 * first[i] + 0.1 * g, 0.999 * second[i] + 0.001 * g**2
+            first[i], second[i] = 0.9 * first[i] + 0.1 * g, 0.99 * second[i] + 0.01 * g**2
         for i, rate in enumerate((0.05, 0.02)):
-            z[i] = z[i] - rate * first[i] / (1 - 0.9**k) / (np.sqrt(second[i] / (1 - 0.999**k)) + 1e-8)
+            z[i] = z[i] - rate * first[i] / (1 - 0.9**k) / (np.sqrt(second[i] / (1 - 0.99**k)) + 1e-8)
         game.step()
         assert_close(game.point, z)
 

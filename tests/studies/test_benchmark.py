@@ -209,8 +209,13 @@ def test_a_whole_contest_in_small(tmp_path, quick):
 
 def test_a_problem_with_drift_loses_the_kernel_primal_alone():
     config = composed("benchmark", [*TINY, "problem=manufactured", "problem.dim=1"])
-    _, _, made, _, _ = build(config)
-    assert [m.name for m in made] == ["mlp dual", "mlp primal", "mlp pd", "kernel dual", "kernel pd"]
+    assert [m.name for m in build(config).contenders] == [
+        "mlp dual",
+        "mlp primal",
+        "mlp pd",
+        "kernel dual",
+        "kernel pd",
+    ]
 
 
 @pytest.mark.parametrize(
