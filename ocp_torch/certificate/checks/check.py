@@ -47,7 +47,7 @@ def check_assumptions(
     if not control_holds:
         warnings.append(f"the control reaches {observed.sup_control:.4g}, beyond C_u = {constants.C_u:.4g}.")
     jumps = jump is not None and jump.size > 0.0
-    if jumps:
+    if jump is not None and jump.size > 0.0:
         at = [round(c, 4) for c in jump.x[:6].tolist()] + (["..."] if len(jump.x) > 6 else [])
         warnings.append(
             f"J and the Lagrangian bound are not used: the {jump.what} {jump.verb} by {jump.size:.3g}, at "

@@ -18,6 +18,7 @@ from ocp_torch.certificate.proof.box import Box
 from ocp_torch.certificate.proof.monomials import Monomials
 from ocp_torch.certificate.proof.rounding import ROUNDING, upward
 from ocp_torch.certificate.proof.taylor import TaylorModel
+from ocp_torch.maths.sums import summed
 
 # Room in the rounding of a dot product of n terms: it is bounded as if it had so many more.
 EXTRA_TERMS = 8
@@ -75,8 +76,8 @@ def affine(model: SmoothModel, weight: Tensor, bias: Tensor) -> SmoothModel:
     gamma = 2.0 * (weight.shape[1] + EXTRA_TERMS) * 2.0**-53
     P = model.P @ weight.T
     P[0] += bias
-    slopes = [sum(model.slope_sizes(i)) for i in range(model.basis.dim)]
-    rounded = gamma * torch.stack([sum(model.degree_sizes()), *slopes])
+    slopes = [summed(model.slope_sizes(i)) for i in range(model.basis.dim)]
+    rounded = gamma * torch.stack([summed(model.degree_sizes()), *slopes])
     radii = (model.radii + rounded) @ weight.abs().T
     radii[0] += ROUNDING * P[0].abs() + gamma * bias.abs()
     # The last factor makes up for the rounding of the radii's own dot products.
