@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -124,5 +125,6 @@ def a_priori_sup_occupation(problem: Problem, policy: Policy, points: Tensor) ->
     largest = lambda function: (
         supremum(function, points, ascents=ASCENTS, steps=ASCENT_STEPS, differentiable=False).value
     )
-    excess = problem.discount - max(0.0, largest(lambda x: -loop.drift_divergence(x)))
+    contraction = lambda x: -cast(Tensor, loop.drift_divergence(x))  # there is one: the problem gives divergences
+    excess = problem.discount - max(0.0, largest(contraction))
     return problem.discount * largest(problem.initial_density) / excess if excess > 0.0 else None

@@ -21,7 +21,7 @@ class PenalisedPrimal(Bound):
         return not context.recorded
 
     def evaluate(self, context: Context) -> Estimate | None:
-        if context.takes_fitted_J:
+        if context.closed_loop and context.takes_fitted_J:
             return None if context.coarse else context.closed_loop.J
         return context.densities.J if context.densities else None
 

@@ -108,16 +108,16 @@ class RecordedFit(NamedTuple):
     hidden: Hidden | None
 
 
-def fit_recorded(context: RecordedContext) -> RecordedFit:
-    """`J(mu u, mu)` of the controller handed out, on held-out samples, with `log mu` fitted on the training samples.
+def fit_recorded(context: RecordedContext, kind: str) -> RecordedFit:
+    """`J(mu u, mu)` of the controller ``kind``, on held-out samples, with `log mu` fitted on the training samples.
 
     By parts `E[(f + R(u)) mu] = E[V mu0 - mu Q_u - V r]`, the same number with less scatter. `C_V` is the largest of the
     bound at hand and of `V - min(Q_u, 0)`, which bounds `V^u` where it is largest, at all samples, with head-room. Raises
     `ArithmeticError` where the fit fails.
     """
     problem, trained, constants, seed = context.problem, context.trained, context.constants, context.seed
-    cost, rho, policy = problem.control_cost, problem.discount, context.policy
-    rough = context.policy_of(trained.fields)
+    cost, rho = problem.control_cost, problem.discount
+    policy, rough = (context.policy_of(kind, fields) for fields in (context.fields, trained.fields))
     like = next(trained.fields.parameters())
     training = closed_loop_samples(problem.training.to(like), rough, cost)
     pool = Drawn(training, derive_seed(seed, Branch.POLICY_EVALUATION, 2))
@@ -137,7 +137,7 @@ def fit_recorded(context: RecordedContext) -> RecordedFit:
         largest, deepest = max(largest, float(V.value.max())), max(deepest, float(-slack.min()))
         densities.append(mu)
         fluxes.append(Flux(loop.x, loop.weight, outflow - mu, mu.unsqueeze(-1) * loop.a / rho))
-        spreads.append(loop.div_a)
+        spreads.append(loop.require_divergences("the closed loop")[0])
     with torch.no_grad():
         loop = training.to(torch.zeros((), dtype=torch.float64))
         V = jets.jet(value, loop.x)
@@ -146,7 +146,7 @@ def fit_recorded(context: RecordedContext) -> RecordedFit:
     C_V = max(constants.C_V, MARGIN * (largest + deepest))
     excess = best_multiples(terms, lambda t, s: t.J(s, C_V))
     J = [integral(t.samples, t.v * t.samples.mu0) + e for t, e in zip(terms, excess, strict=True)]
-    found = Estimate.of(J, controller=context.kind)
+    found = Estimate.of(J, controller=kind)
     highest = highest_occupation(torch.cat(densities), torch.cat(spreads), rho)
     return RecordedFit(found, C_V, highest, hidden_divergence(fluxes))
 
