@@ -53,7 +53,7 @@ class Context:
 
     recorded = external = False  # whether it is of recorded samples, or of a controller that somebody brings
     divergent = ""  # which bounds take a divergence, in words
-    if TYPE_CHECKING:  # each kind has them as it likes: fields, constants or properties, computed once or each time
+    if TYPE_CHECKING:  # each kind gives these itself, as a field, a constant or a property
 
         @property
         def kind(self) -> str | None: ...

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from ocp_torch.certificate.bound import recorded
 from ocp_torch.certificate.checks.hidden import Flux, Hidden, hidden_divergence
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.trained import in_float64
@@ -41,22 +42,25 @@ class RecordedPrimal(PenalisedPrimal):
     def applies(self, context: Context) -> bool:
         return context.recorded
 
-    def evaluate(self, context: RecordedContext) -> Estimate | None:
-        return context.fit.J if context.fit else None
+    def evaluate(self, context: Context) -> Estimate | None:
+        fit = recorded(context).fit
+        return fit.J if fit else None
 
-    def valid(self, context: RecordedContext) -> bool:
+    def valid(self, context: Context) -> bool:
         return context.hidden is None and context.checked.regular_holds
 
-    def speaks(self, context: RecordedContext) -> bool:
+    def speaks(self, context: Context) -> bool:
         return True
 
-    def notes(self, context: RecordedContext, shown: Estimate | None) -> list[str]:
+    def notes(self, context: Context, shown: Estimate | None) -> list[str]:
         if context.hidden is not None:
             return [f"J is not used: {context.hidden.sentence}."]
-        if context.fit is None:
+        fit = recorded(context).fit
+        if fit is None:
             return []
-        C_V = context.fit.C_V
-        return [f"J is above the controller's performance if C_V = {C_V:.4g}, by the samples met, bounds its value."]
+        return [
+            f"J is above the controller's performance if C_V = {fit.C_V:.4g}, by the samples met, bounds its value."
+        ]
 
 
 @torch.no_grad()
