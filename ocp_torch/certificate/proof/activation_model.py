@@ -42,10 +42,10 @@ def activate(model: SmoothModel, activation: nn.Module) -> SmoothModel:
     slopes, cut_total = [], torch.zeros_like(z)
     for i in range(basis.dim):
         own = model.slope_sizes(i)
-        total = sum(own)
+        total = summed(own)
         cut = derivative[m] * total
         for a in range(1, m):
-            cut = cut + derivative[a] * sum(own[m - a :])
+            cut = cut + derivative[a] * summed(own[m - a :])
         cut_total = cut_total + cut
         inexact = m * (ROUNDING * (varying + ROUNDING * known) + wrong)
         slopes.append(moved * total + cut + first * model.radii[1 + i] + inexact)

@@ -91,14 +91,14 @@ def product(left: SmoothModel, right: SmoothModel) -> SmoothModel:
     for i, j, k in basis.products:
         P[k].addcmul_(left.P[i], right.P[j])
     g, h = left.degree_sizes(), right.degree_sizes()
-    G, H, rg, rh = sum(g), sum(h), left.radii[0], right.radii[0]
-    cut = sum(g[a] * h[b] for a in range(1, m + 1) for b in range(m + 1 - a, m + 1))
+    G, H, rg, rh = summed(g), summed(h), left.radii[0], right.radii[0]
+    cut = summed(g[a] * h[b] for a in range(1, m + 1) for b in range(m + 1 - a, m + 1))
     value = G * rh + H * rg + rg * rh + cut + ROUNDING * G * H
     slopes = []
     for i in range(basis.dim):
         dg, dh, sg, sh = left.slope_sizes(i), right.slope_sizes(i), left.radii[1 + i], right.radii[1 + i]
-        DG, DH = sum(dg), sum(dh)
-        tail = sum(dg[a] * h[b] + g[b] * dh[a] for a in range(m) for b in range(m - a, m + 1))
+        DG, DH = summed(dg), summed(dh)
+        tail = summed(dg[a] * h[b] + g[b] * dh[a] for a in range(m) for b in range(m - a, m + 1))
         spread = sg * (H + rh) + DG * rh + sh * (G + rg) + DH * rg
         slopes.append(spread + tail + m * ROUNDING * (DG * H + G * DH))
     return SmoothModel(P, upward(torch.stack([value, *slopes])), basis)
