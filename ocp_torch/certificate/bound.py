@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import wraps
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar, cast
 
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.estimate import Estimate
@@ -14,6 +14,7 @@ from ocp_torch.problems.needs import Need
 
 if TYPE_CHECKING:
     from ocp_torch.certificate.context import Context
+    from ocp_torch.certificate.external.dataset import RecordedContext
 
 # The sides, named as `certificate.json` names them: below `OPT`, above `OPT` and the controller's performance, and below
 # that performance.
@@ -73,6 +74,11 @@ def once(compute: Callable[[Context], T]) -> Callable[[Context], T]:
         return context.results[compute]
 
     return kept
+
+
+def recorded(context: Context) -> RecordedContext:
+    """``context``, for bounds that apply only where it is `recorded`: no other kind is."""
+    return cast("RecordedContext", context)  # its module imports bounds, so that its class cannot be asked for here
 
 
 def sentence_on(what: str, found: Extremum) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ocp_torch.certificate import bounds
 from ocp_torch.certificate.checks.assumptions import Assumptions
-from ocp_torch.certificate.estimate import CONFIDENCE, Estimate, known
+from ocp_torch.certificate.estimate import CONFIDENCE, Estimate, known, known_of
 from ocp_torch.certificate.gap import best, relative_gap, share
 from ocp_torch.certificate.run import Run
 from ocp_torch.certificate.schema import to_dict
@@ -70,20 +70,20 @@ class Certificate:
     @property
     def best_upper(self) -> tuple[str, float] | None:
         """The bound on the controller handed out that counts with the lowest upper end, and that end; no simulation."""
-        usable = {n: e for n, e in self.upper.items() if self.counts(n) and self.speaks.get(n, True)}
-        return best(min, {n: self._ends(e)[1] for n, e in usable.items() if known(e)})
+        usable = lambda name: self.counts(name) and self.speaks.get(name, True)
+        return best(min, {n: self._ends(e)[1] for n, e in known_of(self.upper).items() if usable(n)})
 
     @property
     def best_perf(self) -> tuple[str, float] | None:
         """The controller handed out and the upper end of its simulated performance, bias included, if that counts."""
         name = self.controller
-        return None if name is None or not self.stands else (name, self._ends(self.perf[name])[1])
+        return None if name is None or not self.stands else (name, self._ends(known_of(self.perf)[name])[1])
 
     @property
     def controller(self) -> str | None:
         """The controller that all this is about: the ``subject``, or the one with the smallest simulated performance."""
         mine = lambda name: self.subject is None or name == self.subject
-        found = best(min, {n: self._ends(e)[1] for n, e in self.perf.items() if known(e) and mine(n)})
+        found = best(min, {n: self._ends(e)[1] for n, e in known_of(self.perf).items() if mine(n)})
         return None if found is None else found[0]
 
     @property
@@ -107,7 +107,7 @@ class Certificate:
         lower, perf = self.best_lower, self.best_perf
         if lower is None or perf is None:
             return None
-        values = self.lower[lower[0]].value, self.perf[perf[0]].value
+        values = known_of(self.lower)[lower[0]].value, known_of(self.perf)[perf[0]].value
         return relative_gap(*((name, value) for (name, _), value in zip((lower, perf), values, strict=True)))
 
     @property
@@ -116,17 +116,18 @@ class Certificate:
         level of ``confidence`` (the level of each interval that enters is raised accordingly); `None` where unknown.
         ``takes`` are the sentences on what else the two rest on."""
         perf, lower, upper = self.best_perf, self.best_lower, self.best_upper
-        perfs = [e for e in self.perf.values() if known(e)]
+        perfs = known_of(self.perf)
         level = 1.0 - (1.0 - self.confidence) / (len(perfs) + 2)
-        found = {"at_least": None, "at_most": None, "takes": []}
+        found: dict[str, float | list[str] | None] = {"at_least": None, "at_most": None, "takes": []}
         if perf is None:
             return found
-        low, high = self.perf[perf[0]].interval(level)
+        low, high = perfs[perf[0]].interval(level)
         # Whatever any controller costs, OPT does not exceed it.
-        above = [e.interval(level)[1] for e in perfs] + ([self.upper[upper[0]].interval(level)[1]] if upper else [])
+        above = [e.interval(level)[1] for e in perfs.values()]
+        above += [known_of(self.upper)[upper[0]].interval(level)[1]] if upper else []
         if min(above) > 0.0:
             found["at_least"] = max(0.0, low / min(above) - 1.0)
-        if lower is not None and (under := self.lower[lower[0]].interval(level)[0]) > 0.0:
+        if lower is not None and (under := known_of(self.lower)[lower[0]].interval(level)[0]) > 0.0:
             found["at_most"] = max(0.0, high / under - 1.0)
             found["takes"] = [need.sentence for need in self.needs(lower[0])]
         return found
@@ -145,7 +146,7 @@ class Certificate:
     def hold(self) -> bool:
         """Whether every check passed, what each number rests on holds, and no two bounds contradict each other; a guess that
         is not used is no matter."""
-        shown = [name for side in (self.lower, self.upper) for name, estimate in side.items() if known(estimate)]
+        shown = [*known_of(self.lower), *known_of(self.upper)]
         needs = [need for name in shown for need in self.needs(name) if need.basis != GUESSED]
         return self.assumptions.hold and all(need.holds for need in needs) and self.contradiction is None
 
@@ -162,4 +163,4 @@ class Certificate:
 
     def _highest(self, usable) -> tuple[str, float] | None:
         """The lower bound with the highest lower end among those that are ``usable``."""
-        return best(max, {n: self._ends(e)[0] for n, e in self.lower.items() if known(e) and usable(n)})
+        return best(max, {n: self._ends(e)[0] for n, e in known_of(self.lower).items() if usable(n)})

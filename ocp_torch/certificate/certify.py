@@ -24,6 +24,7 @@ from ocp_torch.control.policies import Policy
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.recorded.dataset import Dataset
 
 
 def certify(context: Context) -> Certificate:
@@ -80,9 +81,16 @@ def certify_fields(
     The name of each part is given to ``progress`` as it begins. Raises `InputError` where weights are not finite.
     """
     require_finite(trained.fields)
-    kind = TrainedContext if problem.has_simulator else RecordedContext
-    made = {"problem": problem, "constants": constants, "settings": settings, "run": run, "progress": progress}
-    return certify(kind(trained=trained, **made))
+    context: Context
+    if isinstance(problem, Dataset):
+        context = RecordedContext(
+            problem=problem, constants=constants, settings=settings, run=run, progress=progress, trained=trained
+        )
+    else:
+        context = TrainedContext(
+            problem=problem, constants=constants, settings=settings, run=run, progress=progress, trained=trained
+        )
+    return certify(context)
 
 
 def certify_policy(
@@ -100,5 +108,14 @@ def certify_policy(
     ``network`` makes the networks for `V^u` and `mu^u`; the name of each part is given to ``progress`` as it begins. Raises
     `InputError` where the policy fails.
     """
-    made = {"problem": problem, "constants": constants, "settings": settings, "run": run, "progress": progress}
-    return certify(ControllerContext(policy=policy, value=value, network=network, **made))
+    context = ControllerContext(
+        problem=problem,
+        constants=constants,
+        settings=settings,
+        run=run,
+        progress=progress,
+        policy=policy,
+        value=value,
+        network=network,
+    )
+    return certify(context)

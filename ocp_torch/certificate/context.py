@@ -19,6 +19,7 @@ from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.progress import Progress, silent
 from ocp_torch.certificate.run import Run
 from ocp_torch.certificate.settings import CertificateSettings
+from ocp_torch.certificate.upper.density import DensityBounds
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.jets import Field
@@ -51,19 +52,45 @@ class Context:
     results: dict = field(default_factory=dict, init=False)  # of functions that bounds declare to be computed `once`
 
     recorded = external = False  # whether it is of recorded samples, or of a controller that somebody brings
-    coarse = False  # whether the controller computes in a precision too low for its divergence
     divergent = ""  # which bounds take a divergence, in words
-    occupation = subject = densities = None
-    if TYPE_CHECKING:  # properties of each kind
-        kind: str | None
-        value: Field | None  # `V` in float64
-        fitted: ClosedLoopBounds | None
-        hidden: Hidden | None
-        perf: dict[str, Estimate | None]
-        zero: Estimate | None
-        observed: Observed
-        notes: list[str]
-        remarks: list[str]
+    if TYPE_CHECKING:  # each kind gives these itself, as a field, a constant or a property
+
+        @property
+        def kind(self) -> str | None: ...
+        @property
+        def value(self) -> Field | None: ...  # `V` in float64
+        @property
+        def fitted(self) -> ClosedLoopBounds | None: ...
+        @property
+        def hidden(self) -> Hidden | None: ...
+        @property
+        def perf(self) -> dict[str, Estimate | None]: ...
+        @property
+        def zero(self) -> Estimate | None: ...
+        @property
+        def observed(self) -> Observed: ...
+        @property
+        def notes(self) -> list[str]: ...
+        @property
+        def remarks(self) -> list[str]: ...
+
+    @property
+    def subject(self) -> str | None:
+        return None
+
+    @property
+    def occupation(self) -> str | None:
+        return None
+
+    @property
+    def densities(self) -> DensityBounds | None:
+        """`J` and `G` of trained `w` and `mu`."""
+        return None
+
+    @property
+    def coarse(self) -> bool:
+        """Whether the controller computes in a precision too low for its divergence."""
+        return False
 
     @property
     def seed(self) -> int:
@@ -89,7 +116,7 @@ class Context:
         return replicated_samples(self.problem, count, self.settings.replicates, self.seed, divergences)
 
     @cached_property
-    def odd(self) -> Tensor:
+    def odd(self) -> Tensor | None:
         """States ``(K, d)`` where the problem's data are unlike elsewhere: narrow features that sampled states miss."""
         return odd_states(self.problem, self.settings.scanned(self.problem), self.seed)
 
@@ -155,7 +182,7 @@ class Context:
     @property
     def proved_C_V(self) -> float | None:
         """The `C_V` that the bounds of the closed loop prove for the controller, where it is used."""
-        return self.closed_loop.C_V if self.takes_fitted_J else None
+        return self.closed_loop.C_V if self.closed_loop and self.takes_fitted_J else None
 
     @cached_property
     def assumptions(self) -> Assumptions:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
+from typing import TypeGuard
 
 import numpy as np
 import torch
@@ -79,15 +80,21 @@ class Estimate:
 
     def to_dict(self, level: float | None = None) -> dict:
         """JSON form, with the interval at ``level`` if one is given; fields that do not apply are left out."""
+        extra: dict[str, float | str | list[float]]
         extra = {k: v for k, v in (("bias", self.bias), ("controller", self.controller)) if v is not None}
         if level is not None:
             extra |= {"half_width": self.half_width(level), "interval": list(self.interval(level))}
         return {"value": self.value, "se": self.se, **extra}
 
 
-def known(estimate: Estimate | None) -> bool:
+def known(estimate: Estimate | None) -> TypeGuard[Estimate]:
     """Whether there is a number."""
     return estimate is not None and estimate.finite
+
+
+def known_of(estimates: dict[str, Estimate | None]) -> dict[str, Estimate]:
+    """Those of ``estimates`` that are numbers."""
+    return {name: estimate for name, estimate in estimates.items() if known(estimate)}
 
 
 @torch.no_grad()

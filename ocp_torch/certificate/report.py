@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from ocp_torch.certificate import bounds
 from ocp_torch.certificate.bound import LOWER, PERFORMANCE, UPPER
 from ocp_torch.certificate.run import LONGEST_NAME
 from ocp_torch.errors import visible
 
 
-def table(certificate: dict, searches: list[str] = ()) -> str:
+def table(certificate: dict, searches: Sequence[str] = ()) -> str:
     """The certificate (as a dict of its schema) as a table for the terminal, and how its suprema were found."""
     exact = certificate["exact"]
     name = lambda key: visible(certificate[key], LONGEST_NAME)

@@ -17,7 +17,9 @@ SCHEMA = 2
 def to_dict(certificate: Certificate) -> dict:
     """The schema of ``certificate``, ready for JSON."""
     one = lambda e: e.to_dict(certificate.confidence) if known(e) else None
-    bound = lambda name, e: None if not known(e) else {**one(e), **standing(certificate, name)}
+    bound = lambda name, e: (
+        None if not known(e) else {**e.to_dict(certificate.confidence), **standing(certificate, name)}
+    )
     below = certificate.perf_lower
     return {
         "schema": SCHEMA,

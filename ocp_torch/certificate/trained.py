@@ -5,12 +5,15 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import nn
 
 from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
+
+M = TypeVar("M", bound=nn.Module)
 
 
 @dataclass(frozen=True)
@@ -26,10 +29,9 @@ class Trained:
         return in_float64(self.fields)
 
 
-def in_float64(fields: Fields) -> Fields:
+def in_float64(fields: M) -> M:
     """A frozen float64 copy on the CPU: what every bound is computed with."""
-    clone: nn.Module = copy.deepcopy(fields).to("cpu").double().requires_grad_(False)
-    return clone.eval()
+    return copy.deepcopy(fields).to("cpu").double().requires_grad_(False).eval()
 
 
 def require_finite(fields: Fields) -> None:

@@ -71,7 +71,7 @@ class TrainedContext(Context):
         if not self.settings.trajectories:
             return {}, None
         self.progress("simulation")
-        initial = None if self.value is None else self.sampled_value.initial
+        initial = None if self.sampled_value is None else self.sampled_value.initial
         return simulate_candidates(self.problem, self.policies, self.value, initial, self.settings, self.seed)
 
     @property
@@ -87,7 +87,7 @@ class TrainedContext(Context):
     def kind(self) -> str:
         """The controller with the lower performance, or the first where none is known."""
         known = {name: s.perf.above for name, s in self._simulated[0].items() if s.perf.finite}
-        return min(known, key=known.get, default=next(iter(self.policies)))
+        return min(known, key=known.__getitem__, default=next(iter(self.policies)))
 
     @property
     def has_densities(self) -> bool:
@@ -122,7 +122,8 @@ class TrainedContext(Context):
             fitted = in_float64(fit_closed_loop(problem, policy, trained.fields, trained.network, *how))
         except ArithmeticError as error:
             return None, [f"the certification stage failed: {error}"]
-        value, initial = (fitted.value, None) if self.value is None else (self.value, self.sampled_value.initial)
+        V = self.sampled_value
+        value, initial = (fitted.value, None) if V is None else (V.value, V.initial)
         return self.bounds_of(self.policies[kind], value, fitted.log_occupation, initial), []
 
     @property

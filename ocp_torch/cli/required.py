@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
@@ -23,7 +25,8 @@ def require_places(overrides: list[Override]) -> None:
 
 def require_sections(data: dict, config_name: str) -> dict:
     """``data``, if each group and field at the top of the configuration has a place in it; else `InputError`."""
-    file = OmegaConf.to_container(OmegaConf.load(CONFIGS / f"{config_name}.yaml"), resolve=False)
+    loaded = OmegaConf.load(CONFIGS / f"{config_name}.yaml")
+    file = cast(dict, OmegaConf.to_container(loaded, resolve=False))  # at the top of our own files there are names
     chosen = [item for entry in file.pop("defaults", []) if isinstance(entry, dict) for item in entry.items()]
     groups = [(key.partition("@")[2] or key).split(".")[0] for key, choice in chosen if choice is not None]
     for name in dict.fromkeys([*groups, *file]):

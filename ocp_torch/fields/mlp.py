@@ -46,6 +46,9 @@ class PeriodicMLP(nn.Module):
     starts near the constant ``shift``.
     """
 
+    shift: Tensor
+    scale: Tensor
+
     def __init__(
         self,
         dim: int,

@@ -40,7 +40,7 @@ def discounted_integral(
     time = lambda s: horizon * s**grading
     pace = lambda s: horizon * grading * s ** (grading - 1.0)
     weight = lambda s: rho * math.exp(-rho * time(s)) * pace(s)
-    x, total, ds = x0, 0.0, 1.0 / steps
+    x, total, ds = x0, x0.new_zeros(()), 1.0 / steps
     for k in range(steps):
         start, middle, end = k * ds, (k + 0.5) * ds, (k + 1.0) * ds
         x, (r1, r2, r3, r4) = _step(dynamics, x, tuple(ds * pace(s) for s in (start, middle, end)))
@@ -61,7 +61,7 @@ def rate_at(
     window = max(1, steps // 4)
     h, ds = (times / steps).unsqueeze(-1), 1.0 / steps
     weight = lambda s: s * (rho * times * (1.0 - s)).exp()
-    x, total = x0, 0.0
+    x, total = x0, x0.new_zeros(())
     for k in range(steps):
         x, (r1, r2, r3, r4) = _step(dynamics, x, (h, h, h))
         if k >= steps - window:

@@ -8,6 +8,8 @@ import inspect
 class Reproducible:
     """Remembers what it was made of, so that ``type(x)(**x.parameters)`` makes it again."""
 
+    _given: tuple[tuple, dict]  # what `__init__` was called with
+
     def __new__(cls, *args, **kwargs) -> Reproducible:
         made = super().__new__(cls)
         made._given = args, kwargs

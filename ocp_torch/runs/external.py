@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -96,7 +95,7 @@ def train_value(
     stepper, average = short_fit(fields, objective, lr, steps, cost_unit(problem))
     for step in range(steps):
         advance(stepper, average, batches.draw, Phase(constants, step / steps))
-    return cast(Fields, average.module)
+    return average.module
 
 
 def policy_of(controller: Callable | Controller, problem: Problem) -> Policy:

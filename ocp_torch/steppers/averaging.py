@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
 
-from torch import Tensor, nn
+from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_multi_avg_fn
 
 from ocp_torch.errors import require_choice, require_number
+from ocp_torch.fields.fields import Fields
 
 # A memory of about 1 / (1 - decay) = 50 steps: a longer one lags behind the last steps of the cosine schedule.
 DECAY = 0.98
@@ -20,13 +21,15 @@ MOST_DECAY = 0.999999
 class Average(AveragedModel):
     """The average of the iterates that were counted is in ``module``."""
 
+    module: Fields
+
     def count(self, iterate: Sequence[Tensor]) -> None:
         """Take ``iterate``, all parameters in the order of those of the fields, into the average."""
         alike: Any = SimpleNamespace(parameters=lambda: iterate, buffers=self.module.buffers)
         self.update_parameters(alike)
 
 
-def averaged(fields: nn.Module, kind: str = "ema", decay: float = DECAY) -> Average:
+def averaged(fields: Fields, kind: str = "ema", decay: float = DECAY) -> Average:
     """A running average of ``fields``: ``ema`` (exponential with ``decay``), ``uniform`` as in the paper, or ``none``.
 
     Raises `InputError` for another ``kind``, or a ``decay`` outside of [0, 0.999999].

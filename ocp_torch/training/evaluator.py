@@ -6,7 +6,6 @@ import copy
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import cast
 
 from torch import nn
 
@@ -48,7 +47,7 @@ class Evaluator:
     @property
     def fields(self) -> Fields:
         """The averaged fields as they stand."""
-        return cast(Fields, self.state.average.module)
+        return self.state.average.module
 
     def certify(
         self,

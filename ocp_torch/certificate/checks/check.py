@@ -46,11 +46,11 @@ def check_assumptions(
     control_holds = observed.sup_control is None or observed.sup_control <= constants.C_u * (1.0 + TOLERANCE)
     if not control_holds:
         warnings.append(f"the control reaches {observed.sup_control:.4g}, beyond C_u = {constants.C_u:.4g}.")
-    jumps = jump is not None and jump.size > 0.0
-    if jumps:
-        at = [round(c, 4) for c in jump.x[:6].tolist()] + (["..."] if len(jump.x) > 6 else [])
+    jumps = jump if jump is not None and jump.size > 0.0 else None
+    if jumps is not None:
+        at = [round(c, 4) for c in jumps.x[:6].tolist()] + (["..."] if len(jumps.x) > 6 else [])
         warnings.append(
-            f"J and the Lagrangian bound are not used: the {jump.what} {jump.verb} by {jump.size:.3g}, at "
+            f"J and the Lagrangian bound are not used: the {jumps.what} {jumps.verb} by {jumps.size:.3g}, at "
             f"x = {at} for one, and they need all to be without jumps."
         )
     assumptions = Assumptions(
@@ -62,7 +62,7 @@ def check_assumptions(
         occupation_holds=M_holds or not uses_M,
         value_holds=value_holds or not uses_C_V,
         control_holds=control_holds or not uses_C_V,
-        regular_holds=not jumps and (posed is None or posed.smooth_seam),
+        regular_holds=jumps is None and (posed is None or posed.smooth_seam),
         cost_holds=posed is None or posed.nonnegative,
         problem_holds=posed is None or posed.sound,
         a_priori_sup_occupation=observed.a_priori_occupation,

@@ -6,7 +6,7 @@ from dataclasses import replace
 from itertools import product
 
 from ocp_torch.certificate.certificate import Certificate
-from ocp_torch.certificate.estimate import Estimate, known
+from ocp_torch.certificate.estimate import Estimate, known_of
 from ocp_torch.problems.needs import GUESSED
 
 # Bounds contradict each other where their intervals at this joint level are apart,
@@ -22,9 +22,9 @@ def examined(certificate: Certificate) -> Certificate:
         return certificate
     truth = {} if certificate.exact is None else {"OPT": Estimate(certificate.exact, 0.0)}
     # Whatever any controller costs, doing nothing included, OPT does not exceed it.
-    above = {n: e for n, e in certificate.upper.items() if known(e) and certificate.counts(n)}
-    above |= {f"Perf ({n})": e for n, e in (certificate.perf | certificate.baseline).items() if known(e)}
-    lower = {n: e for n, e in certificate.lower.items() if known(e)}
+    above = {n: e for n, e in known_of(certificate.upper).items() if certificate.counts(n)}
+    above |= {f"Perf ({n})": e for n, e in known_of(certificate.perf | certificate.baseline).items()}
+    lower = known_of(certificate.lower)
     below = {n: e for n, e in lower.items() if certificate.counts(n)}
     sound = [*product(below.items(), (above | truth).items()), *product(truth.items(), above.items())]
     supposed = {n: e for n, e in lower.items() if certificate.conditional(n)}

@@ -19,6 +19,7 @@ from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.maths.mixture_fit import concentrated
 from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.maths.seeds import Branch, derive_seed
+from ocp_torch.maths.sums import summed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.starts import UNIFORM_STATES, evaluation_distribution
@@ -64,7 +65,8 @@ def notes_on(estimates: dict[str, Estimate | None]) -> list[str]:
 class Judged(Protocol):
     """A result with the weighted integrands per set of each of its means, as parts of the answer."""
 
-    contributions: list[list[Tensor]]
+    @property
+    def contributions(self) -> list[list[Tensor]]: ...
 
 
 R = TypeVar("R", bound=Judged)
@@ -78,7 +80,7 @@ def sharpened(evaluate: Callable[[list[Samples]], R], problem: Problem, sets: li
         rare = [c for c in found.contributions if rarity(torch.cat(c), 1.0) > 0.0]
         if not rare:
             break
-        away = sum((torch.cat(c) - torch.cat(c).mean()).abs() for c in rare)
+        away = summed((torch.cat(c) - torch.cat(c).mean()).abs() for c in rare)
         x, weight = (torch.cat([getattr(s, name) for s in sets]) for name in ("x", "weight"))
         policy = concentrated(x, away, 1.0 / weight)
         known = evaluation_distribution(problem)

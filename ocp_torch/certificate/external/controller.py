@@ -88,12 +88,13 @@ class ControllerContext(Context):
         if not number:
             return {}, None
         own = None if self._fit is None else self._fit.value
-        found = {GIVEN: (self.policy, own, self._initial)}
-        if self.value is not None:
-            found["value"] = (ValuePolicy(self.problem, self.value), self.value, self.sampled_value.initial)
+        found: dict[str, tuple[Policy, Field | None, list[float] | None]] = {GIVEN: (self.policy, own, self._initial)}
+        if self.sampled_value is not None:
+            V = self.sampled_value
+            found["value"] = (ValuePolicy(self.problem, V.value), V.value, V.initial)
         self.progress("simulation")
         zero = self._simulate(zero_policy(self.problem), few_trajectories(self.settings))
-        return {name: self._simulate(policy, number, *rest) for name, (policy, *rest) in found.items()}, zero.perf
+        return {n: self._simulate(policy, number, V, mean) for n, (policy, V, mean) in found.items()}, zero.perf
 
     def _simulate(
         self, policy: Policy, number: int, value: Field | None = None, initial: list[float] | None = None
@@ -116,7 +117,7 @@ class ControllerContext(Context):
         found, _ = self._simulated
         self.progress("assumptions")
         met = observe(self.problem, self.policy, found.get(GIVEN), self.few, self.posed, 0)
-        if "value" not in found:
+        if self.value is None or "value" not in found:
             return met
         # M is about the optimal controller, which the one from V is nearer to than anybody's.
         best, states = ValuePolicy(self.problem, self.value), self.settings.occupation_states

@@ -18,6 +18,7 @@ from ocp_torch.certificate.checks.observed import Observed
 from ocp_torch.certificate.checks.regularity import largest_jump
 from ocp_torch.certificate.checks.wellposed import WellPosed
 from ocp_torch.certificate.context import Context
+from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.trained import Trained
 from ocp_torch.certificate.upper.recorded import RecordedFit, fit_recorded
 from ocp_torch.control.policies import NETWORK, Policy, trained_policies
@@ -43,7 +44,7 @@ class RecordedContext(Context):
     exact = sampled_value = fitted = zero = None
 
     @property
-    def perf(self) -> dict[str, None]:
+    def perf(self) -> dict[str, Estimate | None]:
         return {"value": None, "density": None}
 
     @cached_property
@@ -71,15 +72,14 @@ class RecordedContext(Context):
     def subject(self) -> str | None:
         return self.kind
 
-    def policy_of(self, fields: Fields) -> Policy | None:
-        """The controller handed out, in the precision of ``fields``."""
-        if self.kind is None:
-            return None
-        return trained_policies(self.trained.occupation, self.problem, fields, self.constants)[self.kind]
+    def policy_of(self, kind: str, fields: Fields) -> Policy:
+        """The controller ``kind``, in the precision of ``fields``."""
+        return trained_policies(self.trained.occupation, self.problem, fields, self.constants)[kind]
 
     @cached_property
     def policy(self) -> Policy | None:
-        return self.policy_of(self.fields)
+        """The controller handed out."""
+        return None if self.kind is None else self.policy_of(self.kind, self.fields)
 
     @cached_property
     def _fit(self) -> tuple[RecordedFit | None, list[str]]:
@@ -92,7 +92,7 @@ class RecordedContext(Context):
         if not self.settings.stage.steps:
             return None, []
         try:
-            return fit_recorded(self), []
+            return fit_recorded(self, self.kind), []
         except ArithmeticError as error:
             return None, [f"the certification stage failed: {error}"]
 
@@ -129,7 +129,7 @@ class RecordedContext(Context):
     def assumptions(self) -> Assumptions:
         _, has_J = self.uses
         basis = self.checked.basis | {"C_V": SEARCHED}
-        return replace(self.checked, C_V=self.fit.C_V if has_J else None, basis=basis)
+        return replace(self.checked, C_V=self.fit.C_V if self.fit and has_J else None, basis=basis)
 
     @property
     def notes(self) -> list[str]:

@@ -83,7 +83,7 @@ def mollified_shift(
     looks = {radius: on_few(radius) for radius in RADII}
     best = own
     for _ in range(TRIALS):
-        radius = max(looks, key=looks.get)
+        radius = max(looks, key=looks.__getitem__)
         if looks[radius] <= best.bound:
             break
         tried = _shift(problem, value, radius, sets, worst, ascents)

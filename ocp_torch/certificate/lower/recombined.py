@@ -10,6 +10,7 @@ one's ascents found. What the bound is in the end is measured on other states, a
 from __future__ import annotations
 
 import math
+from typing import Protocol, TypeGuard
 
 import torch
 from torch import Tensor
@@ -32,10 +33,24 @@ ROUNDS, ITERATIONS, ASCENTS, SHARPER = 5, 60, 128, 0.4
 NEGLIGIBLE = 1e-6
 
 
+class Recombinable(Protocol):
+    """A `V` whose last layer combines features."""
+
+    def __call__(self, x: Tensor) -> Tensor: ...
+
+    def features(self, x: Tensor) -> Tensor: ...
+
+    def shifted_by(self, weights: Tensor) -> Field: ...
+
+
+def shows_features(value: Field) -> TypeGuard[Recombinable]:
+    return hasattr(value, "features")
+
+
 class Program:
     """`c -> Q_W` at a growing set of states, in an orthonormal basis of the directions in which it moves."""
 
-    def __init__(self, problem: Problem, value: Field, x: Tensor) -> None:
+    def __init__(self, problem: Problem, value: Recombinable, x: Tensor) -> None:
         self.problem, self.value = problem, value
         samples, self.parts, moved, pushed, features = self._evaluated(x)
         rows = torch.cat([moved - moved.mean(dim=0), *pushed.unbind(dim=1)]) / math.sqrt(len(x))
@@ -79,7 +94,7 @@ class Program:
 @torch.no_grad()
 def recombined(problem: Problem, value: Field, seed: int) -> Field | None:
     """`W` for ``value`` `V` in float64; `None` where its model does not show its features, or no weights were found."""
-    if not hasattr(value, "features"):
+    if not shows_features(value):
         return None
     width = value.features(torch.zeros(1, problem.dim, dtype=torch.float64)).shape[1]
     count = min(STATES, NUMBERS // (width * (problem.control_dim + 2)))

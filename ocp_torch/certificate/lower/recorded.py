@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ocp_torch.certificate.bound import recorded
 from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.lower.penalised import PenalisedDual
@@ -20,7 +21,7 @@ class RecordedDual(PenalisedDual):
     def evaluate(self, context: Context) -> Estimate | None:
         if context.value is None:
             return None
-        return penalised(context.problem, context.value, context.constants.M, context.sets)
+        return penalised(context.problem, context.value, context.constants.M, recorded(context).sets)
 
 
 def penalised(problem: Problem, value: Field, M: float, sets: list[Samples]) -> Estimate:

@@ -54,7 +54,8 @@ class SlackParts:
     @staticmethod
     def join(parts: list[SlackParts]) -> SlackParts:
         names = ("x", "initial", "value", "f", "push")
-        return SlackParts(*(torch.cat([getattr(p, n) for p in parts]) for n in names), parts[0].cost)
+        x, initial, value, f, push = (torch.cat([getattr(p, n) for p in parts]) for n in names)
+        return SlackParts(x, initial, value, f, push, parts[0].cost)
 
     def slack(self, theta: float) -> Tensor:
         """`Q_{theta V}`, ``(N,)``."""

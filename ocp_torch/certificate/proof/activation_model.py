@@ -11,6 +11,7 @@ from ocp_torch.certificate.proof.activations import SERIES
 from ocp_torch.certificate.proof.monomials import Monomials
 from ocp_torch.certificate.proof.rounding import ROUNDING, upward
 from ocp_torch.certificate.proof.smooth_model import SmoothModel
+from ocp_torch.maths.sums import summed
 
 
 def activate(model: SmoothModel, activation: nn.Module) -> SmoothModel:
@@ -23,7 +24,7 @@ def activate(model: SmoothModel, activation: nn.Module) -> SmoothModel:
     sizes = [c.abs() + e for c, e in zip(s, errors, strict=True)]
     sizes[0] = sizes[0] + errors[0] * z.abs()
     levels, r0 = model.degree_sizes()[1:], model.radii[0]
-    reach = upward(sum(levels))
+    reach = upward(summed(levels))
     wide = upward(reach + r0)
     # Suprema over the range of h: of |sigma'|, |sigma''| and |sigma^{(m+1)}| / (m+1)!.
     beyond = sigma.ceiling(m + 2)
@@ -38,13 +39,13 @@ def activate(model: SmoothModel, activation: nn.Module) -> SmoothModel:
     known = _polynomial([*sizes[: m + 1]], reach)
     varying = known - sizes[0]
     wrong = reach * _polynomial([torch.full_like(z, e) for e in errors[1 : m + 1]], reach)
-    slopes, cut_total = [], 0.0
+    slopes, cut_total = [], torch.zeros_like(z)
     for i in range(basis.dim):
         own = model.slope_sizes(i)
-        total = sum(own)
+        total = summed(own)
         cut = derivative[m] * total
         for a in range(1, m):
-            cut = cut + derivative[a] * sum(own[m - a :])
+            cut = cut + derivative[a] * summed(own[m - a :])
         cut_total = cut_total + cut
         inexact = m * (ROUNDING * (varying + ROUNDING * known) + wrong)
         slopes.append(moved * total + cut + first * model.radii[1 + i] + inexact)
@@ -75,9 +76,9 @@ def _composed(P: Tensor, series: list[Tensor], basis: Monomials) -> Tensor:
 
 def _majorant(coefficients: list[Tensor], levels: list[Tensor], m: int) -> list[Tensor]:
     """Of `sum_k c_k (sum_j levels_j tau^j)^k` with everything >= 0: degrees `0 ... m - 1`, then all the rest together."""
-    total = sum(levels)
+    total = summed(levels)
     result = [coefficients[-1]]  # by degree; the tail starts empty
-    tail = 0.0
+    tail = torch.zeros_like(total)
     for c in reversed(coefficients[:-1]):
         grown: list = [c] + [0.0] * (m - 1)
         grown_tail = tail * total
@@ -90,4 +91,4 @@ def _majorant(coefficients: list[Tensor], levels: list[Tensor], m: int) -> list[
         # Degrees that cannot occur yet stay out.
         result, tail = grown[: min(m, len(grown))], grown_tail
     result = result + [torch.zeros_like(total)] * (m - len(result))
-    return [*result, tail + torch.zeros_like(total)]
+    return [*result, tail]

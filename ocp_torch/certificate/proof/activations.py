@@ -9,6 +9,8 @@ accurate to 16 units in the last place.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -153,4 +155,20 @@ class Silu:
         return 1.93 * (2.0 / math.pi) ** (k - 1) / k * UP
 
 
-SERIES = {torch.nn.GELU: Gelu, torch.nn.Tanh: Tanh, torch.nn.Softplus: Softplus, torch.nn.SiLU: Silu}
+class Series(Protocol):
+    """What each of them gives, for derivatives up to an order."""
+
+    def series(self, z: Tensor, order: int) -> list[Tensor]: ...
+
+    def error(self, k: int) -> float: ...
+
+    def ceiling(self, k: int) -> float: ...
+
+
+Activation = type[torch.nn.Module]
+SERIES: dict[Activation, Callable[[int], Series]] = {
+    torch.nn.GELU: Gelu,
+    torch.nn.Tanh: Tanh,
+    torch.nn.Softplus: Softplus,
+    torch.nn.SiLU: Silu,
+}

@@ -5,6 +5,8 @@ What is enclosed is the function that the float64 weights define in real arithme
 
 from __future__ import annotations
 
+from typing import TypeGuard
+
 from torch import nn
 
 from ocp_torch.certificate.proof.activation_model import activate
@@ -15,7 +17,7 @@ from ocp_torch.certificate.proof.taylor import TaylorModel
 from ocp_torch.fields.mlp import Gated, PeriodicMLP
 
 
-def is_known(network: nn.Module) -> bool:
+def is_known(network: object) -> TypeGuard[PeriodicMLP]:
     """Whether `network_model` encloses ``network``: the package's own scalar perceptron with activations in plain form."""
     return type(network) is PeriodicMLP and network.scalar and all(map(_known, network.body.modules()))
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import torch
-from torch import nn
 
 from ocp_torch.certificate.proof.box import Box, equal_cells
 from ocp_torch.certificate.proof.cover import DEGREE
 from ocp_torch.certificate.proof.enclosures import conjugate_model, contradiction, enclosure
 from ocp_torch.certificate.proof.network_model import is_known
+from ocp_torch.maths.jets import Field
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.problem import Problem
 
@@ -19,7 +19,7 @@ MOST_DIMENSIONS = 2
 SPOT_CELLS, SPOT_SIZES = 16, (1.0, 2.0**-8)
 
 
-def obstacle(problem: Problem, value: nn.Module) -> str | None:
+def obstacle(problem: Problem, value: Field) -> str | None:
     """Why there can be no rigorous bound for ``value`` on ``problem``; `None` where there can."""
     if problem.dim > MOST_DIMENSIONS:
         return f"cells cover the torus in at most {MOST_DIMENSIONS} dimensions, and this problem has {problem.dim}"

@@ -21,10 +21,12 @@ from torch import Tensor
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.lower.shifted import slack_function
 from ocp_torch.certificate.proof.cover import CHUNK, Cover
+from ocp_torch.certificate.proof.network_model import is_known
 from ocp_torch.certificate.proof.obstacle import obstacle
 from ocp_torch.certificate.proof.rounding import ROUNDING, upward
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.mlp import PeriodicMLP
+from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.problem import Problem
@@ -98,7 +100,7 @@ class _Finished:
 
 def rigorous_lower_bound(
     problem: Problem,
-    value: PeriodicMLP,
+    value: Field,
     *,
     theta: float = 1.0,
     sampled_slack: float | None = None,
@@ -114,7 +116,7 @@ def rigorous_lower_bound(
     ``tolerance`` or a number of ``cells`` that is not positive.
     """
     require_integer("certificate.rigorous cells", cells, 1)
-    if obstacle(problem, value) is not None:
+    if not is_known(value) or obstacle(problem, value) is not None:
         return None
     tolerance = TOLERANCE[problem.dim] if tolerance is None else tolerance
     require_number("certificate.rigorous tolerance", tolerance, above=0.0)

@@ -18,6 +18,7 @@ from ocp_torch.certificate.proof.box import Box
 from ocp_torch.certificate.proof.monomials import Monomials
 from ocp_torch.certificate.proof.rounding import ROUNDING, upward
 from ocp_torch.certificate.proof.taylor import TaylorModel
+from ocp_torch.maths.sums import summed
 
 # Room in the rounding of a dot product of n terms: it is bounded as if it had so many more.
 EXTRA_TERMS = 8
@@ -75,8 +76,8 @@ def affine(model: SmoothModel, weight: Tensor, bias: Tensor) -> SmoothModel:
     gamma = 2.0 * (weight.shape[1] + EXTRA_TERMS) * 2.0**-53
     P = model.P @ weight.T
     P[0] += bias
-    slopes = [sum(model.slope_sizes(i)) for i in range(model.basis.dim)]
-    rounded = gamma * torch.stack([sum(model.degree_sizes()), *slopes])
+    slopes = [summed(model.slope_sizes(i)) for i in range(model.basis.dim)]
+    rounded = gamma * torch.stack([summed(model.degree_sizes()), *slopes])
     radii = (model.radii + rounded) @ weight.abs().T
     radii[0] += ROUNDING * P[0].abs() + gamma * bias.abs()
     # The last factor makes up for the rounding of the radii's own dot products.
@@ -90,14 +91,14 @@ def product(left: SmoothModel, right: SmoothModel) -> SmoothModel:
     for i, j, k in basis.products:
         P[k].addcmul_(left.P[i], right.P[j])
     g, h = left.degree_sizes(), right.degree_sizes()
-    G, H, rg, rh = sum(g), sum(h), left.radii[0], right.radii[0]
-    cut = sum(g[a] * h[b] for a in range(1, m + 1) for b in range(m + 1 - a, m + 1))
+    G, H, rg, rh = summed(g), summed(h), left.radii[0], right.radii[0]
+    cut = summed(g[a] * h[b] for a in range(1, m + 1) for b in range(m + 1 - a, m + 1))
     value = G * rh + H * rg + rg * rh + cut + ROUNDING * G * H
     slopes = []
     for i in range(basis.dim):
         dg, dh, sg, sh = left.slope_sizes(i), right.slope_sizes(i), left.radii[1 + i], right.radii[1 + i]
-        DG, DH = sum(dg), sum(dh)
-        tail = sum(dg[a] * h[b] + g[b] * dh[a] for a in range(m) for b in range(m - a, m + 1))
+        DG, DH = summed(dg), summed(dh)
+        tail = summed(dg[a] * h[b] + g[b] * dh[a] for a in range(m) for b in range(m - a, m + 1))
         spread = sg * (H + rh) + DG * rh + sh * (G + rg) + DH * rg
         slopes.append(spread + tail + m * ROUNDING * (DG * H + G * DH))
     return SmoothModel(P, upward(torch.stack([value, *slopes])), basis)

@@ -55,9 +55,8 @@ class TaylorModel:
     def __getitem__(self, index) -> TaylorModel:
         """Entries of the axes after the cells."""
         index = index if isinstance(index, tuple) else (index,)
-        return TaylorModel(
-            self.coefficients[(slice(None), slice(None), *index)], self.radius[(slice(None), *index)], self.basis
-        )
+        every = (slice(None),)
+        return TaylorModel(self.coefficients[every + every + index], self.radius[every + index], self.basis)
 
     def __neg__(self) -> TaylorModel:
         return TaylorModel(-self.coefficients, self.radius, self.basis)

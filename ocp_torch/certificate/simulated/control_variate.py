@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.fields.waves import STATES, standardised, waves_of
+from ocp_torch.maths.sums import summed
 
 # Waves in the fit, and states evaluated at once.
 WAVES, CHUNK = 96, 8192
@@ -39,7 +40,8 @@ def integrals(states: list[Tensor], values: list[Tensor], weights: list[Tensor] 
 
 def _moments(x: Tensor, v: Tensor, waves: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Sums of `(1, phi)`, of `phi phi^T` with the constant, and of `(1, phi) v` over one set."""
-    gram, right = 0.0, 0.0
+    count = 1 + 2 * len(waves)
+    gram, right = v.new_zeros(count, count), v.new_zeros(count)
     for part, value in zip(x.split(CHUNK), v.split(CHUNK), strict=True):
         angles = 2.0 * math.pi * (part @ waves.T)
         phi = torch.cat([torch.ones_like(part[:, :1]), angles.cos(), angles.sin()], dim=1)
@@ -49,6 +51,6 @@ def _moments(x: Tensor, v: Tensor, waves: Tensor) -> tuple[Tensor, Tensor, Tenso
 
 def _fit(moments: list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
     """Least-squares coefficients of the waves, beside a constant."""
-    gram, right = sum(g for _, g, _ in moments), sum(r for *_, r in moments)
+    gram, right = summed(g for _, g, _ in moments), summed(r for *_, r in moments)
     ridge = 1e-10 * gram[0, 0] * torch.eye(len(gram), dtype=gram.dtype)
     return torch.linalg.solve(gram + ridge, right)[1:]

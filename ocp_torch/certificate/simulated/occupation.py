@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.runge_kutta import Dynamics, discounted_integral
 from ocp_torch.maths.seeds import fixed_generator
+from ocp_torch.maths.sums import summed
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.problem import Problem
@@ -38,7 +40,7 @@ def velocity_and_divergence(velocity: Callable[[Tensor], Tensor], x: Tensor) -> 
     """
     dim, moves = x.shape[1], DIFFERENCE * torch.eye(x.shape[1], dtype=x.dtype)
     here, *moved = velocity(torch.cat([x, *(x + move for move in moves)])).chunk(dim + 1)
-    return here, sum((g[:, i] - here[:, i]) / DIFFERENCE for i, g in enumerate(moved))
+    return here, summed((g[:, i] - here[:, i]) / DIFFERENCE for i, g in enumerate(moved))
 
 
 def _backward(problem: Problem, policy: Policy) -> Dynamics:
@@ -84,12 +86,12 @@ def settled_occupation(problem: Problem, policy: Policy, x: Tensor) -> Tensor:
         pieces.append(piece)
         # From here on the discount of the time that has passed is part of the factor.
         state = torch.cat([state[:, :-1].remainder(1.0), state[:, -1:] - PIECE], dim=-1)
-        if bool((piece <= SETTLED * sum(pieces)).all()):
-            return sum(pieces)
-    before, last = sum(pieces[-4:-2]), sum(pieces[-2:])
+        if bool((piece <= SETTLED * summed(pieces)).all()):
+            return summed(pieces)
+    before, last = summed(pieces[-4:-2]), summed(pieces[-2:])
     ratio = last / before.clamp_min(1e-300)
     rest = torch.where(ratio < 1.0, last * ratio / (1.0 - ratio), math.inf)
-    return sum(pieces) + torch.where(last > SETTLED * sum(pieces), rest, 0.0)
+    return summed(pieces) + torch.where(last > SETTLED * summed(pieces), rest, 0.0)
 
 
 def estimated_sup_occupation(problem: Problem, policy: Policy, end_states: Tensor, states: int) -> float:
@@ -123,5 +125,6 @@ def a_priori_sup_occupation(problem: Problem, policy: Policy, points: Tensor) ->
     largest = lambda function: (
         supremum(function, points, ascents=ASCENTS, steps=ASCENT_STEPS, differentiable=False).value
     )
-    excess = problem.discount - max(0.0, largest(lambda x: -loop.drift_divergence(x)))
+    contraction = lambda x: -cast(Tensor, loop.drift_divergence(x))  # there is one: the problem gives divergences
+    excess = problem.discount - max(0.0, largest(contraction))
     return problem.discount * largest(problem.initial_density) / excess if excess > 0.0 else None

@@ -71,8 +71,7 @@ def _dynamics(problem: Problem, policy: Policy, value: Field | None) -> Dynamics
         x, summed = state[:, :-1], state[:, -1]
         samples = Samples.of(problem, x, divergences=False)
         generator, V = Generator.of(problem, samples), jets.jet(value, x)
-        own = isinstance(policy, ValuePolicy) and policy.value is value
-        u = policy.control(samples.B, V) if own else policy(x)
+        u = policy.control(samples.B, V) if isinstance(policy, ValuePolicy) and policy.value is value else policy(x)
         velocity = samples.a + torch.einsum("ndm,nm->nd", samples.B, u)
         slack = generator.bellman_slack(V, u)
         change = (V.gradient * velocity).sum(dim=-1, keepdim=True)
@@ -145,18 +144,17 @@ def simulate_performance(
         integrate = lambda rows, count: discounted_integral(
             dynamics, state[rows], rho, longest, count, wrap=False, grading=GRADING
         )
-    if value is not None:
-        integrate = Sliding(integrate, len(x0), tolerance * size)
+    sliding = None if value is None else Sliding(integrate, len(x0), tolerance * size)
     speed = float(velocity.norm(dim=-1).max())
     steps = max(FEWEST_STEPS, 2 * math.ceil(0.5 * longest * max(rho / DISCOUNTED, speed / MOVED)))
     generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT))
     means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
     noise = lambda results: Estimate.of(means(results).tolist()).se
-    result, end, bias = refined(integrate, mass, steps, tolerance * size, generator, noise)
+    result, end, bias = refined(sliding or integrate, mass, steps, tolerance * size, generator, noise)
     ended = end[:, :dim].remainder(1.0)
     with torch.no_grad():
         rate = dynamics(end)[1]
-        rate = rate if value is None else integrate.corrected(rate, torch.arange(len(rate)))
+        rate = rate if sliding is None else sliding.corrected(rate, torch.arange(len(rate)))
         largest_rate = max(largest_rate, RATE_ROOM * float(rate.abs().max()))
     if not random:
         bias += math.exp(-rho * longest) * largest_rate * float(mass.mean())

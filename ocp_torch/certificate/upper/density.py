@@ -32,7 +32,8 @@ def density_bounds(
 
     `OPT <= J` for every `w` and `mu >= 0` once `C_V >= sup V*`; `Perf(w/mu) <= J` once `C_V >= sup V^u` (Proposition 6).
     """
-    fluxes, of = [], {"J": [], "G": []}
+    fluxes: list[Flux] = []
+    of: dict[str, list[torch.Tensor]] = {"J": [], "G": []}
     for samples in sets:
         parts = [_upper_integrands(problem, control_density, occupation, s, C_V) for s in samples.split(CHUNK)]
         of["J"].append(samples.weight * torch.cat([j for j, *_ in parts]))

@@ -65,7 +65,7 @@ def closed_loop_bounds(
     log_occupation: Field,
     sets: list[Samples],
     ascents: int,
-    controller: str,
+    controller: str | None,
     initial: list[float] | None = None,
     odd: Tensor | None = None,
 ) -> ClosedLoopBounds:

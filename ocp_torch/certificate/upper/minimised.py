@@ -23,8 +23,9 @@ class MinimisedPrimal(Bound):
 
     def valid(self, context: Context) -> bool:
         """It takes the divergence of `B w`: `w` is smooth, so that jumps of the problem alone make it wrong."""
-        jumps = context.observed.jump.in_problem or not context.posed.smooth_seam
-        return context.hidden is None and not jumps
+        jump = context.observed.jump
+        jumps = jump is not None and jump.in_problem
+        return context.hidden is None and not jumps and context.posed.smooth_seam
 
     def speaks(self, context: Context) -> bool:
         """`G` bounds the performance of `w` over the `mu` of Lemma 2; of nothing else."""

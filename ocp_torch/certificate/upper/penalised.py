@@ -21,7 +21,7 @@ class PenalisedPrimal(Bound):
         return not context.recorded
 
     def evaluate(self, context: Context) -> Estimate | None:
-        if context.takes_fitted_J:
+        if context.closed_loop and context.takes_fitted_J:
             return None if context.coarse else context.closed_loop.J
         return context.densities.J if context.densities else None
 
@@ -38,7 +38,7 @@ class PenalisedPrimal(Bound):
             notes.append(f"{context.divergent} are not used: {context.hidden.sentence}.")
         if context.fitted is not None and context.coarse:
             notes.append("J is left out: the controller computes in float32, too coarse for its divergence.")
-        if context.takes_fitted_J and context.densities and not context.checked.value_holds:
-            C_V = context.closed_loop.C_V
-            notes.append(f"the J shown is that of the closed loop, with C_V = {C_V:.4g} proved for it.")
+        found = context.closed_loop if context.takes_fitted_J and context.densities else None
+        if found is not None and not context.checked.value_holds:
+            notes.append(f"the J shown is that of the closed loop, with C_V = {found.C_V:.4g} proved for it.")
         return notes

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 
@@ -65,7 +66,7 @@ def fit_closed_loop(
     constants: Constants,
     settings: StageSettings,
     seed: int,
-    pool: Pool | None = None,
+    pool: Source | None = None,
 ) -> Fields:
     """Fields with `log mu^u`, and with `V^u` where ``fields`` hold no `V`, of the closed loop of ``policy``.
 
@@ -73,50 +74,62 @@ def fit_closed_loop(
     no ``fields`` the policy is somebody's own, in float64, and both `mu` and `V` are fitted in float32. ``pool``
     is where samples of the closed loop come from, by default from evaluations at Sobol points.
     """
+    trained = None if fields is None else fields.value
     like = torch.zeros(()) if fields is None else next(fields.parameters())
     loop = ClosedLoop(problem, policy)
-    with_value = fields is None or fields.value is None
-    names = (LOG_OCCUPATION, VALUE) if with_value else (LOG_OCCUPATION,)
+    names = (LOG_OCCUPATION, VALUE) if trained is None else (LOG_OCCUPATION,)
     fitted = Fields.build(problem, names, network, derive_seed(seed, Branch.POLICY_EVALUATION, 0)).to(like)
     if fields is not None and fields.log_occupation is not None:
         fitted.log_occupation.load_state_dict(fields.log_occupation.state_dict())
-    pool = pool or Pool(loop, derive_seed(seed, Branch.POLICY_EVALUATION, 1), like, double=fields is None)
+    count = min(POOL, settings.steps * settings.batch)
+    pool = pool or Pool(loop, derive_seed(seed, Branch.POLICY_EVALUATION, 1), like, count, double=fields is None)
     draw = lambda phase: pool.draw(settings.batch)
-    pool.grow(min(POOL, settings.steps * settings.batch))
-    weight = 1.0 if with_value else positive_weight(loop, fields.value, pool.samples.take(slice(EXCESS_STATES)))
-    objective, phase = PolicyEvaluation(loop, with_value, weight), Phase(constants)
+    weight = 1.0 if trained is None else positive_weight(loop, trained, pool.samples.take(slice(EXCESS_STATES)))
+    objective, phase = PolicyEvaluation(loop, trained is None, weight), Phase(constants)
     stepper, average = short_fit(fitted, objective, settings.lr, settings.steps)
     for k in range(settings.rounds):
         steps = settings.steps * 2**k
         pool.grow(min(POOL, steps * settings.batch))
         for _ in range(steps):
             advance(stepper, average, draw, phase)
-        value = average.module.value if with_value else fields.value
+        value = average.module.value if trained is None else trained
         excess = relative_excess(loop, value, average.module.log_occupation, pool.samples.take(slice(EXCESS_STATES)))
         if excess <= settings.good_excess:
             break
     return average.module
 
 
+class Source(Protocol):
+    """Samples of a closed loop that are drawn from again and again."""
+
+    samples: Samples
+
+    def grow(self, count: int) -> None: ...
+
+    def draw(self, count: int) -> Samples: ...
+
+
 class Pool:
-    """Samples of a closed loop that are drawn from again and again, and grow when more are wanted.
+    """``count`` samples of a closed loop that are drawn from again and again, and grow when more are wanted.
 
     The loop is evaluated in float64 if ``double``; samples are kept in the precision and on the device of ``like``.
     """
 
-    def __init__(self, loop: ClosedLoop, seed: int, like: torch.Tensor, double: bool = False) -> None:
+    def __init__(self, loop: ClosedLoop, seed: int, like: torch.Tensor, count: int, double: bool = False) -> None:
         self.loop, self.like = loop, like
         self.states = SobolSampler(loop.dim, seed, torch.float64 if double else like.dtype)
-        self.samples: Samples | None = None
+        self.samples = self._fresh(count)
         self.drawn = 0
+
+    def _fresh(self, count: int) -> Samples:
+        states = self.states.draw(count).to(self.like.device).split(CHUNK)
+        return Samples.concatenate([Samples.of(self.loop, x).to(self.like) for x in states])
 
     def grow(self, count: int) -> None:
         """Fresh states up to ``count`` in all."""
-        missing = count - (0 if self.samples is None else len(self.samples))
+        missing = count - len(self.samples)
         if missing > 0:
-            fresh = self.states.draw(missing).to(self.like.device).split(CHUNK)
-            kept = [] if self.samples is None else [self.samples]
-            self.samples = Samples.concatenate([*kept, *(Samples.of(self.loop, x).to(self.like) for x in fresh)])
+            self.samples = Samples.concatenate([self.samples, self._fresh(missing)])
 
     def draw(self, count: int) -> Samples:
         """The next ``count`` of them, round and round: consecutive Sobol points are spread evenly."""

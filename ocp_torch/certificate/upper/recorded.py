@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from ocp_torch.certificate.bound import recorded
 from ocp_torch.certificate.checks.hidden import Flux, Hidden, hidden_divergence
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.trained import in_float64
@@ -41,22 +42,25 @@ class RecordedPrimal(PenalisedPrimal):
     def applies(self, context: Context) -> bool:
         return context.recorded
 
-    def evaluate(self, context: RecordedContext) -> Estimate | None:
-        return context.fit.J if context.fit else None
+    def evaluate(self, context: Context) -> Estimate | None:
+        fit = recorded(context).fit
+        return fit.J if fit else None
 
-    def valid(self, context: RecordedContext) -> bool:
+    def valid(self, context: Context) -> bool:
         return context.hidden is None and context.checked.regular_holds
 
-    def speaks(self, context: RecordedContext) -> bool:
+    def speaks(self, context: Context) -> bool:
         return True
 
-    def notes(self, context: RecordedContext, shown: Estimate | None) -> list[str]:
+    def notes(self, context: Context, shown: Estimate | None) -> list[str]:
         if context.hidden is not None:
             return [f"J is not used: {context.hidden.sentence}."]
-        if context.fit is None:
+        fit = recorded(context).fit
+        if fit is None:
             return []
-        C_V = context.fit.C_V
-        return [f"J is above the controller's performance if C_V = {C_V:.4g}, by the samples met, bounds its value."]
+        return [
+            f"J is above the controller's performance if C_V = {fit.C_V:.4g}, by the samples met, bounds its value."
+        ]
 
 
 @torch.no_grad()
@@ -108,16 +112,16 @@ class RecordedFit(NamedTuple):
     hidden: Hidden | None
 
 
-def fit_recorded(context: RecordedContext) -> RecordedFit:
-    """`J(mu u, mu)` of the controller handed out, on held-out samples, with `log mu` fitted on the training samples.
+def fit_recorded(context: RecordedContext, kind: str) -> RecordedFit:
+    """`J(mu u, mu)` of the controller ``kind``, on held-out samples, with `log mu` fitted on the training samples.
 
     By parts `E[(f + R(u)) mu] = E[V mu0 - mu Q_u - V r]`, the same number with less scatter. `C_V` is the largest of the
     bound at hand and of `V - min(Q_u, 0)`, which bounds `V^u` where it is largest, at all samples, with head-room. Raises
     `ArithmeticError` where the fit fails.
     """
     problem, trained, constants, seed = context.problem, context.trained, context.constants, context.seed
-    cost, rho, policy = problem.control_cost, problem.discount, context.policy
-    rough = context.policy_of(trained.fields)
+    cost, rho = problem.control_cost, problem.discount
+    policy, rough = (context.policy_of(kind, fields) for fields in (context.fields, trained.fields))
     like = next(trained.fields.parameters())
     training = closed_loop_samples(problem.training.to(like), rough, cost)
     pool = Drawn(training, derive_seed(seed, Branch.POLICY_EVALUATION, 2))
@@ -137,7 +141,7 @@ def fit_recorded(context: RecordedContext) -> RecordedFit:
         largest, deepest = max(largest, float(V.value.max())), max(deepest, float(-slack.min()))
         densities.append(mu)
         fluxes.append(Flux(loop.x, loop.weight, outflow - mu, mu.unsqueeze(-1) * loop.a / rho))
-        spreads.append(loop.div_a)
+        spreads.append(loop.require_divergences("the closed loop")[0])
     with torch.no_grad():
         loop = training.to(torch.zeros((), dtype=torch.float64))
         V = jets.jet(value, loop.x)
@@ -146,7 +150,7 @@ def fit_recorded(context: RecordedContext) -> RecordedFit:
     C_V = max(constants.C_V, MARGIN * (largest + deepest))
     excess = best_multiples(terms, lambda t, s: t.J(s, C_V))
     J = [integral(t.samples, t.v * t.samples.mu0) + e for t, e in zip(terms, excess, strict=True)]
-    found = Estimate.of(J, controller=context.kind)
+    found = Estimate.of(J, controller=kind)
     highest = highest_occupation(torch.cat(densities), torch.cat(spreads), rho)
     return RecordedFit(found, C_V, highest, hidden_divergence(fluxes))
 

@@ -22,7 +22,7 @@ from ocp_torch.problems.problem import Problem
 # States searched for the extrema of u* and f, and the ascents from the best of them with their steps: the truth claimed is as
 # exact as these extrema.
 SEARCH_POINTS = 2**14
-ASCENTS = dict(ascents=64, steps=100)
+ASCENTS, ASCENT_STEPS = 64, 100
 
 
 class Manufactured(Problem):
@@ -113,15 +113,15 @@ class Manufactured(Problem):
         """Scale `V0` so that `sup |u*| = control_size`, then find the smallest `c` with `f >= 0`, and the bounds."""
         points = scrambled_sobol(SEARCH_POINTS, self.dim, 0, torch.float64)
         push = lambda x: self._pull_back(x).norm(dim=-1)
-        steepest = supremum(push, points, **ASCENTS).value
+        steepest = supremum(push, points, ASCENTS, ASCENT_STEPS).value
         if steepest <= 0.0:
             raise InputError(
                 f"problem.seed = {self.seed} gives a value function the control cannot change; take another."
             )
         self.V0 = self.V0.scaled(self.control_size ** (self.exponent - 1.0) / steepest)
         self.c = 0.0
-        self.c = supremum(lambda x: -self.state_cost(x), points, **ASCENTS).value
-        self.state_cost_bound = supremum(self.state_cost, points, **ASCENTS).value
+        self.c = supremum(lambda x: -self.state_cost(x), points, ASCENTS, ASCENT_STEPS).value
+        self.state_cost_bound = supremum(self.state_cost, points, ASCENTS, ASCENT_STEPS).value
         self.value_bound = self.c + float(self.V0.amplitudes.abs().sum())
         self.control_bound = self.control_limit if self.limited else self.control_size
         self.occupation_bound = 1.0 + self.contrast

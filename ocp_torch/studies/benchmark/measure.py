@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ocp_torch.certificate import BOUNDS, LOWER, UPPER, CertificateSettings, Run, StageSettings
 from ocp_torch.certificate.estimate import replicated_samples
@@ -67,13 +67,13 @@ class Judge:
     def __call__(self, fields: Fields, occupation: str | None, perf: bool = True) -> dict[str, float]:
         """The values of the listed bounds on `OPT` that ``fields`` give, `F_M`, `shifted`, `J` and `G` among them, and with
         ``perf`` of the controllers' performances, `value` and `density`, all by their keys in `certificate.json`."""
-        trained = Trained(fields, occupation, None)
+        trained = Trained(fields, occupation, nn.Identity)  # nothing is fitted, so that no network is made
         context = Measured(problem=self.problem, constants=self.constants, trained=trained, sets=self.sets)
         listed = [bound for bound in BOUNDS if bound.side in (LOWER, UPPER) and bound.applies(context)]
         found = {bound.name: bound.evaluate(context) for bound in listed}
         numbers = {name: estimate.value for name, estimate in found.items() if estimate is not None}
         if perf:
-            initial = None if context.value is None else context.sampled_value.initial
+            initial = None if context.sampled_value is None else context.sampled_value.initial
             for name, policy in context.policies.items():
                 numbers[name] = self.performance(policy, context.value, initial)
         return numbers

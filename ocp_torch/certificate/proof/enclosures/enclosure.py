@@ -65,7 +65,10 @@ class ByClass:
         return found[0] in self._always or not any(name in names for names in below for name in self.about)
 
     def __call__(self, owner: object, argument: Any) -> Any:
-        return self.source(owner)[1](argument)
+        found = self.source(owner)
+        if found is None:
+            raise TypeError(f"{type(owner).__name__} gives no {self.method}.")
+        return found[1](argument)
 
 
 # enclosure(problem, box): an `Enclosure` of the data of ``problem`` over the cells of ``box``, or `None` where it has none.
