@@ -39,6 +39,9 @@ GRADING = 2.0
 FEWEST_STEPS, DISCOUNTED, MOVED = 8, 0.4, 0.2
 # Simulation sets come after those of the bounds in the stream of evaluation points.
 SIMULATION_REPLICATE = 1000
+# From so many starts a replicate on, and where no more than that part of the results repeat others, replicates differ enough
+# to show how far off they are.
+MANY_STARTS, REPEATED = 64, 0.5
 # What is left of the discount when simulation stops, times the rate's supremum, relative to the answer.
 TAIL = 2e-5
 # The answer is taken to be at least this part of the mean state cost at the starts.
@@ -162,8 +165,19 @@ def simulate_performance(
     parts = means(result).tolist()
     totals = [part + (initial[r % len(initial)] if initial else 0.0) for r, part in enumerate(parts)]
     perf = Estimate.of(totals, bias=bias)
-    # Few evenly spread starts may all count alike where the cost jumps. A stratum holds one of `n` starts, so that a
-    # replicate's mean is off by its spread over `n`; where V takes the spread away this is nothing.
-    least = float((mass * result).std()) / (trajectories * math.sqrt(replicates))
-    perf = widened(replace(perf, se=max(perf.se, least)), [mass * result])
+    perf = replace(perf, se=max(perf.se, stratum_error(mass * result, replicates)))
+    perf = widened(perf, [mass * result])
     return Simulated(perf, None if random else float((base + result).max()), ended)
+
+
+def stratum_error(results: Tensor, replicates: int) -> float:
+    """The standard error of a mean of ``results`` ``(N,)`` where ``replicates`` of evenly spread starts may all count alike.
+
+    That is where the cost jumps: results repeat, or starts are few. A stratum holds one of the `n` starts of a replicate,
+    whose mean is then off by the spread of the results over `n`. 0 where the replicates' own scatter may be trusted.
+    """
+    trajectories = len(results) // replicates
+    repeated = 1.0 - len(torch.unique(results.to(torch.float32))) / len(results)
+    if trajectories >= MANY_STARTS and repeated <= REPEATED:
+        return 0.0
+    return float(results.std()) / (trajectories * math.sqrt(replicates))
