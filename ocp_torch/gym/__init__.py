@@ -1,12 +1,14 @@
 """Our problems as Gymnasium environments: `import ocp_torch.gym`, then `gymnasium.make("ocp_torch/Circle-v0")`.
 
 Arguments of the problem and of `make_environment` are given to `gymnasium.make`; a problem of your own is
-`gymnasium.make("ocp_torch/Problem-v0", problem=MyProblem())`. Needs the optional extra `gym`; without it `InputError`.
+`gymnasium.make("ocp_torch/Problem-v0", problem=MyProblem())`. Needs the optional extra `gym`: without it nothing is
+registered, and `register` says how to get it.
 """
 
 from __future__ import annotations
 
 import os
+from importlib.util import find_spec
 
 from ocp_torch.errors import InputError, call, require_choice
 from ocp_torch.gym.environment import make_environment, require_gymnasium
@@ -40,7 +42,7 @@ def make(problem: str | Problem | None = None, **options):
 
 
 def register() -> None:
-    """Put all of them into Gymnasium's registry."""
+    """Put all of them into Gymnasium's registry. Raises `InputError` where it is not installed."""
     gymnasium = require_gymnasium()
     for environment, name in names().items():
         if environment not in gymnasium.registry:
@@ -49,4 +51,5 @@ def register() -> None:
         gymnasium.register("ocp_torch/Problem-v0", entry_point="ocp_torch.gym:make")
 
 
-register()
+if find_spec("gymnasium") is not None:
+    register()
