@@ -11,7 +11,7 @@ from torch import nn
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.maths.sampling import scrambled_sobol
-from ocp_torch.objectives import Phase, primal, saddle
+from ocp_torch.objectives import Dual, Phase, primal, saddle
 from ocp_torch.objectives.saddle import AugmentedSaddle, Saddle
 from ocp_torch.problems import Manufactured
 from ocp_torch.problems.constants import resolve_constants
@@ -139,6 +139,26 @@ def test_the_coupling_is_the_value_times_the_residual_it_is_the_multiplier_of(co
 class WithoutDivergences(Manufactured):
     def drift_divergence(self, x):
         return None
+
+
+@pytest.mark.parametrize("problem", SMOOTH.values(), ids=SMOOTH.keys())
+@pytest.mark.parametrize("size", [0.0, 0.01, 0.3, 5.0])
+@pytest.mark.parametrize("augmentation", [0.5, 3.0])
+def test_against_the_optimal_flux_no_value_is_worth_more_than_the_optimum(problem, size, augmentation):
+    """Without divergences: `Psi(V; w*) + k F_M(V) <= (1 + k) OPT` for every `V`, and `V*` attains it. On a grid, exactly."""
+    objective = Saddle(problem, augmentation)
+    samples, phase = Samples.of(problem, lattice(problem.dim)), Phase(resolve_constants(problem))
+    wave = lambda x: size * (2.0 * math.pi * x.sum(dim=-1)).sin()
+    V = lambda x: problem.exact_value(x) + wave(x)
+    loss = float(objective.losses(exact_fields(problem, value=wave), samples, phase)["value"])
+    least = -(1.0 + augmentation) * problem.exact_optimum
+    assert loss >= least - 1e-9
+    if size == 0.0:
+        assert loss == pytest.approx(least, rel=1e-6)
+    alone = Fields({"value": Function(V)})
+    F_M = -float(Dual(problem, residual=0.0).losses(alone, samples, phase)["value"])
+    plain = float(Saddle(problem).losses(exact_fields(problem, value=wave), samples, phase)["value"])
+    assert loss == pytest.approx(plain - augmentation * F_M, rel=1e-9)
 
 
 def test_without_divergences_each_method_falls_back_to_what_needs_none_and_says_so():

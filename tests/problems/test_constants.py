@@ -1,0 +1,56 @@
+"""The constants bound what they are said to bound, whatever the problem declares of itself."""
+
+import math
+
+import pytest
+import torch
+
+from ocp_torch.problems import Problem
+from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.problems.constants import resolve_constants, state_cost_supremum
+from support import zoo
+from support.exact import ROUNDING, exact_slack
+
+QUADRATIC = tuple(name for name in zoo.EXACT if zoo.build(name).exponent == 2.0)
+
+
+@zoo.on(QUADRATIC)
+def test_the_value_bound_holds_for_controllers_that_are_not_quite_optimal_too(problem):
+    """With `q = 2` a mistake `e` of constant size costs `|e|^2 / 2` more from every state: `V^u = V* + |e|^2 / 2`."""
+    dearer = 0.01 * problem.value_bound
+    mistake = math.sqrt(2.0 * dearer / problem.control_dim)
+    loop = ClosedLoop(problem, lambda x: problem.exact_control(x) + mistake)
+    loop.exact_value = lambda x: problem.exact_value(x) + dearer
+    x = zoo.states(problem, 200, off_kinks=True)
+    torch.testing.assert_close(exact_slack(loop, x), torch.zeros(len(x), dtype=x.dtype), **ROUNDING)
+    assert resolve_constants(problem).C_V >= problem.value_bound + dearer
+
+
+@zoo.on(zoo.FEW)
+def test_constants_that_are_configured_are_used_as_they_are(problem):
+    given = dict(occupation_bound=3.0, value_bound=0.7, control_bound=0.9)
+    found = resolve_constants(problem, **given)
+    assert (found.M, found.C_V, found.C_u) == tuple(given.values())
+
+
+class Declared(Problem):
+    """`0 <= f <= 2` on the circle, and what the problem says of `sup f`."""
+
+    scan_factor = 1
+
+    def __init__(self, bound: float | None) -> None:
+        super().__init__(dim=1)
+        self.state_cost_bound = bound
+
+    def state_cost(self, x):
+        return 1.0 + (2.0 * math.pi * (x[:, 0] - 0.3)).cos()
+
+
+@pytest.mark.parametrize("declared", [None, 1e-3, 1.0, 1.99, 2.0, 2.5, 100.0])
+def test_no_state_costs_more_than_the_supremum_whatever_is_declared(declared):
+    problem = Declared(declared)
+    found = state_cost_supremum(problem)
+    assert found >= 2.0 - 1e-9
+    assert resolve_constants(problem).C_V == found
+    if declared is not None and declared >= 2.0:
+        assert found == declared
