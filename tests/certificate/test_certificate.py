@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from ocp_torch.certificate import Run, Trained, certify_fields
+from ocp_torch.certificate.checks.check import occupation_holds
+from ocp_torch.certificate.checks.observed import Observed
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.policies import ValuePolicy
@@ -110,6 +112,15 @@ def test_an_M_that_was_held_against_nothing_makes_nothing_count(basis):
     blind = replace(CHEAP, occupation_states=0)
     assert not certificate_of(problem, constants, blind).counts("F_M")
     assert certificate_of(problem, constants).counts("F_M") == (basis == "given")
+
+
+@pytest.mark.parametrize(("times", "believed"), [(0.97, False), (1.0, False), (1.05, False), (1.2, True), (5.0, True)])
+@pytest.mark.parametrize("reached", [1.01, 1.9, 40.0])
+def test_an_M_that_the_density_comes_close_to_is_not_believed(reached, times, believed):
+    """Trained with an `M` that is too small, a controller keeps its density just below it."""
+    problem = Anonymous(dim=1)
+    constants = resolve_constants(problem, times * reached, value_bound=1.0, control_bound=1.0)
+    assert occupation_holds(problem, constants, Observed(sup_occupation=reached))[0] is believed
 
 
 def rounds_of(*overrides: str):

@@ -148,6 +148,21 @@ def test_the_bounds_do_not_depend_on_the_mass_that_mu_was_given(problem):
     assert sum(best_multiples(terms, bound)) <= sum(bound(t, 1.0) for t in terms) + 1e-3
 
 
+def test_no_multiple_is_chosen_on_the_half_it_is_evaluated_on():
+    """Another slack in the first set moves what the second and the fourth give, and leaves the third alone."""
+    problem = zoo.build("manufactured 2-d q=2")
+    draw = torch.Generator().manual_seed(0)
+    about = lambda mean: mean + 0.3 * torch.randn(64, generator=draw, dtype=torch.float64)
+    samples = [Samples.of(problem, zoo.states(problem, 64, seed=s)) for s in range(4)]
+    terms = [Terms(own, v=about(1.0), spent=about(0.0), r=about(0.0)) for own in samples]
+    other = [replace(terms[0], spent=terms[0].spent + 0.4), *terms[1:]]
+    for bound in (lambda t, s: t.lagrangian(s, 2.0, 0.5), lambda t, s: t.J(s, 3.0)):
+        here, there = best_multiples(terms, bound), best_multiples(other, bound)
+        assert here[2] == there[2]
+        assert here[1] != there[1]
+        assert here[3] != there[3]
+
+
 def test_the_weight_of_missing_mass_follows_the_slack():
     """Deep slack on one side makes that side of the residual weigh more, within limits; a sign turned turns the ratio."""
     problem = zoo.build("manufactured 2-d q=2")

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ocp_torch.certificate.simulated.occupation import occupation_along_flow
-from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance
+from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
 from ocp_torch.maths.runge_kutta import discounted_integral, refined
 from ocp_torch.maths.sampling import evaluation_points
 from support import zoo
@@ -117,6 +117,24 @@ def test_the_occupation_density_along_the_exact_flow_is_the_exact_one(problem):
     x = zoo.states(problem, 16, seed=4)
     found = occupation_along_flow(problem, problem.exact_control, x, horizon=12.0 / problem.discount, steps=100)
     torch.testing.assert_close(found, problem.exact_occupation(x), rtol=1e-4, atol=1e-4)
+
+
+@zoo.on(zoo.FEW_SMOOTH)
+def test_what_the_truncation_leaves_out_is_within_the_bias(problem):
+    """From the very starts the exact controller costs what `V*` says; steps so fine that only the tail is missing."""
+    found = simulate_performance(problem, problem.exact_control, 4, 2, seed=0, tolerance=1e-9).perf
+    x0, mass = starting_points(problem, 4, 2, seed=0)
+    missing = float((mass * problem.exact_value(x0)).mean()) - found.value
+    assert 1e-6 * found.value < missing <= found.bias < 1e-4 * found.value
+
+
+@zoo.on(("torus 2-d chain", "circle rho=4"))
+def test_a_system_at_rest_costs_what_its_states_cost_but_for_the_tail(problem):
+    rest = lambda x: torch.zeros(len(x), problem.control_dim, dtype=x.dtype)
+    found = simulate_performance(problem, rest, 4, 2, seed=0, tolerance=1e-9).perf
+    x0, mass = starting_points(problem, 4, 2, seed=0)
+    missing = float((mass * problem.state_cost(x0)).mean()) - found.value
+    assert 1e-6 * found.value < missing <= found.bias < 1e-4 * found.value
 
 
 @pytest.mark.parametrize("order", [0.5, 1, 2, 4])

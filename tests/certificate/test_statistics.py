@@ -1,14 +1,16 @@
 """Intervals: Student's t against tables, and how often they cover the truth."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from ocp_torch.certificate import CertificateSettings
+from ocp_torch.certificate import CertificateSettings, Run
 from ocp_torch.certificate.estimate import Estimate, t_factor
 from ocp_torch.errors import InputError
 from ocp_torch.maths.sampling import evaluation_points
+from support.looks import certificate
 
 TURN = 2.0 * math.pi
 # Two-sided, from the usual tables.
@@ -42,6 +44,21 @@ def test_an_interval_is_t_standard_errors_and_all_of_the_bias():
     half = t_factor(0.9, 2) * 1.0 / math.sqrt(3.0) + 0.5
     assert estimate.interval(0.9) == pytest.approx((2.0 - half, 2.0 + half))
     assert Estimate(1.0, 0.0).interval(0.95) == (1.0, 1.0)
+
+
+def test_what_is_said_of_the_suboptimality_holds_jointly_whatever_the_number_of_controllers():
+    """Ten controllers of equal cost, one known to the last digit: the smallest upper end of the others tends to be low."""
+    normal = torch.Generator().manual_seed(0)
+    truth, controllers, wrong = 1.0, 10, 0
+    plain = certificate(Run("circle", "dual"), 0.1)
+    drawn = 1.0 + 0.01 * torch.randn(400, controllers, 8, generator=normal, dtype=torch.float64)
+    for lower, *others in drawn.tolist():
+        perf = {f"{i}": Estimate.of(values) for i, values in enumerate(others)}
+        perf["mine"] = Estimate(truth, 0.0)
+        said = replace(plain, lower={"F_M": Estimate.of(lower)}, perf=perf, subject="mine").suboptimality
+        wrong += not said["at_least"] <= 0.0 <= said["at_most"]
+    # A true level of 95 % is missed this often once in a hundred.
+    assert wrong <= 0.05 * 400 + 2.33 * math.sqrt(0.05 * 0.95 * 400)
 
 
 def V(y):

@@ -107,6 +107,17 @@ def test_integrals_of_waves_are_exact():
         assert mean == pytest.approx(2.0, abs=1e-9)
 
 
+def test_no_set_is_corrected_by_a_fit_to_its_own_half():
+    """More of a wave in the first set changes what is taken off the second and the fourth, and not off the third."""
+    draw = torch.Generator().manual_seed(0)
+    states = [torch.rand(512, 6, generator=draw, dtype=torch.float64) for _ in range(4)]
+    values = [polynomial(x) + 0.3 * torch.randn(512, generator=draw, dtype=torch.float64) for x in states]
+    more = [values[0] + 1e-3 * (TURN * states[0][:, 1]).cos(), *values[1:]]
+    change = [b - a for a, b in zip(integrals(states, values), integrals(states, more), strict=True)]
+    assert abs(change[2]) < 1e-11
+    assert min(abs(change[1]), abs(change[3])) > 1e-8
+
+
 @pytest.mark.nightly
 def test_what_the_fit_takes_off_has_mean_zero():
     """`exp` of a polynomial is no polynomial: repeated estimates scatter about the mean that one large sample gives."""
