@@ -39,9 +39,6 @@ GRADING = 2.0
 FEWEST_STEPS, DISCOUNTED, MOVED = 8, 0.4, 0.2
 # Simulation sets come after those of the bounds in the stream of evaluation points.
 SIMULATION_REPLICATE = 1000
-# From so many starts a replicate on, and where no more than that part of the results repeat others, replicates differ enough
-# to show how far off they are.
-MANY_STARTS, REPEATED = 64, 0.5
 # What is left of the discount when simulation stops, times the rate's supremum, relative to the answer.
 TAIL = 2e-5
 # The answer is taken to be at least this part of the mean state cost at the starts.
@@ -171,13 +168,11 @@ def simulate_performance(
 
 
 def stratum_error(results: Tensor, replicates: int) -> float:
-    """The standard error of a mean of ``results`` ``(N,)`` where ``replicates`` of evenly spread starts may all count alike.
+    """The standard error of a mean of ``results`` ``(N,)``, of ``replicates`` of evenly spread starts, if one stratum is off.
 
-    That is where the cost jumps: results repeat, or starts are few. A stratum holds one of the `n` starts of a replicate,
-    whose mean is then off by the spread of the results over `n`. 0 where the replicates' own scatter may be trusted.
+    Where the cost jumps, all replicates may put the start of the stratum with the jump on the same side, and then agree with
+    one another. A stratum holds one of the `n` starts of a replicate: its mean is off by the spread of the results over `n`.
+    Without this, 95 % intervals missed the mean of a step in 7 to 25 % of draws, whatever `n` from 4 to 256; with it, in 1 to
+    7 %.
     """
-    trajectories = len(results) // replicates
-    repeated = 1.0 - len(torch.unique(results.to(torch.float32))) / len(results)
-    if trajectories >= MANY_STARTS and repeated <= REPEATED:
-        return 0.0
-    return float(results.std()) / (trajectories * math.sqrt(replicates))
+    return float(results.std()) / (len(results) // replicates * math.sqrt(replicates))
