@@ -11,23 +11,14 @@ from ocp_torch.certificate.checks.hidden import Hidden
 from ocp_torch.certificate.checks.observed import Observed, observe
 from ocp_torch.certificate.checks.tails import sharpened
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
-from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.simulated.candidates import simulate_candidates
 from ocp_torch.certificate.simulated.performance import Simulated
-from ocp_torch.certificate.trained import Trained, in_float64
+from ocp_torch.certificate.trained import FieldsContext, in_float64
 from ocp_torch.certificate.upper.density import DensityBounds, density_bounds
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
-from ocp_torch.control.policies import (
-    Density,
-    Policy,
-    admissible_density,
-    occupation_density,
-    trained_policies,
-)
-from ocp_torch.fields.fields import Fields
-from ocp_torch.maths.jets import Field
+from ocp_torch.control.policies import Density, Policy, admissible_density, occupation_density
 from ocp_torch.problems.samples import Samples
 
 # States of each set at which the density is looked at for places without mass.
@@ -35,25 +26,10 @@ LOOKED_AT = 4096
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class TrainedContext(Context):
+class TrainedContext(FieldsContext):
     """Up to two controllers, from `V` and from `w / mu`: both are simulated, and the better one is handed out."""
 
-    trained: Trained
-
     divergent = "J, G and the Lagrangian bound"
-
-    @property
-    def occupation(self) -> str | None:
-        """How `mu` follows from the fields, see `trained_policies`."""
-        return self.trained.occupation
-
-    @cached_property
-    def fields(self) -> Fields:
-        return self.trained.in_float64()
-
-    @property
-    def value(self) -> Field | None:
-        return self.fields.value
 
     @cached_property
     def posed(self) -> WellPosed:
@@ -61,10 +37,7 @@ class TrainedContext(Context):
 
     @cached_property
     def policies(self) -> dict[str, Policy]:
-        return self._policies_of(self.fields)
-
-    def _policies_of(self, fields: Fields) -> dict[str, Policy]:
-        return trained_policies(self.occupation, self.problem, fields, self.constants)
+        return self.policies_of(self.fields)
 
     @cached_property
     def _simulated(self) -> tuple[dict[str, Simulated], Estimate | None]:
@@ -116,7 +89,7 @@ class TrainedContext(Context):
         self.progress("closed-loop fit")
         if not self.problem.gives_divergences:
             return None, ["no upper bound without simulation: this problem gives no divergences of a and B."]
-        problem, trained, policy = self.problem, self.trained, self._policies_of(self.trained.fields)[kind]
+        problem, trained, policy = self.problem, self.trained, self.policies_of(self.trained.fields)[kind]
         how = self.constants, self.settings.stage, self.seed
         try:
             fitted = in_float64(fit_closed_loop(problem, policy, trained.fields, trained.network, *how))

@@ -17,13 +17,10 @@ from ocp_torch.certificate.checks.hidden import Hidden
 from ocp_torch.certificate.checks.observed import Observed
 from ocp_torch.certificate.checks.regularity import largest_jump
 from ocp_torch.certificate.checks.wellposed import WellPosed
-from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.certificate.trained import Trained
+from ocp_torch.certificate.trained import FieldsContext
 from ocp_torch.certificate.upper.recorded import RecordedFit, fit_recorded
-from ocp_torch.control.policies import NETWORK, Policy, trained_policies
-from ocp_torch.fields.fields import Fields
-from ocp_torch.maths.jets import Field
+from ocp_torch.control.policies import NETWORK, Policy
 from ocp_torch.problems.needs import SEARCHED
 from ocp_torch.problems.recorded.dataset import Dataset
 from ocp_torch.problems.samples import Samples
@@ -34,11 +31,10 @@ GROUPS, FEWEST = 64, 8
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class RecordedContext(Context):
+class RecordedContext(FieldsContext):
     """Fields trained on the recorded samples of ``problem``, held against those that were held out."""
 
     problem: Dataset
-    trained: Trained
 
     recorded = True
     exact = sampled_value = fitted = zero = None
@@ -46,14 +42,6 @@ class RecordedContext(Context):
     @property
     def perf(self) -> dict[str, Estimate | None]:
         return {"value": None, "density": None}
-
-    @cached_property
-    def fields(self) -> Fields:
-        return self.trained.in_float64()
-
-    @property
-    def value(self) -> Field | None:
-        return self.fields.value
 
     @cached_property
     def sets(self) -> list[Samples]:
@@ -72,14 +60,10 @@ class RecordedContext(Context):
     def subject(self) -> str | None:
         return self.kind
 
-    def policy_of(self, kind: str, fields: Fields) -> Policy:
-        """The controller ``kind``, in the precision of ``fields``."""
-        return trained_policies(self.trained.occupation, self.problem, fields, self.constants)[kind]
-
     @cached_property
     def policy(self) -> Policy | None:
         """The controller handed out."""
-        return None if self.kind is None else self.policy_of(self.kind, self.fields)
+        return None if self.kind is None else self.policies_of(self.fields)[self.kind]
 
     @cached_property
     def _fit(self) -> tuple[RecordedFit | None, list[str]]:

@@ -121,7 +121,7 @@ def fit_recorded(context: RecordedContext, kind: str) -> RecordedFit:
     """
     problem, trained, constants, seed = context.problem, context.trained, context.constants, context.seed
     cost, rho = problem.control_cost, problem.discount
-    policy, rough = (context.policy_of(kind, fields) for fields in (context.fields, trained.fields))
+    policy, rough = (context.policies_of(fields)[kind] for fields in (context.fields, trained.fields))
     like = next(trained.fields.parameters())
     training = closed_loop_samples(problem.training.to(like), rough, cost)
     pool = Drawn(training, derive_seed(seed, Branch.POLICY_EVALUATION, 2))
