@@ -23,8 +23,8 @@ STATES, MOST_ENTRIES, STATES_OF_A_SIMULATOR, FEWEST_STATES = 4096, 2**22, 512, 1
 # Denominator of the states that are compared a period apart: odd multiples of 1 / 2^17 lie on no grid of cells, and stay
 # what they are, in single precision too, when a few periods are added.
 GRID = 2**17
-# First branch of the random streams that states are drawn from; each check has the one of its number above it.
-BRANCH = 11
+# States of a check are a fixed design, the same for every problem and run: its number is this plus that of the check.
+FIRST_DESIGN = 11
 
 
 class Functions:
@@ -41,13 +41,13 @@ class Functions:
         most = STATES_OF_A_SIMULATOR if simulator else STATES
         self.count = max(FEWEST_STATES, min(most, MOST_ENTRIES // entries))
 
-    def states(self, count: int, branch: int = 0) -> Tensor:
+    def states(self, count: int, design: int = 0) -> Tensor:
         """Evenly spread states, ``(count, d)`` float64."""
-        return scrambled_sobol(count, self.problem.dim, BRANCH + branch, torch.float64)
+        return scrambled_sobol(count, self.problem.dim, FIRST_DESIGN + design, torch.float64)
 
-    def exact_states(self, count: int, branch: int) -> Tensor:
+    def exact_states(self, count: int, design: int) -> Tensor:
         """States that survive both precisions and a few periods to the bit (see `GRID`), ``(count, d)``."""
-        return ((self.states(count, branch) * (GRID // 2)).floor() * 2.0 + 1.0) / GRID
+        return ((self.states(count, design) * (GRID // 2)).floor() * 2.0 + 1.0) / GRID
 
     def ask(self, name: str, x: Tensor) -> Tensor:
         """As `given`, of a function that must give a tensor."""
