@@ -99,12 +99,12 @@ def known_of(estimates: dict[str, Estimate | None]) -> dict[str, Estimate]:
 
 @torch.no_grad()
 def replicated_samples(
-    problem: Problem, count: int, replicates: int, seed: int, divergences: bool, policy: Mixture | None = None
+    problem: Problem, count: int, replicates: int, seed: int, divergences: bool, distribution: Mixture | None = None
 ) -> list[Samples]:
     """``replicates`` independent scrambled Sobol sets of ``count`` states with the problem's data, in float64; weighted, with
-    more states where `mu0` or `f` is large on a small set, or from ``policy``."""
-    policy = evaluation_distribution(problem) if policy is None else policy
-    sets = [policy.draw(count, r, seed) for r in range(replicates)]
+    more states where `mu0` or `f` is large on a small set, or from ``distribution``."""
+    distribution = evaluation_distribution(problem) if distribution is None else distribution
+    sets = [distribution.draw(count, r, seed) for r in range(replicates)]
     return [Samples.of(problem, x, divergences=divergences, weight=weight) for x, weight in sets]
 
 

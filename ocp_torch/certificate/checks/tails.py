@@ -82,14 +82,14 @@ def sharpened(evaluate: Callable[[list[Samples]], R], problem: Problem, sets: li
             break
         away = summed((torch.cat(c) - torch.cat(c).mean()).abs() for c in rare)
         x, weight = (torch.cat([getattr(s, name) for s in sets]) for name in ("x", "weight"))
-        policy = concentrated(x, away, 1.0 / weight)
-        known = evaluation_distribution(problem)
-        policies = [policy for policy in (policy, known) if not policy.is_uniform]
-        if not policies:
+        narrow = [
+            d for d in (concentrated(x, away, 1.0 / weight), evaluation_distribution(problem)) if not d.is_uniform
+        ]
+        if not narrow:
             break
-        policy = Mixture.join([policy.scaled((1.0 - UNIFORM_STATES) / len(policies)) for policy in policies])
+        distribution = Mixture.join([d.scaled((1.0 - UNIFORM_STATES) / len(narrow)) for d in narrow])
         divergences = sets[0].div_a is not None
         fresh = derive_seed(seed, Branch.TAILS, k)
-        sets = replicated_samples(problem, len(sets[0]), len(sets), fresh, divergences, policy)
+        sets = replicated_samples(problem, len(sets[0]), len(sets), fresh, divergences, distribution)
         found = evaluate(sets)
     return found

@@ -16,8 +16,8 @@ DECLARED = ("state_cost_bound", "occupation_bound", "control_bound", "value_boun
 # Turns of a state round the torus within 1 / discount. Paths are simulated in steps of a fraction of a turn: more than so
 # many would take hours.
 MOST_TURNS = 1e4
-# States at which typical speeds are taken, and their branch of the random streams.
-SPEED_STATES, SPEED_BRANCH = 64, 13
+# States at which typical speeds are taken, and the number of their fixed design.
+SPEED_STATES, SPEED_DESIGN = 64, 13
 
 
 def require_made(problem: Problem) -> None:
@@ -46,7 +46,7 @@ def require_made(problem: Problem) -> None:
 
 def require_units(problem: Problem) -> None:
     """Units of cost and time in which a state can be followed for the time that counts."""
-    f, a, B = problem.probe(SPEED_STATES, SPEED_BRANCH, "f", "a", "B")
+    f, a, B = problem.probe(SPEED_STATES, SPEED_DESIGN, "f", "a", "B")
     # A control that costs as much as the state cost varies.
     u = (problem.exponent * float(f.std())) ** (1.0 / problem.exponent)
     u = u if problem.control_limit is None else min(u, problem.control_limit)

@@ -10,8 +10,8 @@ from ocp_torch.problems.blame import place
 from ocp_torch.problems.checks.functions import Functions
 
 SOURCES = {"drift_divergence": "drift", "control_divergence": "control_matrix"}
-# States compared, and their branch (see `functions.BRANCH`).
-COMPARED, BRANCH = 24, 7
+# States compared, and their design (see `functions.FIRST_DESIGN`).
+COMPARED, DESIGN = 24, 7
 # Steps of the differences. They are believed where both agree within this part of the largest divergence, and a claim that is
 # off by more than that part there is wrong; kinks and jumps at a minority of states are forgiven.
 STEPS, AGREE, WRONG = (1e-3, 2.5e-4), 0.01, 0.1
@@ -24,7 +24,7 @@ def require_divergences(functions: Functions) -> None:
     d, m = functions.problem.dim, functions.problem.control_dim
     if functions.simulator or COMPARED * d * d * m > MOST_NUMBERS:
         return
-    x = functions.exact_states(COMPARED, BRANCH)
+    x = functions.exact_states(COMPARED, DESIGN)
     for name, source in SOURCES.items():
         claimed = functions.given(name, x)
         if claimed is None:

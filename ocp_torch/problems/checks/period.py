@@ -12,8 +12,8 @@ from ocp_torch.problems.blame import place
 from ocp_torch.problems.checks.functions import DATA, Functions
 from ocp_torch.problems.checks.purity import SAME
 
-# States compared, their branch (see `functions.BRANCH`), and the whole numbers that are added to them.
-COMPARED, BRANCH = 256, 5
+# States compared, their design (see `functions.FIRST_DESIGN`), and the whole numbers that are added to them.
+COMPARED, DESIGN = 256, 5
 LOWEST, HIGHEST = -2, 3
 # Coordinates that a sentence shows.
 MOST_SHOWN = 8
@@ -21,7 +21,7 @@ MOST_SHOWN = 8
 
 def require_period(functions: Functions) -> None:
     """The same values a few whole periods away, in all coordinates at once."""
-    x = functions.exact_states(min(COMPARED, functions.count), BRANCH)
+    x = functions.exact_states(min(COMPARED, functions.count), DESIGN)
     whole = torch.randint(LOWEST, HIGHEST + 1, x.shape, generator=fixed_generator()).to(x)
     for name in DATA:
         here, there = functions.ask(name, x), functions.ask(name, x + whole)

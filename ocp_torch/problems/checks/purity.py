@@ -13,9 +13,9 @@ from ocp_torch.problems.checks.functions import DATA, Functions
 
 # Answers that differ by more than that part of the largest are not the same; rounding in single precision stays below.
 SAME = 1e-5
-# States compared, some rows of them asked alone, and their branches (see `functions.BRANCH`).
-COMPARED, ALONE, BRANCH = 37, (0, 18, 36), 1
-DIFFERENTIATED, DIFFERENTIATED_BRANCH = 5, 2
+# States compared, some rows of them asked alone, and their designs (see `functions.FIRST_DESIGN`).
+COMPARED, ALONE, DESIGN = 37, (0, 18, 36), 1
+DIFFERENTIATED, DIFFERENTIATED_DESIGN = 5, 2
 OTHER_ROWS = "is no function of the state alone, but changes with the other states or what was asked before"
 TWICE = "is no function of the state alone, but changes when it is asked again"
 OVERWRITES = "overwrites an answer it gave before; it must give a new tensor each time"
@@ -25,7 +25,7 @@ Answers = tuple[Tensor, dict[str, Tensor]]
 
 def require_purity(functions: Functions) -> Answers:
     """Ask the same states in another order, among others and alone; what was answered first is given for `require_still`."""
-    x = functions.exact_states(COMPARED, BRANCH)
+    x = functions.exact_states(COMPARED, DESIGN)
     kept = {name: functions.ask(name, x) for name in DATA}
     first = {name: values.clone() for name, values in kept.items()}
     turned = x.flip(0)
@@ -50,7 +50,7 @@ def require_still(functions: Functions, first: Answers) -> None:
 
 def require_differentiable(functions: Functions) -> None:
     """It can be called with states that need gradients: ascents to suprema differentiate by the state."""
-    x = functions.states(DIFFERENTIATED, DIFFERENTIATED_BRANCH)
+    x = functions.states(DIFFERENTIATED, DIFFERENTIATED_DESIGN)
     for name in DATA:
         with torch.enable_grad():
             function = getattr(functions.problem, name)

@@ -18,14 +18,14 @@ FEWER_STATES = 256
 FACES = 32
 # The lowest states from which a search goes on downhill, and its steps.
 DESCENTS, STEPS = 16, 40
-# Branches of the states (see `functions.BRANCH`).
-SPREAD_BRANCH, FACE_BRANCH, SIGN_BRANCH = 3, 4, 6
+# Designs of the states (see `functions.FIRST_DESIGN`).
+SPREAD, FACE, SIGN = 3, 4, 6
 
 
 def require_finite(functions: Functions) -> None:
     """At evenly spread states and, the data, at those where a division goes wrong first: on the faces and the middles."""
     for dtype in (torch.float64, torch.float32):
-        spread = functions.states(functions.count, SPREAD_BRANCH).to(dtype).remainder(1.0)
+        spread = functions.states(functions.count, SPREAD).to(dtype).remainder(1.0)
         special = _special(functions).to(dtype)
         for name in FORMS:
             for x in (spread, special) if name in DATA else (spread[:FEWER_STATES],):
@@ -46,7 +46,7 @@ def _special(functions: Functions) -> Tensor:
     """Quarters of the diagonal, and states with one coordinate at 0 or 1/2; ``(K, d)``."""
     d = functions.problem.dim
     corners = torch.tensor([0.0, 0.5, 0.25, 0.75], dtype=torch.float64).unsqueeze(-1).expand(4, d)
-    faces = functions.states(min(FACES, functions.count), FACE_BRANCH)
+    faces = functions.states(min(FACES, functions.count), FACE)
     rows = torch.arange(len(faces))
     faces[rows, rows % d] = 0.5 * (rows % 2).double()
     return torch.cat([corners, faces])
@@ -54,7 +54,7 @@ def _special(functions: Functions) -> Tensor:
 
 def require_signs(functions: Functions) -> None:
     """`f >= 0` and `mu0 >= 0`, at states and downhill from the least; and `f` within the bound the problem declares."""
-    x = functions.states(functions.count, SIGN_BRANCH)
+    x = functions.states(functions.count, SIGN)
     largest, at = _require_sign(functions, "state_cost", x, "; a constant added to it changes no optimal control.")
     bound = functions.problem.state_cost_bound
     if bound is not None and not largest <= bound + ROUNDING * abs(largest):
