@@ -168,14 +168,19 @@ class SobolevField(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return self.shift + self.scale * (nn.functional.linear(self.features(x), self.coefficients))
 
-    def jet(self, x: Tensor) -> Jet:
-        """The jet of a scalar field in closed form, from one set of waves."""
+    def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
+        """The jet of a scalar field in closed form, from one set of waves, for noise ``sigma`` ``(N, d, k)``."""
         cosines, sines, amplitudes = self.features._waves(x)
         constant, rest = self.coefficients[:1], self.coefficients[1:]
         of_cosine, of_sine = amplitudes * rest[: len(amplitudes)], amplitudes * rest[len(amplitudes) :]
         value = self.shift + self.scale * (constant + cosines @ of_cosine + sines @ of_sine)
         turned = cosines * of_sine - sines * of_cosine
-        return Jet(value, self.scale * 2.0 * math.pi * (turned @ self.features.frequencies))
+        gradient = self.scale * 2.0 * math.pi * (turned @ self.features.frequencies)
+        if sigma is None:
+            return Jet(value, gradient)
+        driven = torch.einsum("wd,ndk->nwk", 2.0 * math.pi * self.features.frequencies, sigma)
+        bent = driven.square().sum(dim=-1) * (cosines * of_cosine + sines * of_sine)
+        return Jet(value, gradient, -0.5 * self.scale * bent.sum(dim=-1))
 
     @property
     def norm(self) -> Tensor:

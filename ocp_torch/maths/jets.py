@@ -3,6 +3,9 @@
 A field is any callable `(N, d) -> (N,)` or `(N, d) -> (N, m)` whose rows do not depend on one another. Its derivatives take
 one reverse pass for each output: forward mode would take one for each direction, and runs PyTorch's operators through Python,
 at several times the cost. Everything here is differentiable again with respect to the field's parameters.
+
+Noise adds `D : hess`, `D = sigma sigma^T / 2`, for columns of `sigma` ``(N, d, k)`` that are data: a reverse pass for each
+column. A field that knows a shorter way has a method ``jet(x, sigma)`` of its own.
 """
 
 from __future__ import annotations
@@ -22,42 +25,72 @@ CHUNK = 1024
 
 @dataclass(frozen=True)
 class Jet:
-    """A scalar field's ``value`` ``(N,)`` and ``gradient`` ``(N, d)`` at `N` states: tensors, arrays or Taylor models."""
+    """A scalar field's ``value`` ``(N,)`` and ``gradient`` ``(N, d)`` at `N` states: tensors, arrays or Taylor models; and
+    where there is noise its ``curvature`` `D : hess` ``(N,)``."""
 
     value: Any
     gradient: Any
+    curvature: Any = None
 
     def map(self, function: Callable[[Any], Any]) -> Jet:
         """``function`` of each part, for what acts on all alike: a choice of states, a multiple, the field as mere data."""
-        return Jet(function(self.value), function(self.gradient))
+        curvature = None if self.curvature is None else function(self.curvature)
+        return Jet(function(self.value), function(self.gradient), curvature)
 
     @staticmethod
     def concatenate(jets: list[Jet]) -> Jet:
         """The jets of one field at several batches of states as one."""
-        return Jet(torch.cat([j.value for j in jets]), torch.cat([j.gradient for j in jets]))
+        curvature = None if jets[0].curvature is None else torch.cat([j.curvature for j in jets])
+        return Jet(torch.cat([j.value for j in jets]), torch.cat([j.gradient for j in jets]), curvature)
 
 
-def jet(field: Field, x: Tensor) -> Jet:
-    """The jet of a scalar ``field`` at states ``(N, d)``: by its own method ``jet`` if it has one, else by a reverse pass."""
+def jet(field: Field, x: Tensor, sigma: Tensor | None = None) -> Jet:
+    """The jet of a scalar ``field`` at states ``(N, d)``, with its curvature along the noise ``sigma`` ``(N, d, k)`` there:
+    by its own method ``jet`` if it has one, else by reverse passes."""
     own = getattr(field, "jet", None)
-    if own is not None:
-        return own(x)
+    return reverse_jet(field, x, sigma) if own is None else own(x) if sigma is None else own(x, sigma)
+
+
+def reverse_jet(field: Field, x: Tensor, sigma: Tensor | None = None) -> Jet:
+    """`jet` by reverse passes, one and one more for each column of ``sigma``."""
     again, at = torch.is_grad_enabled(), _differentiable(x)
     if at is None:
-        value, pullback = torch.func.vjp(field, x)[:2]
-        return Jet(value, pullback(torch.ones_like(value))[0])
+        return _transformed_jet(field, x, sigma)
     with torch.enable_grad():
+        # A node of its own: where sigma depends on x too, it is not differentiated.
+        at = at if sigma is None else at.view_as(at)
         value = field(at)
         if not value.requires_grad:
-            return Jet(value, torch.zeros_like(x))
+            return Jet(value, torch.zeros_like(x), None if sigma is None else torch.zeros_like(value))
         # The gradient of a sum, as rows do not depend on one another: to be handed one PyTorch would import SymPy.
-        gradient = torch.autograd.grad(value.sum(), at, create_graph=again, materialize_grads=True)[0]
-    return Jet(value if again else value.detach(), gradient)
+        twice = again or sigma is not None
+        gradient = torch.autograd.grad(value.sum(), at, create_graph=twice, materialize_grads=True)[0]
+        curvature = None if sigma is None else _curvature(gradient, at, sigma, again)
+    return Jet(value, gradient, curvature) if again else Jet(value, gradient, curvature).map(Tensor.detach)
+
+
+def _curvature(gradient: Tensor, at: Tensor, sigma: Tensor, again: bool) -> Tensor:
+    """`D : hess` ``(N,)`` of the field whose ``gradient`` at the states ``at`` has a graph."""
+    if not gradient.requires_grad:
+        return torch.zeros_like(gradient[:, 0])
+    options: dict[str, Any] = {"create_graph": again, "retain_graph": True, "materialize_grads": True}
+    bent = (torch.autograd.grad((gradient * s).sum(), at, **options)[0] * s for s in sigma.unbind(-1))
+    return 0.5 * sum((b.sum(dim=-1) for b in bent), torch.zeros_like(gradient[:, 0]))
+
+
+def _transformed_jet(field: Field, x: Tensor, sigma: Tensor | None) -> Jet:
+    """`jet` inside a transform of `torch.func`, where only its own derivatives work, at a higher cost."""
+    value, pullback = torch.func.vjp(field, x)[:2]
+    gradient = pullback(torch.ones_like(value))[0]
+    if sigma is None:
+        return Jet(value, gradient)
+    slope = lambda y: _transformed_jet(field, y, None).gradient
+    bent = (torch.func.jvp(slope, (x,), (s,))[1] * s for s in sigma.unbind(-1))
+    return Jet(value, gradient, 0.5 * sum((b.sum(dim=-1) for b in bent), torch.zeros_like(value)))
 
 
 def _differentiable(x: Tensor) -> Tensor | None:
-    """``x`` to differentiate by; `None` inside a transform of `torch.func`, where only its own derivatives work, at a higher
-    cost."""
+    """``x`` to differentiate by; `None` inside a transform of `torch.func`."""
     try:
         return x if x.requires_grad else x.detach().requires_grad_(True)
     except RuntimeError:
@@ -65,9 +98,10 @@ def _differentiable(x: Tensor) -> Tensor | None:
 
 
 @torch.no_grad()
-def chunked_jet(field: Field, x: Tensor, chunk: int = CHUNK) -> Jet:
+def chunked_jet(field: Field, x: Tensor, sigma: Tensor | None = None, chunk: int = CHUNK) -> Jet:
     """The jet of a scalar ``field`` at many states, without a graph."""
-    return Jet.concatenate([jet(field, part) for part in x.split(chunk)])
+    columns = [None] * len(x.split(chunk)) if sigma is None else sigma.split(chunk)
+    return Jet.concatenate([jet(field, part, s) for part, s in zip(x.split(chunk), columns, strict=True)])
 
 
 def value_and_jacobian(field: Field, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -100,3 +134,17 @@ def divergence(vector_field: Field, x: Tensor) -> Tensor:
     """`div v(x)` ``(N,)`` of a field ``(N, d) -> (N, d)``."""
     _, jacobian = value_and_jacobian(vector_field, x)
     return torch.diagonal(jacobian, dim1=0, dim2=2).sum(dim=-1)
+
+
+def diffusion_divergences(noise: Field, x: Tensor) -> tuple[Tensor, Tensor]:
+    """`div D` ``(N, d)``, with components `sum_j d_j D_ij`, and `div div D` ``(N,)``, of `D = sigma sigma^T / 2` for the
+    field ``noise``, `sigma`: ``(N, d) -> (N, d, k)``."""
+
+    def row_divergence(y: Tensor) -> Tensor:
+        D = lambda z: 0.5 * torch.einsum("nik,njk->nij", noise(z), noise(z)).flatten(1)
+        d = y.shape[1]
+        _, jacobian = value_and_jacobian(D, y)  # (d d, N, d)
+        return torch.einsum("ijnj->ni", jacobian.unflatten(0, (d, d)))
+
+    div_D, jacobian = value_and_jacobian(row_divergence, x)
+    return div_D, torch.einsum("ini->n", jacobian)

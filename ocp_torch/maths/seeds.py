@@ -40,6 +40,7 @@ class Branch(IntEnum):
     DRAWN_STARTS = 21  # which weighted starts are kept; below, how many
     MASS = 22  # states for the mass of a density, the same in every run
     REFERENCE = 23  # states between the nodes of a reference grid, the same in every run
+    BROWNIAN = 24  # paths of the noise; below, the rows they are for and how often their steps are halved
     AUDIT = 1000  # which trajectories are simulated again with finer steps
 
 

@@ -6,7 +6,6 @@ from torch import Tensor
 
 from ocp_torch.errors import require_number
 from ocp_torch.fields.fields import VALUE, Fields
-from ocp_torch.maths import jets
 from ocp_torch.objectives.objective import Objective
 from ocp_torch.objectives.phase import Phase
 from ocp_torch.problems.problem import Problem
@@ -36,8 +35,9 @@ class Dual(Objective):
         self.residual = require_number("method.residual", residual, at_least=0.0)
 
     def losses(self, fields: Fields, samples: Samples, phase: Phase) -> dict[str, Tensor]:
-        V = jets.jet(fields.value, samples.x)
-        slack = self.generator(samples).hjb_slack(V)
+        generator = self.generator(samples)
+        V = generator.jet(fields.value)
+        slack = generator.hjb_slack(V)
         return {"value": value_loss(phase, fields, samples, V.value, slack, self.residual)}
 
 

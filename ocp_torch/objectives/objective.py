@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from ocp_torch.fields.fields import Fields
-from ocp_torch.maths import jets
 from ocp_torch.maths.jets import Field
 from ocp_torch.objectives.phase import Phase
 from ocp_torch.problems.generator import Generator
@@ -63,7 +62,7 @@ class Objective(ABC):
         shown: dict[str, Tensor] = {}
         generator = self.generator(samples)
         if fields.value is not None:
-            slack = generator.hjb_slack(jets.jet(fields.value, samples.x)).clamp_min(0.0)
+            slack = generator.hjb_slack(generator.jet(fields.value)).clamp_min(0.0)
             shown |= {"slack_mean_positive": samples.mean(slack), "slack_maximum": slack.max()}
         given = samples.div_a is not None and samples.div_B is not None
         if given and fields.control_density is not None and fields.log_occupation is not None:

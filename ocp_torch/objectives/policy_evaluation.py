@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
-from ocp_torch.maths import jets
 from ocp_torch.objectives.objective import Objective
 from ocp_torch.objectives.phase import Phase
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -16,10 +15,10 @@ from ocp_torch.problems.samples import Samples
 class PolicyEvaluation(Objective):
     r"""`min_mu E[r^2]` and, where a value function is wanted too, `min_V E[(Q_u / s)^2]`, on samples of a `ClosedLoop`.
 
-    `r = mu0 - mu (1 + (grad log mu . g_u + div g_u) / rho)` is the Liouville residual, `Q_u` the Bellman slack and `s` the
-    scale of the `V` network: the strong forms of P(u) and D(u) (section 5.4 of the paper). The two players do not
-    interact; there is no hinge and no game. Missing mass (`r > 0`) may cost the bounds more, or less, than surplus:
-    ``positive_weight`` is what `r^2` weighs there, where it weighs 1 elsewhere.
+    `r = mu0 - mu (1 + (grad log mu . g_u + div g_u) / rho)`, and what noise adds, is the Liouville residual, `Q_u` the
+    Bellman slack and `s` the scale of the `V` network: the strong forms of P(u) and D(u) (section 5.4 of the paper).
+    The two players do not interact; there is no hinge and no game. Missing mass (`r > 0`) may cost the bounds more, or
+    less, than surplus: ``positive_weight`` is what `r^2` weighs there, where it weighs 1 elsewhere.
     """
 
     def __init__(self, problem: ClosedLoop, with_value: bool, positive_weight: float = 1.0) -> None:
@@ -36,6 +35,6 @@ class PolicyEvaluation(Objective):
         r = samples.mu0 - outflow
         losses = {"occupation": samples.mean(torch.where(r > 0.0, self.positive_weight, 1.0) * r.square())}
         if "value" in self.players:
-            slack = generator.hjb_slack(jets.jet(fields.value, samples.x))
+            slack = generator.hjb_slack(generator.jet(fields.value))
             losses["value"] = samples.mean((slack / getattr(fields.value, "scale", 1.0)).square())
         return losses

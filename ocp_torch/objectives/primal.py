@@ -14,7 +14,7 @@ from ocp_torch.problems.samples import Samples
 
 
 class ClosedPrimal(Objective):
-    r"""Without drift: minimise `G(w) = min_mu J(w, mu)`, whose minimum over `mu` is pointwise (Lemma 2)."""
+    r"""Without drift and noise: minimise `G(w) = min_mu J(w, mu)`, whose minimum over `mu` is pointwise (Lemma 2)."""
 
     players = {"density": (CONTROL_DENSITY,)}
     occupation = CLOSED
@@ -28,7 +28,7 @@ class ClosedPrimal(Objective):
 
 
 class NetworkPrimal(Objective):
-    r"""With drift: minimise `J(w, mu)` over two networks, `w` and `log mu`."""
+    r"""With drift or noise: minimise `J(w, mu)` over two networks, `w` and `log mu`."""
 
     players = {"density": (CONTROL_DENSITY, LOG_OCCUPATION)}
     occupation = NETWORK
@@ -44,9 +44,10 @@ class NetworkPrimal(Objective):
 
 
 def primal(problem: Problem, occupation: str = "auto") -> Objective:
-    """The primal with `mu` in closed form (only where `a = 0`), by a network, or whichever suits the problem.
+    """The primal with `mu` in closed form (only where `a = 0` and there is no noise), by a network, or whichever suits the
+    problem.
 
-    Raises `InputError` for ``occupation="closed"`` with drift.
+    Raises `InputError` for ``occupation="closed"`` with drift or noise.
     """
     require_choice("method.occupation", occupation, ("auto", "closed", "network"))
     if occupation == "closed" and not problem.driftless:
@@ -54,10 +55,15 @@ def primal(problem: Problem, occupation: str = "auto") -> Objective:
             "method.occupation is 'closed', but this problem has drift, for which mu has no closed form; "
             "use method.occupation=network or auto."
         )
+    if occupation == "closed" and problem.noisy:
+        raise InputError(
+            "method.occupation is 'closed', but this problem has noise, with which the residual at a state depends on mu "
+            "around it; use method.occupation=network or auto."
+        )
     if occupation == "closed" and not problem.has_simulator:
         raise InputError("method.occupation is 'closed', but mu at a new state needs f there, which no data set gives.")
     if not problem.gives_divergences:
         note = "this problem gives no divergences of a and B: primal falls back to the saddle, without J."
         return Saddle(problem, augmentation=1.0, notes=(note,))
-    closed = problem.driftless and problem.has_simulator and occupation != "network"
+    closed = problem.driftless and not problem.noisy and problem.has_simulator and occupation != "network"
     return (ClosedPrimal if closed else NetworkPrimal)(problem)

@@ -1,6 +1,6 @@
 r"""The primal-dual saddle, PD (section 6 of the paper), as it stands there and with each player's exact penalty added.
 
-`L(V; w, mu) = E[V mu0 + l]` with `l = (f + R(w/mu)) mu - V mu + grad V . (a mu + B w) / rho` is its Lagrangian.
+`L(V; w, mu) = E[V mu0 + l]` with `l = (f + R(w/mu)) mu - V mu + (L^0 V mu + grad V . B w) / rho` is its Lagrangian.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from torch import Tensor
 
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fields
-from ocp_torch.maths import jets
 from ocp_torch.objectives.dual import value_loss
 from ocp_torch.objectives.objective import NETWORK, SADDLE, Objective
 from ocp_torch.objectives.phase import Phase
@@ -18,7 +17,7 @@ from ocp_torch.problems.samples import Samples
 
 
 class Saddle(Objective):
-    r"""`sup_V inf_w Psi`, `Psi = E[V mu0 + grad V . B w / rho + S_M(w, f - V + grad V . a / rho)]`, `S_M` of Lemma 3.
+    r"""`sup_V inf_w Psi`, `Psi = E[V mu0 + grad V . B w / rho + S_M(w, f - V + L^0 V / rho)]`, `S_M` of Lemma 3.
 
     Convex in `w`, concave in `V`, and needs no divergence of the problem. (With a limit `c` on the control, `S_M` is finite
     for `|w| <= c M` only, and `w` is shrunk to that ball first.) With ``augmentation`` `k > 0` the value player
@@ -33,7 +32,8 @@ class Saddle(Objective):
         self.augmentation = augmentation
 
     def losses(self, fields: Fields, samples: Samples, phase: Phase) -> dict[str, Tensor]:
-        generator, V = self.generator(samples), jets.jet(fields.value, samples.x)
+        generator = self.generator(samples)
+        V = generator.jet(fields.value)
         w = self.cost.within(fields.control_density(samples.x), phase.constants.M)
         pushed, beta = generator.controlled(V, w) / self.rho, generator.reduced_cost(V)
         psi = samples.mean(V.value * samples.mu0 + pushed + self.cost.saddle_minimum(w, beta, phase.constants.M))
@@ -90,7 +90,8 @@ class AugmentedSaddle(Objective):
 
     def losses(self, fields: Fields, samples: Samples, phase: Phase) -> dict[str, Tensor]:
         k, C_V = self.augmentation, phase.constants.C_V
-        generator, V = self.generator(samples), jets.jet(fields.value, samples.x)
+        generator = self.generator(samples)
+        V = generator.jet(fields.value)
         of_value = k * value_loss(phase, fields, samples, V.value, generator.hjb_slack(V), self.residual)
         if not self.needs_divergences(phase):
             return {"value": of_value}

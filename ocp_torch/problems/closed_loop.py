@@ -51,5 +51,11 @@ class ClosedLoop(Problem):
     def control_divergence(self, x: Tensor) -> Tensor:
         return x.new_zeros(len(x), 1)
 
+    def noise(self, x: Tensor) -> Tensor | None:
+        return self.problem.noise(x)
+
+    def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return self.problem.noise_divergences(x)
+
     def initial_density(self, x: Tensor) -> Tensor:
         return self.problem.initial_density(x)

@@ -1,7 +1,9 @@
-r"""The generator `L^u V = grad V . (a + B u)`, the rate at which `V` changes along the system, and what is made of it.
+r"""The generator `L^u V = grad V . (a + B u) + D : hess V`, the rate at which `V` changes along the system in the mean, and
+what is made of it; `D = sigma sigma^T / 2` is there where there is noise.
 
 Every loss and every bound is a mean or a supremum of two constraint violations: the slack of the Hamilton-Jacobi-Bellman
-equation for `V`, and the residual of Liouville's equation, the adjoint one, for `(w, mu)`. They are written here, once.
+equation for `V`, and the residual of Liouville's (with noise Fokker and Planck's) equation, the adjoint one, for `(w, mu)`.
+They are written here, once.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.jets import Field, Jet, control_flux_divergence, jet
+from ocp_torch.maths.jets import Field, Jet, chunked_jet, control_flux_divergence, jet
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
@@ -21,7 +23,7 @@ from ocp_torch.problems.samples import Samples
 def hjb_slack(value, state_cost, transport, conjugate):
     r"""`Q = V - f - L^0 V / rho + R*(-B^T grad V / rho)` from its four terms, ``(N,)``: `V` is a subsolution where `Q <= 0`.
 
-    The terms are tensors, NumPy arrays or Taylor models. ``transport``, the third, is `None` where there is no drift, and
+    The terms are tensors, NumPy arrays or Taylor models. ``transport``, the third, is `None` where `L^0 = 0`, and
     where ``value`` is `V - L^0 V / rho` already.
     """
     free = value - state_cost if transport is None else value - state_cost - transport
@@ -40,8 +42,9 @@ class Generator:
     r"""`L^u` of a problem of discount ``rho`` and control cost ``cost`` at `N` states, and its adjoint.
 
     ``data`` are the problem's Samples there. The methods up to `reduced_cost` also serve other arithmetics: ``data`` may be
-    anything with `f`, `a` (`None` for no drift) and `B` as NumPy arrays or Taylor models, and needs no ``cost``. Methods of
-    Liouville's equation raise `InputError` where the Samples have no divergences.
+    anything with `f`, `a` (`None` for no drift), `B` and `noise` as NumPy arrays or Taylor models, and needs no ``cost``.
+    Jets are to be those of `jet`, which has the curvature where there is noise. Methods of Liouville's equation raise
+    `InputError` where the Samples have no divergences.
     """
 
     data: Samples | Any
@@ -53,12 +56,24 @@ class Generator:
         """That of ``problem`` at ``samples`` of it."""
         return cls(samples, problem.discount, problem.control_cost)
 
-    def uncontrolled(self, V: Jet) -> Any:
-        """`L^0 V = grad V . a`, ``(N,)``."""
+    def jet(self, field: Field) -> Jet:
+        """The jet of a scalar ``field`` at the samples."""
+        return jet(field, self.data.x, self.data.noise)
+
+    def chunked_jet(self, field: Field) -> Jet:
+        """`jet` at many samples, without a graph."""
+        return chunked_jet(field, self.data.x, self.data.noise)
+
+    def advection(self, V: Jet) -> Any:
+        """`grad V . a`, ``(N,)``."""
         return (V.gradient * self.data.a).sum(-1)
 
+    def uncontrolled(self, V: Jet) -> Any:
+        """`L^0 V = grad V . a + D : hess V`, ``(N,)``."""
+        return self.advection(V) if V.curvature is None else self.advection(V) + V.curvature
+
     def transport(self, V: Jet) -> Any:
-        """`L^0 V / rho`, ``(N,)``; `None` where there is no drift."""
+        """`L^0 V / rho`, ``(N,)``; `None` where there is neither drift nor noise."""
         return None if self.data.a is None else self.uncontrolled(V) / self.rho
 
     def push(self, V: Jet) -> Any:
@@ -70,7 +85,7 @@ class Generator:
         return self.data.f - V.value + self.transport(V)
 
     def __call__(self, V: Jet, u: Tensor) -> Tensor:
-        """`L^u V = grad V . (a + B u)`, ``(N,)``."""
+        """`L^u V = grad V . (a + B u) + D : hess V`, ``(N,)``."""
         return self.uncontrolled(V) + self.controlled(V, u)
 
     def controlled(self, V: Jet, u: Tensor) -> Tensor:
@@ -87,7 +102,7 @@ class Generator:
         return V.value - self.data.f - self.cost.cost(u) - self(V, u) / self.rho
 
     def multiplier_term(self, V: Jet, mu: Tensor, w: Tensor) -> Tensor:
-        """`-V mu + grad V . (a mu + B w) / rho`, ``(N,)``: what the multiplier `V` charges for `mu` and `w`."""
+        """`-V mu + (L^0 V mu + grad V . B w) / rho`, ``(N,)``: what the multiplier `V` charges for `mu` and `w`."""
         return (self.uncontrolled(V) * mu + self.controlled(V, w)) / self.rho - V.value * mu
 
     def control_inflow(self, control_density: Field) -> tuple[Tensor, Tensor]:
@@ -97,20 +112,33 @@ class Generator:
         return w, self.data.mu0 - flux / self.rho
 
     def occupation_outflow(self, log_occupation: Field) -> tuple[Tensor, Tensor]:
-        """`mu` and `mu + div(a mu) / rho`, both ``(N,)``: the mass that is discounted, and that drift carries away.
+        """`mu` and `mu + (div(a mu) - div div(D mu)) / rho`, both ``(N,)``: the mass that is discounted, and that drift and
+        noise carry away.
 
-        `control_inflow` less this is Liouville's residual `r = mu0 - mu - div(a mu + B w) / rho`.
+        `control_inflow` less this is the residual `r = mu0 - mu - (div(a mu + B w) - div div(D mu)) / rho`.
         """
         div_a, _ = self.data.require_divergences("the primal objective")
-        log_mu = jet(log_occupation, self.data.x)
+        log_mu = self.jet(log_occupation)
         mu = log_mu.value.exp()
-        return mu, mu * (1.0 + (div_a + self.uncontrolled(log_mu)) / self.rho)
+        carried = div_a + self.advection(log_mu)
+        if self.data.noise is not None:
+            bent = log_mu.curvature + 0.5 * pull_back(self.data.noise, log_mu.gradient).square().sum(-1)
+            carried = carried - self._spread(torch.ones_like(mu), log_mu.gradient, bent)
+        return mu, mu * (1.0 + carried / self.rho)
 
     def drift_flux_divergence(self, occupation: Field) -> tuple[Tensor, Tensor]:
-        """`mu` and `div(a mu)`, both ``(N,)``, where `mu` itself is the field, which may be 0."""
+        """`mu` and `div(a mu) - div div(D mu)`, both ``(N,)``, where `mu` itself is the field, which may be 0."""
         div_a, _ = self.data.require_divergences("J")
-        mu = jet(occupation, self.data.x)
-        return mu.value, mu.value * div_a + self.uncontrolled(mu)
+        mu = self.jet(occupation)
+        carried = mu.value * div_a + self.advection(mu)
+        return mu.value, carried if mu.curvature is None else carried - self._spread(
+            mu.value, mu.gradient, mu.curvature
+        )
+
+    def _spread(self, value: Tensor, gradient: Tensor, curvature: Tensor) -> Tensor:
+        """`div div(D mu) = D : hess mu + 2 div D . grad mu + mu div div D`, ``(N,)``; or all of it over `mu`."""
+        div_D, div_div_D = self.data.noise_divergences
+        return curvature + 2.0 * (div_D * gradient).sum(-1) + value * div_div_D
 
     def primal_integrand(self, w: Tensor, mu: Tensor, residual: Tensor, value_bound: float) -> Tensor:
         """The integrand of `J`: `f mu + mu R(w/mu) + C_V max(residual, 0)`, ``(N,)``; 0 for `f mu` where `f = 0`."""

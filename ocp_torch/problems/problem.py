@@ -1,9 +1,11 @@
 r"""A discounted control-affine problem on the unit torus, known through evaluations at batches of states.
 
-minimise  rho E_{x0 ~ mu0} int_0^inf e^{-rho t} (f(x_t) + |u_t|^q / q) dt,   dx/dt = a(x) + B(x) u
+minimise  rho E int_0^inf e^{-rho t} (f(x_t) + |u_t|^q / q) dt,   dx = (a(x) + B(x) u) dt + sigma(x) dW,   x_0 ~ mu0
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -13,6 +15,7 @@ from ocp_torch.errors import InputError, require_integer, require_number
 from ocp_torch.maths import jets
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
+from ocp_torch.problems.arguments import require_numbers
 from ocp_torch.problems.control_limit import control_cost
 from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.reproducible import Reproducible
@@ -35,7 +38,8 @@ class Problem(Reproducible):
     All methods are batched, take states ``(N, d)``, work in the precision and on the device of their argument, and have
     period 1 in each coordinate. Arguments of `__init__`: ``dim`` is `d`, ``control_dim`` is `m` (default `d`),
     ``discount`` is `rho > 0` (per unit time), ``exponent`` is `q` in (1, 2], ``control_limit`` is `c > 0` where controls
-    must satisfy `|u| <= c` (Euclidean), else `None`. Raises `InputError` outside these ranges.
+    must satisfy `|u| <= c` (Euclidean), else `None`; ``noise`` is `nu >= 0`, or one for each coordinate, where Brownian
+    motions spread the state (`D = nu`, torus units squared per unit time). Raises `InputError` outside these ranges.
 
     Attributes a subclass may set, each `None` where unknown: ``state_cost_bound >= sup f``; ``occupation_bound >= sup
     mu*`` (`math.inf` when known to be unbounded); ``control_bound >= sup |u*|``; ``value_bound >= sup V*``;
@@ -57,6 +61,7 @@ class Problem(Reproducible):
         discount: float = 2.0,
         exponent: float = 2.0,
         control_limit: float | None = None,
+        noise: float | Sequence[float] = 0.0,
     ) -> None:
         self.dim = require_integer("problem.dim", dim, 1, maximum=MOST_COORDINATES)
         self.control_dim = (
@@ -76,6 +81,7 @@ class Problem(Reproducible):
         self.value_bound: float | None = None
         self.exact_optimum: float | None = None
         self.lipschitz: Lipschitz | None = None
+        self.diffusion = constant_diffusion(noise, self.dim)
         self._placed: dict = {}
 
     def state_cost(self, x: Tensor) -> Tensor:
@@ -90,6 +96,26 @@ class Problem(Reproducible):
         """`B`, ``(N, d, m)``; by default control `k` moves coordinate `k`."""
         eye = torch.eye(self.dim, self.control_dim, dtype=x.dtype, device=x.device)
         return eye.expand(len(x), self.dim, self.control_dim)
+
+    def noise(self, x: Tensor) -> Tensor | None:
+        """`sigma`, ``(N, d, k)``, of `k` Brownian motions (Ito); `None` where there is no noise. By default that of the
+        argument ``noise``. An override may be degenerate, and vary with the state."""
+        if self.diffusion is None:
+            return None
+        sigma = torch.tensor(self.diffusion, dtype=torch.float64).mul(2.0).sqrt().diag()
+        return self._like(x, "sigma", sigma).expand(len(x), -1, -1)
+
+    @property
+    def noisy(self) -> bool:
+        """Whether there is noise."""
+        return self.noise(torch.full((1, self.dim), 0.5, dtype=torch.float64)) is not None
+
+    def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """`div D` ``(N, d)``, with components `sum_j d_j D_ij`, and its divergence ``(N,)``, where there is noise: by
+        autograd through `noise`. Override it where they are known."""
+        if type(self).noise is Problem.noise:
+            return torch.zeros_like(x), torch.zeros_like(x[:, 0])
+        return jets.diffusion_divergences(self.noise, x)
 
     def initial_density(self, x: Tensor) -> Tensor:
         """Density `mu0` of the initial state, ``(N,)``, with mean 1 over the torus; uniform unless overridden."""
@@ -189,3 +215,17 @@ class Problem(Reproducible):
         if key not in self._placed:
             self._placed[key] = constant.to(x)
         return self._placed[key]
+
+
+def constant_diffusion(noise: float | Sequence[float], dim: int) -> tuple[float, ...] | None:
+    """``noise`` as the diagonal of `D`; `None` where all of it is 0. Raises `InputError` unless it is a number `>= 0`, or
+    ``dim`` of them."""
+    if isinstance(noise, Sequence) and not isinstance(noise, str):
+        each = require_numbers("problem.noise", noise, dim)
+    else:
+        each = [require_number("problem.noise", noise)] * dim
+    if min(each) < 0.0:
+        raise InputError(
+            f"problem.noise is {noise}, but must be 0 or more: it is a diffusion, a variance per unit time."
+        )
+    return tuple(each) if max(each) > 0.0 else None

@@ -21,7 +21,7 @@ class Samples:
 
     `weight` is one over the density the states were drawn from, so that a weighted mean estimates an integral over the
     torus. `penalty_weight` is what a violated inequality weighs at each state, `None` for as much as `weight`; it may be
-    above 0 where `weight` is 0. The divergences are `None` where the problem cannot give them.
+    above 0 where `weight` is 0. The divergences are `None` where the problem cannot give them, `noise` where there is none.
     """
 
     x: Tensor  # (N, d) states
@@ -33,11 +33,16 @@ class Samples:
     div_a: Tensor | None = None  # (N,) divergence of the drift
     div_B: Tensor | None = None  # (N, m) divergence of each column of B
     penalty_weight: Tensor | None = None  # (N,)
+    noise: Tensor | None = None  # (N, d, k) sigma
+    div_D: Tensor | None = None  # (N, d) divergence of the rows of D = sigma sigma^T / 2
+    div_div_D: Tensor | None = None  # (N,) the divergence of that
 
     @classmethod
     @torch.no_grad()
     def of(cls, problem: Problem, x: Tensor, divergences: bool = True, weight: Tensor | None = None) -> Samples:
         """Evaluate ``problem`` at the states ``x`` of shape ``(N, d)``."""
+        noise = problem.noise(x)
+        spread = problem.noise_divergences(x) if divergences and noise is not None else (None, None)
         return cls(
             x=x,
             f=problem.state_cost(x),
@@ -47,6 +52,9 @@ class Samples:
             weight=torch.ones_like(x[:, 0]) if weight is None else weight,
             div_a=problem.drift_divergence(x) if divergences else None,
             div_B=problem.control_divergence(x) if divergences else None,
+            noise=noise,
+            div_D=spread[0],
+            div_div_D=spread[1],
         )
 
     def __len__(self) -> int:
@@ -65,6 +73,13 @@ class Samples:
         if self.div_a is None or self.div_B is None:
             raise InputError(f"{who} needs the divergences of a and B, which this problem does not give.")
         return self.div_a, self.div_B
+
+    @property
+    def noise_divergences(self) -> tuple[Tensor, Tensor]:
+        """`div D` ``(N, d)`` and `div div D` ``(N,)``, or an `InputError` that says that they are missing."""
+        if self.div_D is None or self.div_div_D is None:
+            raise InputError("the residual with noise needs the divergences of D, which this problem does not give.")
+        return self.div_D, self.div_div_D
 
     def take(self, index: Tensor | slice) -> Samples:
         """The samples at the rows ``index``."""

@@ -24,12 +24,13 @@ def test_a_network_is_bitwise_periodic_in_value_and_gradient(dim, dtype, device)
     """Multiples of 2^-10 are exact in float32 also after shifts by whole numbers up to 2^13."""
     network = seeded(0, dim, modes=4).to(device, dtype)
     x = torch.randint(2**10, (200, dim), generator=torch.Generator().manual_seed(0)).to(device, dtype) / 2**10
-    reference = vars(jet(network, x)).values()
+    sigma = torch.randn(200, dim, dim, generator=torch.Generator().manual_seed(1)).to(device, dtype)
+    reference = vars(jet(network, x, sigma)).values()
     for shift in (1.0, -1.0, -7.0, 2.0**13):
         for coordinate in range(dim):
             moved = x.clone()
             moved[:, coordinate] += shift
-            for found, expected in zip(vars(jet(network, moved)).values(), reference, strict=True):
+            for found, expected in zip(vars(jet(network, moved, sigma)).values(), reference, strict=True):
                 assert torch.equal(found, expected)
 
 
@@ -37,7 +38,8 @@ def test_a_network_made_in_single_precision_is_smooth_at_the_wrap_once_it_is_dou
     """Wave numbers rounded in float32 would leave a jump of about 1e-7; second derivatives are of order 100."""
     network = seeded(1, 1, modes=6).double()
     left, right = torch.tensor([[1.0 - 1e-12]], dtype=torch.float64), torch.tensor([[0.0]], dtype=torch.float64)
-    ends = [vars(jet(network, x)).values() for x in (left, right)]
+    sigma = torch.ones(1, 1, 1, dtype=torch.float64)
+    ends = [vars(jet(network, x, sigma)).values() for x in (left, right)]
     for at_one, at_zero in zip(*ends, strict=True):
         torch.testing.assert_close(at_one, at_zero, rtol=0.0, atol=1e-9)
 

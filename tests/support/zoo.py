@@ -44,6 +44,14 @@ class Swing(Problem):
         return 1.0 + 0.5 * (TURN * (x[:, 0] + 2.0 * x[:, 1])).cos()
 
 
+class NoisySwing(Swing):
+    """With noise of one Brownian motion in two coordinates, that varies and vanishes somewhere; divergences by autograd."""
+
+    def noise(self, x):
+        column = torch.stack([0.3 * (TURN * x[:, 1]).sin(), 0.2 + 0.1 * (TURN * x.sum(dim=-1)).cos()], dim=-1)
+        return column.unsqueeze(-1)
+
+
 _KINKED = {
     "circle rho=2": partial(Circle, discount=2.0),
     "circle rho=4": partial(Circle, discount=4.0),
@@ -73,11 +81,27 @@ _LIMITED = {
     ),
     "limited 3-d m=2 q=1.2": partial(Manufactured, dim=3, control_dim=2, exponent=1.2, control_limit=0.5),
 }
-_CASES = {**_KINKED, **_SMOOTH, **_LIMITED, "swing": Swing}
+# Exact truth with noise: isotropic; full and varying; in one coordinate of two; and beside all else.
+_NOISY = {
+    "noisy 1-d": partial(Manufactured, dim=1, noise=0.02),
+    "noisy 2-d sigma(x)": partial(Manufactured, noise=[0.02, 0.01], state_dependent_noise=True, seed=1),
+    "noisy 2-d degenerate": partial(Manufactured, noise=[0.0, 0.05], control_limit=0.5, initial_contrast=0.5),
+    "noisy 3-d m=2 sigma(x) B(x) q=1.5": partial(
+        Manufactured,
+        dim=3,
+        control_dim=2,
+        exponent=1.5,
+        noise=0.02,
+        state_dependent_noise=True,
+        state_dependent_control=True,
+    ),
+}
+_CASES = {**_KINKED, **_SMOOTH, **_LIMITED, **_NOISY, "swing": Swing, "noisy swing": NoisySwing}
 
 # Names by what is known: V* with kinks and no drift; V* smooth, with drift; both of them; and every problem there is.
 KINKED, SMOOTH, EXACT = tuple(_KINKED), tuple(_SMOOTH), (*_KINKED, *_SMOOTH)
 ALL, LIMITED = (*EXACT, "swing"), tuple(_LIMITED)
+EXACT_NOISY, NOISY = tuple(_NOISY), (*_NOISY, "noisy swing")
 # Systems people have, without exact truth.
 _NATURAL = {
     "arm n=2": Arm,

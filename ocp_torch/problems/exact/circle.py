@@ -12,5 +12,5 @@ class Circle(Torus):
     below `alpha / rho` none of this is exact any more, and none of it is claimed.
     """
 
-    def __init__(self, discount: float = 2.0, control_limit: float | None = None) -> None:
-        super().__init__(dim=1, shear="none", discount=discount, control_limit=control_limit)
+    def __init__(self, discount: float = 2.0, control_limit: float | None = None, noise: float = 0.0) -> None:
+        super().__init__(dim=1, shear="none", discount=discount, control_limit=control_limit, noise=noise)

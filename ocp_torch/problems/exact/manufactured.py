@@ -1,12 +1,15 @@
 r"""A problem in which everything is prescribed first, and the drift and the cost are derived from it.
 
-Choose periodic `V0`, `B`, `q`, and densities `mu0`, `mu* > 0`. Then `u* = grad R*(-B^T grad V0 / rho)`; the flux
-`F = rho grad(phi) + h`, with `Laplace(phi) = mu0 - mu*` and `div h = 0`, satisfies Liouville's equation
-`mu0 = mu* + div(F) / rho`; the closed loop is `g* = F / mu*`, the drift `a = g* - B u*`, and the cost
-`f = V0 - grad V0 . g* / rho - |u*|^q / q + c` makes the Hamilton-Jacobi-Bellman equation hold with `V* = V0 + c`.
+Choose periodic `V0`, `B`, `sigma`, `q`, and densities `mu0`, `mu* > 0`. Then `u* = grad R*(-B^T grad V0 / rho)`; the flux
+`F = rho grad(phi) + h`, with `Laplace(phi) = mu0 - mu*` and `div h = 0`, satisfies `mu0 = mu* + div(F) / rho`; it is
+`g* mu* - div(D mu*)` of the closed loop `g*`, so the drift is `a = g* - B u*`, and the cost
+`f = V0 - (grad V0 . g* + D : hess V0) / rho - |u*|^q / q + c` makes the Hamilton-Jacobi-Bellman equation hold with
+`V* = V0 + c`.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -31,7 +34,8 @@ class Manufactured(Problem):
     ``control_dim <= dim`` (default ``dim``); ``drift_size`` is the amplitude of the divergence-free part of the flux (on
     the command line ``problem.drift``); ``control_size`` the largest `|u*|`; ``contrast`` in [0, 1) that of `mu*`, and
     ``initial_contrast`` that of `mu0`; with ``state_dependent_control`` each entry of `B` varies with one coordinate;
-    ``interaction`` is how many coordinates one trigonometric term couples; ``seed`` draws all coefficients. With a
+    ``noise`` is that of `Problem`, and with ``state_dependent_noise`` `sigma` is a full matrix that varies like `B`, of about
+    that size; ``interaction`` is how many coordinates one trigonometric term couples; ``seed`` draws all coefficients. With a
     ``control_limit`` below ``control_size``, which is then the largest control an unlimited optimum would use, `u*` stays
     at the limit on a part of the torus, and everything is as exact as before. Raises `InputError` for wrong arguments.
 
@@ -53,10 +57,10 @@ class Manufactured(Problem):
         interaction: int = 2,
         seed: int = 0,
         control_limit: float | None = None,
+        noise: float | Sequence[float] = 0.0,
+        state_dependent_noise: bool = False,
     ) -> None:
-        super().__init__(
-            dim=dim, control_dim=control_dim, discount=discount, exponent=exponent, control_limit=control_limit
-        )
+        super().__init__(dim, control_dim, discount, exponent, control_limit, noise)
         if self.control_dim > self.dim:
             raise InputError(f"problem.control_dim is {control_dim}, but must be at most problem.dim = {dim}.")
         self.drift_size = require_number("problem.drift", drift, at_least=0.0)
@@ -64,14 +68,11 @@ class Manufactured(Problem):
         self.contrast = require_number("problem.contrast", contrast, at_least=0.0, at_most=0.99)
         self.initial_contrast = require_number("problem.initial_contrast", initial_contrast, at_least=0.0, at_most=1.0)
         self.state_dependent_control = require_flag("problem.state_dependent_control", state_dependent_control)
+        self.state_dependent_noise = require_flag("problem.state_dependent_noise", state_dependent_noise)
         self.interaction = require_integer("problem.interaction", interaction, 1, maximum=max(2, self.dim))
         self.seed = require_integer("problem.seed", seed, 0)
         self._prescribe(torch.Generator().manual_seed(self.seed))
         self._derive()
-
-    @property
-    def parameters(self) -> dict:
-        return {**super().parameters, "drift": self.drift_size}
 
     @property
     def driftless(self) -> bool:
@@ -95,6 +96,10 @@ class Manufactured(Problem):
         self.phi = self.mu0.minus(self.mu).inverse_laplacian()
         self.stream = [self._stream_component(i, generator) for i in range(d)]
         self.B = WavyMatrix(d, self.control_dim, self.state_dependent_control, generator)
+        self.sigma = None
+        if self.diffusion is not None and self.state_dependent_noise:
+            self.sigma = WavyMatrix(d, d, True, generator)
+            self.sigma.mean *= torch.tensor(self.diffusion, dtype=torch.float64).mul(2.0).sqrt().unsqueeze(-1)
 
     def _stream_component(self, i: int, generator: torch.Generator) -> TrigonometricPolynomial:
         """`h_i`, which does not depend on coordinate `i`: half constant, half wave; `|h| <= drift`."""
@@ -133,22 +138,45 @@ class Manufactured(Problem):
         return -torch.einsum("ndm,nd->nm", self.B(x), self.V0.gradient(x)) / self.discount
 
     def _closed_loop(self, x: Tensor) -> Tensor:
-        """`g* = F / mu*`, ``(N, d)``."""
+        """`g* = (F + div(D mu*)) / mu*`, ``(N, d)``."""
         flux = self.discount * self.phi.gradient(x) + torch.stack([h(x) for h in self.stream], dim=-1)
-        return flux / self.mu(x).unsqueeze(-1)
+        sigma, density = self.noise(x), self.mu(x).unsqueeze(-1)
+        if sigma is not None:
+            div_D, _ = self.noise_divergences(x)
+            driven = torch.einsum("ndk,nd->nk", sigma, self.mu.gradient(x))
+            flux = flux + div_D * density + 0.5 * torch.einsum("ndk,nk->nd", sigma, driven)
+        return flux / density
+
+    def _curvature(self, function: TrigonometricPolynomial, x: Tensor) -> Tensor:
+        """`D : hess` of ``function``, ``(N,)``; 0 where there is no noise."""
+        sigma = self.noise(x)
+        if sigma is None:
+            return torch.zeros_like(x[:, 0])
+        return 0.5 * torch.einsum("nik,nij,njk->n", sigma, function.hessian(x), sigma)
+
+    def noise(self, x: Tensor) -> Tensor | None:
+        return super().noise(x) if self.sigma is None else self.sigma(x)
+
+    def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        if self.sigma is None:
+            return torch.zeros_like(x), torch.zeros_like(x[:, 0])
+        return self.sigma.square_divergences(x)
 
     def state_cost(self, x: Tensor) -> Tensor:
-        along = (self.V0.gradient(x) * self._closed_loop(x)).sum(dim=-1) / self.discount
-        return self.V0(x) - along - self.control_cost.cost(self.exact_control(x)) + self.c
+        along = (self.V0.gradient(x) * self._closed_loop(x)).sum(dim=-1) + self._curvature(self.V0, x)
+        return self.V0(x) - along / self.discount - self.control_cost.cost(self.exact_control(x)) + self.c
 
     def drift(self, x: Tensor) -> Tensor:
         pushed = torch.einsum("ndm,nm->nd", self.B(x), self.exact_control(x))
         return self._closed_loop(x) - pushed
 
     def drift_divergence(self, x: Tensor) -> Tensor:
-        """`div a = div g* - div(B u*)`, with `div g* = (rho (mu0 - mu*) - grad mu* . g*) / mu*` by Liouville's equation."""
-        density = self.mu(x)
-        outflow = self.discount * (self.mu0(x) - density) - (self.mu.gradient(x) * self._closed_loop(x)).sum(dim=-1)
+        """`div a = div g* - div(B u*)`, with `div g* = (rho (mu0 - mu*) + div div(D mu*) - grad mu* . g*) / mu*`."""
+        density, slope = self.mu(x), self.mu.gradient(x)
+        outflow = self.discount * (self.mu0(x) - density) - (slope * self._closed_loop(x)).sum(dim=-1)
+        if self.noisy:
+            div_D, div_div_D = self.noise_divergences(x)
+            outflow = outflow + self._curvature(self.mu, x) + 2.0 * (div_D * slope).sum(dim=-1) + density * div_div_D
         return outflow / density - self._pushed_divergence(x)
 
     def _pushed_divergence(self, x: Tensor) -> Tensor:

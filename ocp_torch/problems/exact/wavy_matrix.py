@@ -40,6 +40,12 @@ class WavyMatrix:
             return x.new_zeros(len(x), *self.mean.shape)
         return -2.0 * DEPTH * torch.pi * self.mean.to(x) * self._angle(x).sin()
 
+    def curvatures(self, x: Tensor) -> Tensor:
+        """The second derivative of each entry along its coordinate, ``(N, d, m)``."""
+        if not self.varies:
+            return x.new_zeros(len(x), *self.mean.shape)
+        return -DEPTH * (2.0 * torch.pi) ** 2 * self.mean.to(x) * self._angle(x).cos()
+
     def directions(self, x: Tensor) -> Tensor:
         """1 at `[i, k, c]` for the coordinate `c` of entry `(i, k)`, else 0: ``(d, m, d)``."""
         return torch.nn.functional.one_hot(self.coordinate.to(x.device), len(self.mean)).to(x)
@@ -48,6 +54,16 @@ class WavyMatrix:
         """Of each column, ``(N, m)``: entry `(i, k)` counts where it varies with coordinate `i`."""
         rows = torch.arange(len(self.mean), device=x.device).unsqueeze(-1)
         return (self.slopes(x) * (self.coordinate.to(x.device) == rows)).sum(dim=1)
+
+    def square_divergences(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        r"""`div D` ``(N, d)`` and `div div D` ``(N,)`` of `D = B B^T / 2`, by the product rule."""
+        B, slopes, along = self(x), self.slopes(x), self.directions(x)
+        columns = self.divergence(x)
+        turned = torch.einsum("nik,ikj->nijk", slopes, along)
+        rows = 0.5 * (torch.einsum("nijk,njk->ni", turned, B) + torch.einsum("nik,nk->ni", B, columns))
+        own = torch.einsum("iki->ik", along)
+        bent = (self.curvatures(x) * own * B).sum(dim=(1, 2))
+        return rows, bent + 0.5 * columns.square().sum(-1) + 0.5 * torch.einsum("nijk,njik->n", turned, turned)
 
     def _angle(self, x: Tensor) -> Tensor:
         return 2.0 * torch.pi * (x[:, self.coordinate.to(x.device)] + self.phase.to(x))
