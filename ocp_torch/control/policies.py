@@ -65,7 +65,7 @@ def zero_policy(problem: Problem) -> Policy:
 
 def occupation_density(kind: str | None, problem: Problem, fields: Fields, constants: Constants) -> Density:
     """`mu(x)` of trained fields: ``closed`` (Lemma 2, no drift), ``saddle`` (Lemma 3) or ``network`` (`exp log mu`)."""
-    cost, rho = problem.control_cost, problem.discount
+    cost = problem.control_cost
 
     def closed(x: Tensor) -> Tensor:
         samples = Samples.of(problem, x)
@@ -73,8 +73,8 @@ def occupation_density(kind: str | None, problem: Problem, fields: Fields, const
         return cost.primal_occupation(w, samples.f, constants.C_V, inflow)
 
     def saddle(x: Tensor) -> Tensor:
-        V = jets.jet(fields.value, x)
-        beta = problem.state_cost(x) - V.value + (V.gradient * problem.drift(x)).sum(dim=-1) / rho
+        generator = Generator.of(problem, Samples.of(problem, x, divergences=False))
+        beta = generator.reduced_cost(generator.jet(fields.value))
         return cost.saddle_occupation(fields.control_density(x), beta, constants.M)
 
     network = lambda x: fields.log_occupation(x).exp()

@@ -17,6 +17,9 @@ from torch import Tensor
 from ocp_torch.maths.runge_kutta import Dynamics
 from ocp_torch.maths.seeds import Branch, derive_seed
 
+# What a rate counts at a part of each of the horizons ``(N,)``.
+Weight = Callable[[Tensor, float], Tensor]
+
 # Paths that are followed together: their increments are kept while their steps are halved.
 TOGETHER = 512
 # How often steps are halved at most after the first time.
@@ -69,20 +72,30 @@ def increments(grid: Grid, motions: int, halvings: int, seed: int, rows: int) ->
     return grid.horizon.sqrt().unsqueeze(-1) * moves
 
 
+def discounted(rho: float) -> Weight:
+    """`rho e^{-rho t} dt`: what a rate counts up to the horizon."""
+    return lambda horizon, part: horizon * rho * torch.exp(-rho * horizon * part)
+
+
+def at_random_times(rho: float) -> Weight:
+    """For horizons `T ~ Exp(rho)`: as for `rate_at`, each `s` in (0, 1] gives the discounted integral in the mean, and they are
+    averaged by `8 s^7`, mostly near 1."""
+    return lambda horizon, part: 8.0 * part**8 * torch.exp(rho * horizon * (1.0 - part))
+
+
 @torch.no_grad()
 def path_integral(
-    dynamics: Dynamics, noise: Callable[[Tensor], Tensor], x0: Tensor, grid: Grid, moves: Tensor, density: Callable
+    dynamics: Dynamics, noise: Callable[[Tensor], Tensor], x0: Tensor, grid: Grid, moves: Tensor, weight: Weight
 ) -> tuple[Tensor, Tensor]:
-    """`int density(t / horizon) rate(x_t) dt` along each path ``(N,)`` from ``x0`` ``(N, d)``, and its end ``(N, d)``.
+    """`int weight(s) rate(x_t) ds` for `t = horizon s` along each path ``(N,)`` from ``x0`` ``(N, d)``, and its end ``(N, d)``.
 
-    ``noise`` gives `sigma` ``(N, d, k)``; ``moves`` ``(steps, N, k)`` are the increments; ``density`` maps a part of the
-    horizon to numbers ``(N,)``. The rule of the integral is the trapezoidal one.
+    ``noise`` gives `sigma` ``(N, d, k)``; ``moves`` ``(steps, N, k)`` are the increments. The rule is the trapezoidal one.
     """
     parts, x, total = grid.parts, x0, torch.zeros_like(grid.horizon)
     widths = torch.nn.functional.pad(parts.diff(), (1, 1))
     for k, part in enumerate(parts.tolist()):
         velocity, rate = dynamics(x)
-        total = total + 0.5 * float(widths[k] + widths[k + 1]) * grid.horizon * density(part) * rate
+        total = total + 0.5 * float(widths[k] + widths[k + 1]) * weight(grid.horizon, part) * rate
         if k < grid.steps:
             step = float(widths[k + 1]) * grid.horizon.unsqueeze(-1)
             x = x + step * velocity + torch.einsum("ndk,nk->nd", noise(x), moves[k])
@@ -105,13 +118,13 @@ def expectation(
     x0: Tensor,
     weights: Tensor,
     grid: Grid,
-    density: Callable[[slice], Callable],
+    weight: Weight,
     tolerance: float,
     seed: int,
     standard_error: Callable[[Tensor], float],
 ) -> Expectation:
     """Means of `path_integral` by ``weights`` ``(N,)``, with steps halved until halving moves them by less than ``tolerance``
-    or little beside the ``standard_error`` of the results. ``density`` maps rows to theirs.
+    or little beside the ``standard_error`` of the results.
 
     The bias is what the last halving moved the extrapolated mean by, twice its own standard error included.
     """
@@ -122,7 +135,7 @@ def expectation(
         parts = []
         for number, rows in enumerate(_rows(len(x0))):
             moves = increments(grid.of(rows), motions, halvings, seed, number)
-            parts.append(path_integral(dynamics, noise, x0[rows], fine.of(rows), moves, density(rows)))
+            parts.append(path_integral(dynamics, noise, x0[rows], fine.of(rows), moves, weight))
         return torch.cat([r for r, _ in parts]), torch.cat([e for _, e in parts])
 
     coarse, (fine, end) = followed(0)[0], followed(1)

@@ -65,5 +65,5 @@ def primal(problem: Problem, occupation: str = "auto") -> Objective:
     if not problem.gives_divergences:
         note = "this problem gives no divergences of a and B: primal falls back to the saddle, without J."
         return Saddle(problem, augmentation=1.0, notes=(note,))
-    closed = problem.driftless and not problem.noisy and problem.has_simulator and occupation != "network"
+    closed = problem.still and problem.has_simulator and occupation != "network"
     return (ClosedPrimal if closed else NetworkPrimal)(problem)

@@ -70,7 +70,11 @@ class Generator:
 
     def uncontrolled(self, V: Jet) -> Any:
         """`L^0 V = grad V . a + D : hess V`, ``(N,)``."""
-        return self.advection(V) if V.curvature is None else self.advection(V) + V.curvature
+        if V.curvature is None:
+            if self.data.noise is not None:
+                raise TypeError("where there is noise the jet of V must have its curvature: take it by Generator.jet")
+            return self.advection(V)
+        return self.advection(V) + V.curvature
 
     def transport(self, V: Jet) -> Any:
         """`L^0 V / rho`, ``(N,)``; `None` where there is neither drift nor noise."""
@@ -117,6 +121,11 @@ class Generator:
 
         `control_inflow` less this is the residual `r = mu0 - mu - (div(a mu + B w) - div div(D mu)) / rho`.
         """
+        mu, outflow, _ = self.occupation_flux(log_occupation)
+        return mu, outflow
+
+    def occupation_flux(self, log_occupation: Field) -> tuple[Tensor, Tensor, Tensor]:
+        """Those two, and the flux `a mu - div(D mu)` ``(N, d)`` that carries the mass."""
         div_a, _ = self.data.require_divergences("the primal objective")
         log_mu = self.jet(log_occupation)
         mu = log_mu.value.exp()
@@ -124,16 +133,24 @@ class Generator:
         if self.data.noise is not None:
             bent = log_mu.curvature + 0.5 * pull_back(self.data.noise, log_mu.gradient).square().sum(-1)
             carried = carried - self._spread(torch.ones_like(mu), log_mu.gradient, bent)
-        return mu, mu * (1.0 + carried / self.rho)
+        return mu, mu * (1.0 + carried / self.rho), self._flux(mu, mu.unsqueeze(-1) * log_mu.gradient)
 
-    def drift_flux_divergence(self, occupation: Field) -> tuple[Tensor, Tensor]:
-        """`mu` and `div(a mu) - div div(D mu)`, both ``(N,)``, where `mu` itself is the field, which may be 0."""
+    def drift_flux(self, occupation: Field) -> tuple[Tensor, Tensor, Tensor]:
+        """`mu`, `div F` ``(N,)`` and `F = a mu - div(D mu)` ``(N, d)``, where `mu` itself is the field, which may be 0."""
         div_a, _ = self.data.require_divergences("J")
         mu = self.jet(occupation)
         carried = mu.value * div_a + self.advection(mu)
-        return mu.value, carried if mu.curvature is None else carried - self._spread(
-            mu.value, mu.gradient, mu.curvature
-        )
+        if mu.curvature is not None:
+            carried = carried - self._spread(mu.value, mu.gradient, mu.curvature)
+        return mu.value, carried, self._flux(mu.value, mu.gradient)
+
+    def _flux(self, value: Tensor, gradient: Tensor) -> Tensor:
+        """`a mu - div(D mu)`, ``(N, d)``."""
+        flux, sigma = value.unsqueeze(-1) * self.data.a, self.data.noise
+        if sigma is None:
+            return flux
+        div_D, _ = self.data.noise_divergences
+        return flux - value.unsqueeze(-1) * div_D - 0.5 * (sigma @ pull_back(sigma, gradient).unsqueeze(-1)).squeeze(-1)
 
     def _spread(self, value: Tensor, gradient: Tensor, curvature: Tensor) -> Tensor:
         """`div div(D mu) = D : hess mu + 2 div D . grad mu + mu div div D`, ``(N,)``; or all of it over `mu`."""

@@ -110,6 +110,11 @@ class Problem(Reproducible):
         """Whether there is noise."""
         return self.noise(torch.full((1, self.dim), 0.5, dtype=torch.float64)) is not None
 
+    @property
+    def still(self) -> bool:
+        """Whether nothing moves without control: there is neither drift nor noise."""
+        return self.driftless and not self.noisy
+
     def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """`div D` ``(N, d)``, with components `sum_j d_j D_ij`, and its divergence ``(N,)``, where there is noise: by
         autograd through `noise`. Override it where they are known."""

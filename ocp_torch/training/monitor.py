@@ -38,10 +38,10 @@ def liouville_residual(trainer: Trainer, batch: Samples) -> dict[str, Tensor]:
     generator = Generator.of(problem, samples)
     _, inflow = generator.control_inflow(admissible_density(*form))
     density = occupation_density(*form)
-    if problem.driftless:
+    if problem.still:
         outflow = density(samples.x)
     else:
-        mu, drifted = generator.drift_flux_divergence(density)
+        mu, drifted, _ = generator.drift_flux(density)
         outflow = mu + drifted / problem.discount
     return {"residual_mean_absolute": samples.mean((inflow - outflow).abs())}
 

@@ -77,7 +77,7 @@ def test_the_residual_is_that_of_finite_differences(problem):
     torch.testing.assert_close(found, w(x))
     torch.testing.assert_close(mu, log_mu(x).exp())
     torch.testing.assert_close(inflow - outflow, expected, **TOLERANCE)
-    same, drifted = L.drift_flux_divergence(lambda y: log_mu(y).exp())
+    same, drifted, _ = L.drift_flux(lambda y: log_mu(y).exp())
     torch.testing.assert_close(same, mu)
     torch.testing.assert_close(mu + drifted / problem.discount, outflow)
 
@@ -135,6 +135,6 @@ def test_parts_of_a_jet_go_together():
 def test_without_divergences_there_is_no_residual():
     problem = zoo.build("swing")
     L = Generator.of(problem, Samples.of(problem, zoo.states(problem, 5), divergences=False))
-    for residual in (L.control_inflow, L.occupation_outflow, L.drift_flux_divergence):
+    for residual in (L.control_inflow, L.occupation_outflow, L.drift_flux):
         with pytest.raises(InputError, match="divergences"):
             residual(zoo.rough_network(2, seed=0))

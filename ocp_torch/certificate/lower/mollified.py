@@ -49,9 +49,10 @@ class Mollified:
     def __call__(self, x: Tensor) -> Tensor:
         return self.value(self.neighbours(x)).unflatten(0, (len(x), -1)).mean(dim=1)
 
-    def jet(self, x: Tensor) -> Jet:
-        """The average of the neighbours' jets."""
-        return jet(self.value, self.neighbours(x)).map(lambda part: part.unflatten(0, (len(x), -1)).mean(dim=1))
+    def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
+        """The average of the neighbours' jets; noise is that at ``x``."""
+        sigma = None if sigma is None else sigma.repeat_interleave(len(self.offsets), dim=0)
+        return jet(self.value, self.neighbours(x), sigma).map(lambda part: part.unflatten(0, (len(x), -1)).mean(dim=1))
 
     def fitting(self, sets: list[Samples]) -> list[Samples]:
         """As many of the first states of each of ``sets``, a power of two times fewer, as the budget allows."""

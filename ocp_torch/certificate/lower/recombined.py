@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.lower.shifted import SlackParts, slack_function
-from ocp_torch.maths.jets import CHUNK, Field, chunked_jet
+from ocp_torch.maths.jets import CHUNK, Field
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import climb
@@ -39,6 +39,8 @@ class Recombinable(Protocol):
     def __call__(self, x: Tensor) -> Tensor: ...
 
     def features(self, x: Tensor) -> Tensor: ...
+
+    def feature_curvature(self, x: Tensor, sigma: Tensor) -> Tensor: ...
 
     def shifted_by(self, weights: Tensor) -> Field: ...
 
@@ -63,14 +65,18 @@ class Program:
     def _evaluated(self, x: Tensor):
         problem, rho = self.problem, self.problem.discount
         samples = Samples.of(problem, x, divergences=False)
-        parts = SlackParts.of(Generator.of(problem, samples), chunked_jet(self.value, x))
+        generator = Generator.of(problem, samples)
+        parts = SlackParts.of(generator, generator.chunked_jet(self.value))
         axes = torch.eye(problem.dim, dtype=x.dtype)
         moved, pushed, features = [], [], []
         for part in samples.split(CHUNK):
             slope = lambda e, at=part.x: torch.func.jvp(self.value.features, (at,), (e.expand_as(at),))[1]
             gradients = torch.stack([slope(e) for e in axes], dim=1)  # (N, d, n)
             features.append(self.value.features(part.x))
-            moved.append(features[-1] - torch.einsum("nd,ndk->nk", part.a, gradients) / rho)
+            carried = torch.einsum("nd,ndk->nk", part.a, gradients)
+            if part.noise is not None:
+                carried = carried + self.value.feature_curvature(part.x, part.noise)
+            moved.append(features[-1] - carried / rho)
             pushed.append(-torch.einsum("ndm,ndk->nmk", part.B, gradients) / rho)
         return samples, parts, *(torch.cat(columns) for columns in (moved, pushed, features))
 

@@ -19,7 +19,7 @@ from ocp_torch.certificate.bound import LOWER, Bound, sentence_on
 from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.simulated.control_variate import integrals
-from ocp_torch.maths.jets import Field, Jet, chunked_jet, jet
+from ocp_torch.maths.jets import Field, Jet, jet
 from ocp_torch.maths.supremum import Extremum, minimiser, supremum
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.generator import Generator, hjb_slack
@@ -64,7 +64,7 @@ class SlackParts:
 
 def slack_parts(problem: Problem, value: Field, sets: list[Samples]) -> list[SlackParts]:
     """The parts on each of ``sets``."""
-    return [SlackParts.of(Generator.of(problem, s), chunked_jet(value, s.x)) for s in sets]
+    return [SlackParts.of(L, L.chunked_jet(value)) for L in (Generator.of(problem, s) for s in sets)]
 
 
 def initials(sets: list[Samples], parts: list[SlackParts]) -> list[float]:
@@ -119,12 +119,27 @@ class Shift:
         )
 
 
+@dataclass(frozen=True)
+class Scaled:
+    """`theta V`."""
+
+    value: Field
+    theta: float
+
+    def __call__(self, x: Tensor) -> Tensor:
+        return self.theta * self.value(x)
+
+    def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
+        return jet(self.value, x, sigma).map(lambda part: self.theta * part)
+
+
 def slack_function(problem: Problem, value: Field):
     """`x -> Q(x)` for the whole torus, differentiable in `x` where the problem is."""
 
     def slack(x: Tensor) -> Tensor:
         samples = Samples.of(problem, x, divergences=False) if not x.requires_grad else _live(problem, x)
-        return Generator.of(problem, samples).hjb_slack(jet(value, x))
+        generator = Generator.of(problem, samples)
+        return generator.hjb_slack(generator.jet(value))
 
     return slack
 
@@ -132,13 +147,14 @@ def slack_function(problem: Problem, value: Field):
 def _live(problem: Problem, x: Tensor) -> Samples:
     """Samples whose data carry derivatives in `x`; only suprema over `x` want that."""
     one = torch.ones_like(x[:, 0])
-    return Samples(x, problem.state_cost(x), problem.drift(x), problem.control_matrix(x), one, one)
+    f, a, B = problem.state_cost(x), problem.drift(x), problem.control_matrix(x)
+    return Samples(x, f, a, B, one, one, noise=problem.noise(x))
 
 
 def climbed(problem: Problem, value: Field, parts: SlackParts, theta: float, ascents: int) -> Extremum:
     """`sup Q_{theta V}`: the largest of all sampled states, then local ascents from the worst; an estimate from below."""
     start = parts.x[parts.slack(theta).topk(min(ascents, len(parts.x))).indices]
-    scaled = value if theta == 1.0 else lambda x: theta * value(x)
+    scaled = value if theta == 1.0 else Scaled(value, theta)
     found = supremum(slack_function(problem, scaled), start, ascents=ascents)
     return Extremum(found.value, found.x, len(parts.x), found.ascents)
 

@@ -4,6 +4,9 @@ For any smooth `V`, `V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt` exactly alo
 `Q_u = V - f - R(u) - grad V . (a + B u) / rho`. So `Perf(u) = E[V mu0] - E int rho e^{-rho t} Q_u`, and what is left to
 simulate, with all its errors, is as small as `Q_u`.
 
+With noise `Q_u` has `D : hess V` in it, and the identity a martingale of mean 0 (Ito's formula), which is left out: paths are
+those of the SDE, and what is averaged along them is `Q_u` alone (`ocp_torch.maths.brownian`).
+
 Where a controller slides along a kink of `V` that rate is not the one at which `V` changes (see `Sliding`).
 
 The infinite horizon is truncated, with the tail bounded; or each trajectory stops at a time `T ~ Exp(rho)` of its own,
@@ -23,7 +26,7 @@ from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
 from ocp_torch.certificate.simulated.sliding import Sliding
 from ocp_torch.control.policies import Policy, ValuePolicy
-from ocp_torch.maths import jets
+from ocp_torch.maths.brownian import Grid, at_random_times, discounted, expectation
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.runge_kutta import Dynamics, discounted_integral, rate_at, refined
 from ocp_torch.maths.seeds import Branch, derive_seed
@@ -70,12 +73,30 @@ def _dynamics(problem: Problem, policy: Policy, value: Field | None) -> Dynamics
             return problem.velocity(state, u), problem.state_cost(state) + cost.cost(u)
         x, summed = state[:, :-1], state[:, -1]
         samples = Samples.of(problem, x, divergences=False)
-        generator, V = Generator.of(problem, samples), jets.jet(value, x)
+        generator = Generator.of(problem, samples)
+        V = generator.jet(value)
         u = policy.control(samples.B, V) if isinstance(policy, ValuePolicy) and policy.value is value else policy(x)
         velocity = samples.a + torch.einsum("ndm,nm->nd", samples.B, u)
         slack = generator.bellman_slack(V, u)
         change = (V.gradient * velocity).sum(dim=-1, keepdim=True)
         return torch.cat([velocity, change], dim=-1), torch.stack([-slack, summed - V.value], dim=-1)
+
+    return dynamics
+
+
+def _drifting(problem: Problem, policy: Policy, value: Field | None) -> Dynamics:
+    """The drift of the closed loop with noise, and what it costs; with ``value`` its slack `-Q_u`."""
+    cost = problem.control_cost
+
+    def dynamics(x: Tensor) -> tuple[Tensor, Tensor]:
+        if value is None:
+            u = policy(x)
+            return problem.velocity(x, u), problem.state_cost(x) + cost.cost(u)
+        samples = Samples.of(problem, x, divergences=False)
+        generator = Generator.of(problem, samples)
+        V = generator.jet(value)
+        u = policy.control(samples.B, V) if isinstance(policy, ValuePolicy) and policy.value is value else policy(x)
+        return samples.a + torch.einsum("ndm,nm->nd", samples.B, u), -generator.bellman_slack(V, u)
 
     return dynamics
 
@@ -135,8 +156,8 @@ def simulate_performance(
     # By the slack's definition `V - Q_u = f + R(u) + grad V . g / rho`: the answer's size also where `E[V mu0]` is far off.
     size = max(float((mass * (base + rate)).mean().abs()), LEAST * float((mass * problem.state_cost(x0)).mean()), 1e-12)
     largest_rate = RATE_ROOM * float(rate.abs().max())
+    times = -torch.log1p(-points[:, dim]) / rho if random else None
     if random:
-        times = -torch.log1p(-points[:, dim]) / rho
         longest = float(times.max())
         integrate = lambda rows, count: rate_at(dynamics, state[rows], rho, times[rows], count, wrap=False)
     else:
@@ -150,7 +171,14 @@ def simulate_performance(
     generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT))
     means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
     noise = lambda results: Estimate.of(means(results).tolist()).se
-    result, end, bias = refined(sliding or integrate, mass, steps, tolerance * size, generator, noise)
+    if problem.noisy:
+        dynamics, sliding = _drifting(problem, policy, value), None
+        grid = Grid(torch.full_like(mass, longest), steps, GRADING) if times is None else Grid(times, steps, 1.0)
+        weight = at_random_times(rho) if random else discounted(rho)
+        found = expectation(dynamics, problem.noise, x0, mass, grid, weight, tolerance * size, seed, noise)
+        result, end, bias = found.result, found.end, found.bias
+    else:
+        result, end, bias = refined(sliding or integrate, mass, steps, tolerance * size, generator, noise)
     ended = end[:, :dim].remainder(1.0)
     with torch.no_grad():
         rate = dynamics(end)[1]

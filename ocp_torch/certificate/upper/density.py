@@ -37,7 +37,7 @@ def density_bounds(
     for samples in sets:
         parts = [_upper_integrands(problem, control_density, occupation, s, C_V) for s in samples.split(CHUNK)]
         of["J"].append(samples.weight * torch.cat([j for j, *_ in parts]))
-        if problem.driftless:
+        if problem.still:
             of["G"].append(samples.weight * torch.cat([g for _, g, *_ in parts]))
         moved = (torch.cat(columns) / problem.discount for columns in list(zip(*parts, strict=True))[2:])
         fluxes.append(Flux(samples.x, samples.weight, *moved))
@@ -55,7 +55,7 @@ def _upper_integrands(problem, control_density, occupation, samples: Samples, C_
     generator = Generator.of(problem, samples)
     w, inflow = generator.control_inflow(control_density)
     spread, pushed = rho * (samples.mu0 - inflow), torch.einsum("ndm,nm->nd", samples.B, w)
-    if problem.driftless:
+    if problem.still:
         mu = occupation(samples.x)
         # An infinite mu stands still at no cost where f = 0: the closed minimum has that limit, J needs the number.
         J = torch.where(
@@ -64,6 +64,6 @@ def _upper_integrands(problem, control_density, occupation, samples: Samples, C_
             cost.primal_minimum(w, samples.f, C_V, inflow),
         )
         return J, cost.primal_minimum(w, samples.f, C_V, inflow), spread, pushed
-    mu, drifted = generator.drift_flux_divergence(occupation)
+    mu, drifted, carried = generator.drift_flux(occupation)
     J = generator.primal_integrand(w, mu, inflow - mu - drifted / rho, C_V)
-    return J, None, spread + drifted, pushed + mu.unsqueeze(-1) * samples.a
+    return J, None, spread + drifted, pushed + carried

@@ -32,7 +32,7 @@ from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.lower.shifted import slack_function
 from ocp_torch.certificate.upper.multiples import Terms, best_multiples
-from ocp_torch.maths.jets import CHUNK, Field, chunked_jet
+from ocp_torch.maths.jets import CHUNK, Field
 from ocp_torch.maths.supremum import Extremum, batched, supremum
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.generator import Generator
@@ -125,11 +125,12 @@ def closed_loop_bounds(
 @torch.no_grad()
 def _integrands(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples):
     """`V`, `mu Q_u`, `r` and `Q_u` at the states of ``samples``, and the flux `mu g_u`."""
-    V = chunked_jet(value, samples.x)
-    slack = Generator.of(loop, samples).hjb_slack(V)
-    pairs = [Generator.of(loop, part).occupation_outflow(log_occupation) for part in samples.split(CHUNK)]
-    mu, outflow = torch.cat([m for m, _ in pairs]), torch.cat([o for _, o in pairs])
-    flux = Flux(samples.x, samples.weight, outflow - mu, mu.unsqueeze(-1) * samples.a / loop.discount)
+    generator = Generator.of(loop, samples)
+    V = generator.chunked_jet(value)
+    slack = generator.hjb_slack(V)
+    parts = [Generator.of(loop, part).occupation_flux(log_occupation) for part in samples.split(CHUNK)]
+    mu, outflow, moved = (torch.cat(columns) for columns in zip(*parts, strict=True))
+    flux = Flux(samples.x, samples.weight, outflow - mu, moved / loop.discount)
     return V.value, mu * slack, samples.mu0 - outflow, slack, flux
 
 

@@ -13,7 +13,6 @@ from ocp_torch.certificate.upper.multiples import MULTIPLES, Terms
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
-from ocp_torch.maths import jets
 from ocp_torch.maths.jets import CHUNK, Field
 from ocp_torch.maths.sampling import SobolSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
@@ -141,7 +140,8 @@ class Pool:
 @torch.no_grad()
 def positive_weight(loop: ClosedLoop, value: Field, samples: Samples) -> float:
     """What a positive residual should weigh where a negative one weighs 1: the root of `eps_hi / eps_lo`, within limits."""
-    slack = Generator.of(loop, samples).hjb_slack(jets.jet(value, samples.x))
+    generator = Generator.of(loop, samples)
+    slack = generator.hjb_slack(generator.jet(value))
     hi, lo = float((-slack).max().clamp_min(1e-30)), float(slack.max().clamp_min(1e-30))
     return math.sqrt(min(max(hi / lo, 1.0 / MOST_LOPSIDED), MOST_LOPSIDED))
 
@@ -150,7 +150,8 @@ def positive_weight(loop: ClosedLoop, value: Field, samples: Samples) -> float:
 def relative_excess(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples) -> float:
     """What the residual costs the Lagrangian bound on ``samples``, relative to `|E[V mu0]|`: the bound's part above
     `E[V mu0 - mu Q_u]`, for the best multiple of `mu`."""
-    generator, V = Generator.of(loop, samples), jets.jet(value, samples.x)
+    generator = Generator.of(loop, samples)
+    V = generator.jet(value)
     slack = generator.hjb_slack(V)
     mu, outflow = generator.occupation_outflow(log_occupation)
     terms = Terms(samples, V.value, mu * slack, samples.mu0 - outflow)
