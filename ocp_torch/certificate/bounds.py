@@ -1,7 +1,5 @@
 """The bounds of a certificate, listed once: gaps, tables, files and the benchmark's columns follow from this list."""
 
-from __future__ import annotations
-
 from ocp_torch.certificate.bound import Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.lower.penalised import PenalisedDual

@@ -1,7 +1,5 @@
 """The one certifier: it asks the listed bounds what they say of a context, and puts that into a certificate."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from torch import nn
@@ -15,11 +13,8 @@ from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.external.controller import ControllerContext
 from ocp_torch.certificate.external.dataset import RecordedContext
-from ocp_torch.certificate.progress import Progress, silent
-from ocp_torch.certificate.run import Run
-from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.certificate.trained import Trained, require_finite
-from ocp_torch.certificate.trained_context import TrainedContext
+from ocp_torch.certificate.settings import CertificateSettings, Progress, Run, silent
+from ocp_torch.certificate.trained import FieldsContext, Trained, TrainedContext
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.constants import Constants
@@ -34,12 +29,12 @@ def certify(context: Context) -> Certificate:
     evaluated = lambda side: {bound.name: shown(bound, context) for bound in bounds if bound.side == side}
     _ = context.posed  # first of all: functions that are not finite are refused here
     lower = evaluated(LOWER)
-    perf, zero = context.perf, context.zero  # before the upper side, which is of the best of them
+    perf, (_, zero) = context.perf, context.simulated  # before the upper side, which is of the best of them
     upper, perf_lower = evaluated(UPPER), evaluated(PERFORMANCE)
     sides = {LOWER: lower, UPPER: upper, PERFORMANCE: perf_lower}
     certificate = Certificate(
         run=context.run,
-        exact=context.exact,
+        exact=context.problem.exact_optimum,
         lower=lower,
         upper=upper,
         perf=perf,
@@ -47,7 +42,7 @@ def certify(context: Context) -> Certificate:
         assumptions=context.assumptions,
         warnings=[
             *context.constants.warnings,
-            *context.check_notes,
+            *context.checked.warnings,
             *context.notes,
             *(note for bound in bounds for note in bound.notes(context, sides[bound.side][bound.name])),
             *notes_on(upper | lower),
@@ -80,17 +75,9 @@ def certify_fields(
 
     The name of each part is given to ``progress`` as it begins. Raises `InputError` where weights are not finite.
     """
-    require_finite(trained.fields)
-    context: Context
-    if isinstance(problem, Dataset):
-        context = RecordedContext(
-            problem=problem, constants=constants, settings=settings, run=run, progress=progress, trained=trained
-        )
-    else:
-        context = TrainedContext(
-            problem=problem, constants=constants, settings=settings, run=run, progress=progress, trained=trained
-        )
-    return certify(context)
+    trained.require_finite()
+    kind: type[FieldsContext] = RecordedContext if isinstance(problem, Dataset) else TrainedContext
+    return certify(kind(problem, constants, settings, run, progress, trained=trained))
 
 
 def certify_policy(
@@ -108,14 +95,5 @@ def certify_policy(
     ``network`` makes the networks for `V^u` and `mu^u`; the name of each part is given to ``progress`` as it begins. Raises
     `InputError` where the policy fails.
     """
-    context = ControllerContext(
-        problem=problem,
-        constants=constants,
-        settings=settings,
-        run=run,
-        progress=progress,
-        policy=policy,
-        value=value,
-        network=network,
-    )
-    return certify(context)
+    shared = problem, constants, settings, run, progress
+    return certify(ControllerContext(*shared, policy=policy, value=value, network=network))

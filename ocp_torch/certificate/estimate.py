@@ -1,7 +1,5 @@
 """Numbers with their uncertainty: means over independent randomised point sets."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cache
@@ -48,7 +46,7 @@ class Estimate:
     replicates: int = 0
 
     @classmethod
-    def of(cls, replicates: list[float], bias: float | None = None, controller: str | None = None) -> Estimate:
+    def of(cls, replicates: list[float], bias: float | None = None, controller: str | None = None) -> "Estimate":
         """Mean and standard error of independent ``replicates``."""
         values = np.asarray(replicates, dtype=np.float64)
         se = float(values.std(ddof=1) / math.sqrt(len(values)))
@@ -78,13 +76,11 @@ class Estimate:
         half = self.half_width(level)
         return self.value - half, self.value + half
 
-    def to_dict(self, level: float | None = None) -> dict:
-        """JSON form, with the interval at ``level`` if one is given; fields that do not apply are left out."""
-        extra: dict[str, float | str | list[float]]
+    def to_dict(self, level: float) -> dict:
+        """JSON form, with the interval at ``level``; fields that do not apply are left out."""
         extra = {k: v for k, v in (("bias", self.bias), ("controller", self.controller)) if v is not None}
-        if level is not None:
-            extra |= {"half_width": self.half_width(level), "interval": list(self.interval(level))}
-        return {"value": self.value, "se": self.se, **extra}
+        interval = {"half_width": self.half_width(level), "interval": list(self.interval(level))}
+        return {"value": self.value, "se": self.se, **extra, **interval}
 
 
 def known(estimate: Estimate | None) -> TypeGuard[Estimate]:

@@ -1,16 +1,14 @@
-r"""The assumptions the bounds rest on, and whether what was observed under the controller contradicts them."""
-
-from __future__ import annotations
+"""The assumptions the bounds rest on, and whether what was observed under the controller contradicts them."""
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 
 from ocp_torch.problems.needs import GIVEN, GUESSED, SEARCHED, Need
 
 
 @dataclass(frozen=True)
 class Assumptions:
-    """The constants used, what was estimated beside them, and whether every check passed.
+    """The constants used, what was estimated beside them, whether every check passed, and a warning for each that did not.
 
     The flags say which bounds stand: `F_M` needs ``occupation_holds``; `J` and `G` need ``value_holds`` and
     ``cost_holds``; `J` and the Lagrangian bound ``regular_holds``; everything needs ``problem_holds``.
@@ -32,9 +30,8 @@ class Assumptions:
     largest_jump: float | None = None
     smallest_state_cost: float | None = None
     initial_mass: float | None = None
-    basis: dict[str, str] = field(
-        default_factory=dict
-    )  # of M and C_V (see `ocp_torch.problems.needs`); given if absent
+    basis: dict[str, str] = field(default_factory=dict)  # of M and C_V (`ocp_torch.problems.needs`); given if absent
+    warnings: list[str] = field(default_factory=list)
 
     @property
     def hold(self) -> bool:
@@ -62,13 +59,13 @@ class Assumptions:
         """No jumps, where a divergence is used."""
         return Need("regular", SEARCHED, "neither a, B nor the controller jumps", self.regular_holds)
 
-    def with_value_bound(self, C_V: float) -> Assumptions:
+    def with_value_bound(self, C_V: float) -> "Assumptions":
         """With the `C_V` that the suprema found of `V` and its slack prove for the controller at hand."""
         return replace(self, C_V=C_V, value_holds=True, control_holds=True, basis=self.basis | {"C_V": SEARCHED})
 
     def to_dict(self) -> dict:
-        """JSON form; a supremum that grew beyond all numbers is null."""
-        numbers = {k: v for k, v in asdict(self).items() if not k.endswith("_holds") and k != "basis"}
+        """JSON form of the numbers; a supremum that grew beyond all numbers is null."""
+        numbers = {k: v for k, v in vars(self).items() if not k.endswith("_holds") and k not in ("basis", "warnings")}
         finite = {k: v if v is None or math.isfinite(v) else None for k, v in numbers.items()}
         return {**finite, "hold": self.hold}
 

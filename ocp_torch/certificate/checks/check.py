@@ -1,21 +1,27 @@
-"""Hold the constants of a problem against what was observed under the controller that is certified."""
-
-from __future__ import annotations
+"""What is observed of a controller, and the constants of its problem held against that."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 
 from ocp_torch.certificate.checks.assumptions import Assumptions
-from ocp_torch.certificate.checks.observed import Observed
+from ocp_torch.certificate.checks.regularity import Jump, largest_jump
+from ocp_torch.certificate.checks.wellposed import WellPosed
+from ocp_torch.certificate.simulated.occupation import a_priori_sup_occupation, estimated_sup_occupation
+from ocp_torch.certificate.simulated.performance import Simulated
+from ocp_torch.control.policies import Policy
 from ocp_torch.problems.constants import FROM_PROBLEM, Constants
 from ocp_torch.problems.needs import GUESSED
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.samples import Samples
 
-# An estimated supremum may exceed a bound by so much, relative to it, before it contradicts it.
-TOLERANCE = 0.02
-# And a simulated value by so much before it contradicts C_V, since both carry numerical errors.
-ROUGH = 1e-3
+# Of each set of samples: states at which the control is looked at, and states that lines are drawn through in search of
+# jumps. More find rarer ones and take longer.
+CONTROLLED, CROSSED = 4096, 256
+# An estimated supremum may exceed a bound by so much, relative to it, before it contradicts it; and a simulated value by so
+# much before it contradicts C_V, since both carry numerical errors.
+TOLERANCE, ROUGH = 0.02, 1e-3
 # An M that somebody gave must be so much above the density observed. Trained with an M that is too small, a controller does
 # not exceed it: the dual keeps its density just below, and F_M is then above OPT.
 CLEARANCE = 1.1
@@ -23,10 +29,48 @@ CLEARANCE = 1.1
 DECLARED = 1.25
 
 
+@dataclass(frozen=True)
+class Observed:
+    """What the checks found; `None` where it was not looked for."""
+
+    sup_occupation: float | None = None
+    a_priori_occupation: float | None = None  # >= sup mu^u, by the divergence of the closed loop
+    sup_control: float | None = None
+    largest_value: float | None = None  # V^u at a simulated start
+    jump: Jump | None = None
+    problem: WellPosed | None = None
+
+
+def observe(
+    problem: Problem,
+    policy: Policy,
+    simulated: Simulated | None,
+    sets: list[Samples],
+    posed: WellPosed,
+    occupation_states: int,
+) -> Observed:
+    """Look at the controller ``policy`` at the states of ``sets``, and where the trajectories of ``simulated`` end.
+
+    ``occupation_states`` is the number of states at which its occupation density is computed; 0 skips that.
+    """
+    with torch.no_grad():
+        sup_control = max(float(policy(samples.x[:CONTROLLED]).norm(dim=-1).max()) for samples in sets)
+    near = torch.cat([samples.x[:CROSSED] for samples in sets])
+    occupation = a_priori = largest_value = None
+    if simulated is not None:
+        near, largest_value = torch.cat([near, simulated.end_states[:CONTROLLED]]), simulated.largest_value
+        # Where the problem says that mu* is unbounded there is no M to hold a largest density against.
+        if occupation_states and problem.occupation_bound != math.inf:
+            occupation = estimated_sup_occupation(problem, policy, simulated.end_states, occupation_states)
+            a_priori = a_priori_sup_occupation(problem, policy, sets[0].x[:CONTROLLED])
+    jump = largest_jump(policy, problem.dim, problem=problem, near=near)
+    return Observed(occupation, a_priori, sup_control, largest_value, jump, posed)
+
+
 def check_assumptions(
     problem: Problem, constants: Constants, observed: Observed, uses: tuple[bool, bool]
-) -> tuple[Assumptions, list[str]]:
-    """Hold what was ``observed`` against ``constants``: the assumptions, and a warning for each that fails.
+) -> Assumptions:
+    """Hold what was ``observed`` against ``constants``: the assumptions, with a warning for each that fails.
 
     ``uses`` says whether the certificate has a lower side, which rests on `M`, and an upper one that rests on `C_V`.
     """
@@ -46,14 +90,14 @@ def check_assumptions(
     control_holds = observed.sup_control is None or observed.sup_control <= constants.C_u * (1.0 + TOLERANCE)
     if not control_holds:
         warnings.append(f"the control reaches {observed.sup_control:.4g}, beyond C_u = {constants.C_u:.4g}.")
-    jumps = jump if jump is not None and jump.size > 0.0 else None
-    if jumps is not None:
-        at = [round(c, 4) for c in jumps.x[:6].tolist()] + (["..."] if len(jumps.x) > 6 else [])
+    jumps = jump is not None and jump.size > 0.0
+    if jump is not None and jumps:
+        at = [round(c, 4) for c in jump.x[:6].tolist()] + (["..."] if len(jump.x) > 6 else [])
         warnings.append(
-            f"J and the Lagrangian bound are not used: the {jumps.what} {jumps.verb} by {jumps.size:.3g}, at "
+            f"J and the Lagrangian bound are not used: the {jump.what} {jump.verb} by {jump.size:.3g}, at "
             f"x = {at} for one, and they need all to be without jumps."
         )
-    assumptions = Assumptions(
+    return Assumptions(
         constants.M if uses_M else None,
         constants.C_V if uses_C_V else None,
         constants.C_u,
@@ -62,7 +106,7 @@ def check_assumptions(
         occupation_holds=M_holds or not uses_M,
         value_holds=value_holds or not uses_C_V,
         control_holds=control_holds or not uses_C_V,
-        regular_holds=jumps is None and (posed is None or posed.smooth_seam),
+        regular_holds=not jumps and (posed is None or posed.smooth_seam),
         cost_holds=posed is None or posed.nonnegative,
         problem_holds=posed is None or posed.sound,
         a_priori_sup_occupation=observed.a_priori_occupation,
@@ -71,8 +115,8 @@ def check_assumptions(
         smallest_state_cost=posed.smallest_cost if posed else None,
         initial_mass=posed.mass if posed else None,
         basis={"M": constants.basis("M"), "C_V": constants.basis("C_V")},
+        warnings=warnings,
     )
-    return assumptions, warnings
 
 
 def occupation_holds(problem: Problem, constants: Constants, observed: Observed) -> tuple[bool, str]:

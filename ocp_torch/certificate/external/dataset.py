@@ -5,19 +5,17 @@ samples estimate them without bias, with errors from their scatter. What a supre
 shifted and the Lagrangian bound are left out, and `M` and `C_V` are estimates, and said to be.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 
 from ocp_torch.certificate.checks.assumptions import Assumptions
+from ocp_torch.certificate.checks.check import Observed
 from ocp_torch.certificate.checks.hidden import Hidden
-from ocp_torch.certificate.checks.observed import Observed
 from ocp_torch.certificate.checks.regularity import largest_jump
 from ocp_torch.certificate.checks.wellposed import WellPosed
-from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.trained import FieldsContext
 from ocp_torch.certificate.upper.recorded import RecordedFit, fit_recorded
 from ocp_torch.control.policies import NETWORK, Policy
@@ -30,18 +28,15 @@ from ocp_torch.problems.samples import Samples
 GROUPS, FEWEST = 64, 8
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class RecordedContext(FieldsContext):
     """Fields trained on the recorded samples of ``problem``, held against those that were held out."""
 
     problem: Dataset
 
     recorded = True
-    exact = sampled_value = fitted = zero = None
-
-    @property
-    def perf(self) -> dict[str, Estimate | None]:
-        return {"value": None, "density": None}
+    sampled_value = fitted = None
+    candidates: ClassVar[dict] = {}
 
     @cached_property
     def sets(self) -> list[Samples]:
@@ -55,10 +50,6 @@ class RecordedContext(FieldsContext):
         if trained.fields.value is not None and self.problem.knows_control_matrix:
             return "value"
         return "density" if trained.fields.control_density is not None and trained.occupation == NETWORK else None
-
-    @property
-    def subject(self) -> str | None:
-        return self.kind
 
     @cached_property
     def policy(self) -> Policy | None:

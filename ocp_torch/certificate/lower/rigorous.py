@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ocp_torch.certificate.bound import LOWER, Bound, once
+from ocp_torch.certificate.bound import LOWER, Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate
@@ -38,9 +38,14 @@ class Rigorous(Bound):
         return [bound.sentence] if bound else []
 
 
-@once
 def proved(context: Context) -> tuple[RigorousBound | None, str | None]:
     """The proved counterpart of `SampledValue.own`, or why there is none; neither where there is no `V` to speak of."""
+    if "proved" not in context.results:
+        context.results["proved"] = _proved(context)
+    return context.results["proved"]
+
+
+def _proved(context: Context) -> tuple[RigorousBound | None, str | None]:
     V = context.sampled_value
     if V is None:
         return None, None

@@ -1,9 +1,7 @@
-"""What each of several controllers costs, and doing nothing, where only the best of them is handed out."""
-
-from __future__ import annotations
+"""What each of several controllers costs, and doing nothing."""
 
 import math
-from functools import partial
+from typing import NamedTuple
 
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import CertificateSettings
@@ -19,38 +17,35 @@ BASELINE_PART = 4
 CHEAP = 256
 
 
+class Candidate(NamedTuple):
+    """A controller to simulate, the control variate `V` of its simulation, and `E[V mu0]` per set."""
+
+    policy: Policy
+    value: Field | None
+    initial: list[float] | None
+
+
 def simulate_candidates(
-    problem: Problem,
-    policies: dict[str, Policy],
-    value: Field | None,
-    initial: list[float] | None,
-    settings: CertificateSettings,
-    seed: int,
+    problem: Problem, candidates: dict[str, Candidate], settings: CertificateSettings, seed: int, best_only: bool
 ) -> tuple[dict[str, Simulated], Estimate]:
-    """Performance of each of ``policies``, with ``value`` as control variate, and of doing nothing.
-
-    ``initial`` is `E[V mu0]` per set. A policy that is clearly worse than another on a quarter of the trajectories gets no
-    more of them, where that saves time.
-    """
-    simulate = partial(
-        simulate_performance,
+    """Performance of each of ``candidates``, and of doing nothing. With ``best_only`` one that is clearly worse than another
+    on a quarter of the trajectories gets no more of them, where that saves time."""
+    simulate = lambda candidate, trajectories: simulate_performance(
         problem,
-        replicates=settings.replicates,
-        seed=seed,
-        horizon=settings.horizon,
-        tolerance=settings.tolerance,
+        candidate.policy,
+        trajectories,
+        settings.replicates,
+        seed,
+        candidate.value,
+        candidate.initial,
+        settings.horizon,
+        settings.tolerance,
     )
-    few = few_trajectories(settings)
-    judge = lambda policy, trajectories: simulate(policy, trajectories=trajectories, value=value, initial=initial)
-    pays = len(policies) > 1 and settings.trajectories * settings.replicates > CHEAP
-    found = {name: judge(policy, few) for name, policy in policies.items()} if pays else {}
+    few = max(2, settings.trajectories // BASELINE_PART)
+    pays = best_only and len(candidates) > 1 and settings.trajectories * settings.replicates > CHEAP
+    found = {name: simulate(candidate, few) for name, candidate in candidates.items()} if pays else {}
     best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
-    for name, policy in policies.items():
+    for name, candidate in candidates.items():
         if name not in found or not found[name].perf.below > best:
-            found[name] = judge(policy, settings.trajectories)
-    return found, simulate(zero_policy(problem), trajectories=few).perf
-
-
-def few_trajectories(settings: CertificateSettings) -> int:
-    """Trajectories per replicate for what needs few."""
-    return max(2, settings.trajectories // BASELINE_PART)
+            found[name] = simulate(candidate, settings.trajectories)
+    return found, simulate(Candidate(zero_policy(problem), None, None), few).perf

@@ -12,7 +12,7 @@ import torch
 from tqdm import tqdm
 
 from ocp_torch.certificate import CertificateSettings
-from ocp_torch.certificate.checks.possible import require_possible
+from ocp_torch.certificate.settings import require_possible
 from ocp_torch.errors import InputError, call, require_choice, require_integer, require_number, require_section
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants, resolve_constants

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 from ocp_torch.certificate import BOUNDS, LOWER, UPPER, CertificateSettings, Run, StageSettings
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.simulated.performance import simulate_performance
-from ocp_torch.certificate.trained import Trained
-from ocp_torch.certificate.trained_context import TrainedContext
+from ocp_torch.certificate.trained import Trained, TrainedContext
 from ocp_torch.certificate.upper.density import DensityBounds
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import InputError
