@@ -161,7 +161,7 @@ class Context:
     @cached_property
     def checked(self) -> Assumptions:
         """The assumptions as the checks leave them."""
-        return check_assumptions(self.problem, self.constants, self.observed, self.uses)
+        return check_assumptions(self.problem, self.constants, self.posed, self.observed, self.uses)
 
     @cached_property
     def closed_loop(self) -> ClosedLoopBounds | None:

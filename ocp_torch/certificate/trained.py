@@ -149,7 +149,7 @@ class TrainedContext(FieldsContext):
         self.progress("assumptions")
         usable = found if found is not None and found.perf.finite else None
         states = self.settings.occupation_states
-        return observe(self.problem, self.policies[self.kind], usable, self.few, self.posed, states)
+        return observe(self.problem, self.policies[self.kind], usable, self.few, states)
 
     @property
     def notes(self) -> list[str]:

@@ -38,21 +38,13 @@ class Observed:
     sup_control: float | None = None
     largest_value: float | None = None  # V^u at a simulated start
     jump: Jump | None = None
-    problem: WellPosed | None = None
 
 
 def observe(
-    problem: Problem,
-    policy: Policy,
-    simulated: Simulated | None,
-    sets: list[Samples],
-    posed: WellPosed,
-    occupation_states: int,
+    problem: Problem, policy: Policy, simulated: Simulated | None, sets: list[Samples], occupation_states: int
 ) -> Observed:
-    """Look at the controller ``policy`` at the states of ``sets``, and where the trajectories of ``simulated`` end.
-
-    ``occupation_states`` is the number of states at which its occupation density is computed; 0 skips that.
-    """
+    """Look at the controller ``policy`` at the states of ``sets``, and where the trajectories of ``simulated`` end; its
+    occupation density is computed at so many ``occupation_states``, 0 for not at all."""
     with torch.no_grad():
         sup_control = max(float(policy(samples.x[:CONTROLLED]).norm(dim=-1).max()) for samples in sets)
     near = torch.cat([samples.x[:CROSSED] for samples in sets])
@@ -64,20 +56,20 @@ def observe(
             occupation = estimated_sup_occupation(problem, policy, simulated.end_states, occupation_states)
             a_priori = a_priori_sup_occupation(problem, policy, sets[0].x[:CONTROLLED])
     jump = largest_jump(policy, problem.dim, problem=problem, near=near)
-    return Observed(occupation, a_priori, sup_control, largest_value, jump, posed)
+    return Observed(occupation, a_priori, sup_control, largest_value, jump)
 
 
 def check_assumptions(
-    problem: Problem, constants: Constants, observed: Observed, uses: tuple[bool, bool]
+    problem: Problem, constants: Constants, posed: WellPosed, observed: Observed, uses: tuple[bool, bool]
 ) -> Assumptions:
     """Hold what was ``observed`` against ``constants``: the assumptions, with a warning for each that fails.
 
     ``uses`` says whether the certificate has a lower side, which rests on `M`, and an upper one that rests on `C_V`.
     """
     uses_M, uses_C_V = uses
-    posed, jump, reached = observed.problem, observed.jump, observed.largest_value
-    warnings = list(posed.warnings) if posed else []
-    M_holds, why = occupation_holds(problem, constants, observed)
+    jump, reached = observed.jump, observed.largest_value
+    warnings = list(posed.warnings)
+    M_holds, why = occupation_holds(problem, constants, observed.sup_occupation, posed.mass)
     if uses_M and not M_holds:
         warnings.append(f"F_M is not used: {why}.")
     elif uses_M and constants.basis("M") == GUESSED:
@@ -106,31 +98,33 @@ def check_assumptions(
         occupation_holds=M_holds or not uses_M,
         value_holds=value_holds or not uses_C_V,
         control_holds=control_holds or not uses_C_V,
-        regular_holds=not jumps and (posed is None or posed.smooth_seam),
-        cost_holds=posed is None or posed.nonnegative,
-        problem_holds=posed is None or posed.sound,
+        regular_holds=not jumps and posed.smooth_seam,
+        cost_holds=posed.nonnegative,
+        problem_holds=posed.sound,
         a_priori_sup_occupation=observed.a_priori_occupation,
         largest_value=reached,
         largest_jump=jump.size if jump else None,
-        smallest_state_cost=posed.smallest_cost if posed else None,
-        initial_mass=posed.mass if posed else None,
+        smallest_state_cost=posed.smallest_cost,
+        initial_mass=posed.mass,
         basis={"M": constants.basis("M"), "C_V": constants.basis("C_V")},
         warnings=warnings,
     )
 
 
-def occupation_holds(problem: Problem, constants: Constants, observed: Observed) -> tuple[bool, str]:
+def occupation_holds(
+    problem: Problem, constants: Constants, estimate: float | None, mass: float = 1.0
+) -> tuple[bool, str]:
     """Whether nothing speaks against `M >= sup mu*`, and what does. An `M` that was given must have been held against the
-    density under the controller, unless the problem knows `mu*` exactly; a guess stays one whatever it was held against."""
-    true, estimate = problem.occupation_bound, observed.sup_occupation
+    density under the controller, of which ``estimate`` is the supremum, unless the problem knows `mu*` exactly; a guess stays
+    one whatever it was held against. ``mass`` is the integral of `mu0`, and so of every occupation density."""
+    true = problem.occupation_bound
     if true is not None and math.isinf(true):
         return False, "mu* is unbounded for this problem, so no M is large enough"
     point = torch.full((1, problem.dim), 0.5, dtype=torch.float64)
     if true is not None and constants.M >= true and problem.exact_occupation(point) is not None:
         return True, ""
-    mean = 1.0 if observed.problem is None else observed.problem.mass
-    if constants.M < mean * (1.0 - 1e-6):
-        return False, f"M = {constants.M:.4g} is below the mean of every occupation density, {mean:.4g}"
+    if constants.M < mass * (1.0 - 1e-6):
+        return False, f"M = {constants.M:.4g} is below the mean of every occupation density, {mass:.4g}"
     if constants.sources["M"] != FROM_PROBLEM and true is not None and constants.M < true * (1.0 - TOLERANCE):
         return False, f"M = {constants.M:.4g} is below this problem's sup mu*, {true:.4g}"
     if estimate is None:

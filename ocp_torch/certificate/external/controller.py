@@ -86,12 +86,12 @@ class ControllerContext(Context):
     def observed(self) -> Observed:
         found, _ = self.simulated
         self.progress("assumptions")
-        met = observe(self.problem, self.policy, found.get(GIVEN), self.few, self.posed, 0)
+        met = observe(self.problem, self.policy, found.get(GIVEN), self.few, 0)
         if self.value is None or "value" not in found:
             return met
         # M is about the optimal controller, which the one from V is nearer to than anybody's.
         best, states = ValuePolicy(self.problem, self.value), self.settings.occupation_states
-        near = observe(self.problem, best, found["value"], self.few, self.posed, states)
+        near = observe(self.problem, best, found["value"], self.few, states)
         return replace(met, sup_occupation=near.sup_occupation, a_priori_occupation=near.a_priori_occupation)
 
     @property

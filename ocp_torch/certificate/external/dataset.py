@@ -94,11 +94,11 @@ class RecordedContext(FieldsContext):
     def observed(self) -> Observed:
         occupation = self.fit.sup_occupation if self.fit else None
         if self.policy is None:
-            return Observed(sup_occupation=occupation, problem=self.posed)
+            return Observed(occupation)
         with torch.no_grad():
             control = max(float(self.policy(s.x).norm(dim=-1).max()) for s in self.sets)
         jump = largest_jump(self.policy, self.problem.dim)
-        return Observed(sup_occupation=occupation, sup_control=control, jump=jump, problem=self.posed)
+        return Observed(sup_occupation=occupation, sup_control=control, jump=jump)
 
     @cached_property
     def assumptions(self) -> Assumptions:

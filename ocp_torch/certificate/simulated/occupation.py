@@ -1,9 +1,6 @@
-r"""The occupation density of a closed loop: along the flow, its supremum, and what is known of that beforehand."""
-
-from __future__ import annotations
+"""The occupation density of a closed loop: along the flow, its supremum, and what is known of that beforehand."""
 
 import math
-from collections.abc import Callable
 from typing import cast
 
 import torch
@@ -33,47 +30,33 @@ ASCENTS, ASCENT_STEPS = 16, 20
 DIFFERENCE = 1e-7
 
 
-def velocity_and_divergence(velocity: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, Tensor]:
-    """`g(x)` ``(N, d)`` and `div g(x)` ``(N,)`` by differences, all in one call of ``velocity``, in float64.
+def backward_flow(problem: Problem, policy: Policy) -> Dynamics:
+    r"""`dy/dt = -g(y)` for the closed loop `g = a + B u`, with the logarithm of the density's growth as one more coordinate.
 
-    Cheaper than derivatives of a controller that is a derivative itself, by far where it is no network.
+    Its discounted integral is `mu^u(x) = rho int e^{-rho t} mu0(y_t) exp(-int_0^t div g(y_s) ds) dt`, `y_0 = x`: the density
+    of a flow changes by its divergence (the representation behind Proposition 8 of the paper). Valid for a Lipschitz loop.
+    Differences of `g`, all in one call, are cheaper than derivatives of a controller that is a derivative itself.
     """
-    dim, moves = x.shape[1], DIFFERENCE * torch.eye(x.shape[1], dtype=x.dtype)
-    here, *moved = velocity(torch.cat([x, *(x + move for move in moves)])).chunk(dim + 1)
-    return here, summed((g[:, i] - here[:, i]) / DIFFERENCE for i, g in enumerate(moved))
-
-
-def _backward(problem: Problem, policy: Policy) -> Dynamics:
-    """The flow back in time with the logarithm of the density's growth as one more coordinate."""
-    velocity = lambda y: problem.velocity(y, policy(y))
 
     def backward(state: Tensor) -> tuple[Tensor, Tensor]:
         y, log_factor = state[:, :-1], state[:, -1]
-        forward, spread = velocity_and_divergence(velocity, y)
-        motion = torch.cat([-forward, -spread.unsqueeze(-1)], dim=-1)
+        moves = DIFFERENCE * torch.eye(y.shape[1], dtype=y.dtype)
+        around = torch.cat([y, *(y + move for move in moves)])
+        here, *moved = problem.velocity(around, policy(around)).chunk(len(moves) + 1)
+        divergence = summed((g[:, i] - here[:, i]) / DIFFERENCE for i, g in enumerate(moved))
+        motion = torch.cat([-here, -divergence.unsqueeze(-1)], dim=-1)
         return motion, problem.initial_density(y) * log_factor.clamp_max(LARGEST_GROWTH).exp()
 
     return backward
 
 
-def occupation_along_flow(problem: Problem, policy: Policy, x: Tensor, horizon: float, steps: int) -> Tensor:
-    r"""`mu^u(x) = rho int e^{-rho t} mu0(y_t) exp(-int_0^t div g(y_s) ds) dt` along `dy/dt = -g(y)`, `y_0 = x`; ``(N,)``.
-
-    The density of a flow changes by its divergence (the representation behind Proposition 8 of the paper); valid for a
-    Lipschitz closed loop `g = a + B u`. The logarithm of the second factor is carried as one more coordinate.
-    """
-    start = torch.cat([x, x.new_zeros(len(x), 1)], dim=-1)
-    density, _ = discounted_integral(_backward(problem, policy), start, problem.discount, horizon, steps)
-    return density
-
-
 def settled_occupation(problem: Problem, policy: Policy, x: Tensor) -> Tensor:
-    """`mu^u` ``(N,)`` as `occupation_along_flow`, as far back as it takes; infinite where the past adds ever more.
+    """`mu^u` ``(N,)`` along the `backward_flow`, as far back as it takes; infinite where the past adds ever more.
 
     Where the flow contracts nearly as fast as the discount forgets, the integral settles slowly, and geometrically: what
     is left is extrapolated from the last pieces.
     """
-    rho, dynamics = problem.discount, _backward(problem, policy)
+    rho, dynamics = problem.discount, backward_flow(problem, policy)
     horizon = PIECE / rho
     with torch.no_grad():
         speed = float(problem.velocity(x, policy(x)).norm(dim=-1).max())
@@ -110,10 +93,7 @@ def estimated_sup_occupation(problem: Problem, policy: Policy, end_states: Tenso
     around = top[torch.arange(NEARBY) % len(top)]
     steps = torch.randn(around.shape, dtype=x.dtype, generator=generator) / math.sqrt(problem.dim)
     sizes = 10.0 ** (-1.0 - 2.0 * torch.rand(NEARBY, 1, dtype=x.dtype, generator=generator))
-    nearby = settled_occupation(problem, policy, (around + sizes * steps).remainder(1.0)).nan_to_num(
-        nan=math.inf, posinf=math.inf
-    )
-    return max(float(density.max()), float(nearby.max()))
+    return max(float(density.max()), float(met((around + sizes * steps).remainder(1.0)).max()))
 
 
 def a_priori_sup_occupation(problem: Problem, policy: Policy, points: Tensor) -> float | None:
@@ -122,9 +102,7 @@ def a_priori_sup_occupation(problem: Problem, policy: Policy, points: Tensor) ->
     if not problem.gives_divergences:
         return None
     loop = ClosedLoop(problem, policy)
-    largest = lambda function: (
-        supremum(function, points, ascents=ASCENTS, steps=ASCENT_STEPS, differentiable=False).value
-    )
+    largest = lambda function: supremum(function, points, ASCENTS, ASCENT_STEPS, differentiable=False).value
     contraction = lambda x: -cast(Tensor, loop.drift_divergence(x))  # there is one: the problem gives divergences
     excess = problem.discount - max(0.0, largest(contraction))
     return problem.discount * largest(problem.initial_density) / excess if excess > 0.0 else None
