@@ -1,12 +1,12 @@
 """Are a controller, and the problem, regular? Jumps and layers, found by halving segments until only they are left to see."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize, one_hot
 
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.seeds import fixed_generator
@@ -39,7 +39,6 @@ class Jump:
 
     @property
     def in_problem(self) -> bool:
-        """Whether it is one of the data, not of a controller's."""
         return self.what in (DRIFT, MATRIX)
 
     @property
@@ -48,9 +47,7 @@ class Jump:
 
 
 @torch.no_grad()
-def largest_jump(
-    policy: Policy, dim: int, seed: int = 0, problem: Problem | None = None, near: Tensor | None = None
-) -> Jump:
+def largest_jump(policy: Policy, dim: int, problem: Problem | None = None, near: Tensor | None = None) -> Jump:
     """Follow, on segments of all lengths, the half across which the control changes more; with ``problem`` also its drift,
     control matrix and closed loop, and layers of them too steep for sampled states to resolve.
 
@@ -64,16 +61,16 @@ def largest_jump(
         functions[MATRIX] = lambda x: problem.control_matrix(x).flatten(1)
         if not problem.driftless:
             functions[DRIFT] = problem.drift
-    generator = fixed_generator(seed)
-    draw = lambda *shape: torch.rand(*shape, dtype=torch.float64, generator=generator)
+    generator = fixed_generator()
+    draw = partial(torch.rand, dtype=torch.float64, generator=generator)
     left = draw(SEGMENTS, dim)
-    direction = torch.nn.functional.normalize(torch.randn(SEGMENTS, dim, dtype=torch.float64, generator=generator))
+    direction = normalize(torch.randn(SEGMENTS, dim, dtype=torch.float64, generator=generator))
     right = left + direction * 10.0 ** (-3.0 * draw(SEGMENTS, 1)) * 0.5
     sizes = {name: max(float(batched(f, left).norm(dim=-1).max()), 1e-300) for name, f in functions.items()}
     together = lambda x: torch.cat([f(x) / sizes[name] for name, f in functions.items()], dim=-1)
     first, last = _pieces(together, dim, generator, near)
     left, right = torch.cat([left, first]), torch.cat([right, last])
-    steep = 0.0, left[0], 0.0
+    steepest, steep_at = 0.0, left[0]
     value_left, value_right = batched(together, left), batched(together, right)
     for k in range(HALVINGS):
         middle = 0.5 * (left + right)
@@ -82,40 +79,35 @@ def largest_jump(
         left, value_left = torch.where(nearer, left, middle), torch.where(nearer, value_left, value)
         right, value_right = torch.where(nearer, middle, right), torch.where(nearer, value, value_right)
         change = (value_right - value_left).norm(dim=-1).nan_to_num(nan=0.0)
-        length = (right - left).norm(dim=-1)
-        narrow = torch.where(length <= LAYER, change, 0.0)
-        if float(narrow.max()) > steep[0]:
-            at = int(narrow.argmax())
-            steep = float(narrow[at]), left[at].clone(), float(length[at])
+        narrow = torch.where((right - left).norm(dim=-1) <= LAYER, change, 0.0)
+        if float(narrow.max()) > steepest:
+            steepest, steep_at = float(narrow.max()), left[int(narrow.argmax())].clone()
         if k == FIRST_HALVINGS:
             top = change.topk(min(KEPT, len(change))).indices
             left, right, value_left, value_right = (part[top] for part in (left, right, value_left, value_right))
     jump = _largest(functions, sizes, left, right, NOTICEABLE)
-    if jump.size > 0.0 or problem is None or steep[0] < STEEP:
+    if jump.size > 0.0 or problem is None or steepest < STEEP:
         return jump
-    away = 0.5 * LAYER * torch.nn.functional.normalize(torch.ones(1, dim, dtype=torch.float64))
-    return _largest(functions, sizes, steep[1] - away, steep[1] + away, 0.5 * STEEP, LAYER)
+    away = 0.5 * LAYER * normalize(torch.ones(1, dim, dtype=torch.float64))
+    return _largest(functions, sizes, steep_at - away, steep_at + away, 0.5 * STEEP, LAYER)
 
 
 def _largest(functions, sizes: dict[str, float], left: Tensor, right: Tensor, least: float, width: float = 0.0) -> Jump:
     """Of which function the change from ``left`` to ``right`` is largest for its size, if above ``least`` of it."""
-    best = Jump(0.0, left[0].remainder(1.0))
-    relative = least
-    for name in (DRIFT, MATRIX, CONTROLLER, LOOP):
-        if name not in functions:
-            continue
+    best, relative = Jump(0.0, left[0].remainder(1.0)), least
+    # The data come first: what jumps in them jumps in the closed loop too.
+    for name in (n for n in (DRIFT, MATRIX, CONTROLLER, LOOP) if n in functions):
         change = (functions[name](right) - functions[name](left)).norm(dim=-1).nan_to_num(nan=0.0)
         worst = int(change.argmax())
-        # The data come first: what jumps in them jumps in the closed loop too.
         if float(change[worst]) > relative * sizes[name]:
-            relative = max(2.0 * float(change[worst]) / sizes[name], least)
+            relative = 2.0 * float(change[worst]) / sizes[name]
             best = Jump(float(change[worst]), left[worst].remainder(1.0), name, width)
     return best
 
 
 def _pieces(function, dim: int, generator: torch.Generator, near: Tensor | None) -> tuple[Tensor, Tensor]:
     """The ends of pieces of lines across which ``function`` changes most, and most unlike the pieces beside them."""
-    draw = lambda *shape: torch.rand(*shape, dtype=torch.float64, generator=generator)
+    draw = partial(torch.rand, dtype=torch.float64, generator=generator)
     starts, ends = [], []
     for length in LENGTHS:
         middle = draw(LINES, dim)
@@ -125,10 +117,9 @@ def _pieces(function, dim: int, generator: torch.Generator, near: Tensor | None)
             middle[: LINES // 2] = near[rows] + 0.3 * length * (draw(LINES // 2, dim) - 0.5) / dim**0.5
         direction = torch.randn(LINES, dim, dtype=torch.float64, generator=generator)
         axis = torch.randint(dim, (LINES,), generator=generator)
-        direction[::2] = torch.nn.functional.one_hot(axis[::2], dim).to(direction)
-        direction = torch.nn.functional.normalize(direction)
-        along = length * (torch.linspace(-0.5, 0.5, ON_LINE, dtype=torch.float64))
-        x = middle.unsqueeze(1) + along[:, None] * direction.unsqueeze(1)  # (LINES, ON_LINE, d)
+        direction[::2] = one_hot(axis[::2], dim).to(direction)
+        along = length * torch.linspace(-0.5, 0.5, ON_LINE, dtype=torch.float64)
+        x = middle.unsqueeze(1) + along[:, None] * normalize(direction).unsqueeze(1)  # (LINES, ON_LINE, d)
         step = batched(function, x.flatten(0, 1)).unflatten(0, (LINES, ON_LINE)).diff(dim=1)
         change = step.norm(dim=-1).nan_to_num(nan=0.0)
         unlike = torch.zeros_like(change)
