@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ocp_torch.certificate import bounds
+from ocp_torch.certificate.bounds import BOUNDS
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.estimate import CONFIDENCE, Estimate, known, known_of
 from ocp_torch.certificate.report import to_dict
@@ -46,8 +46,8 @@ class Certificate:
     refuted: frozenset[str] = frozenset()
 
     def needs(self, name: str) -> tuple[Need, ...]:
-        """What the bound ``name`` rests on."""
-        found = bounds.needs(name, self.assumptions)
+        """What the bound ``name`` rests on; nothing for simulations, the truth, and names that nobody listed."""
+        found = next((bound.needs(self.assumptions) for bound in BOUNDS if bound.name == name), ())
         return tuple(replace(need, holds=False) if need.name in self.refuted else need for need in found)
 
     def counts(self, name: str) -> bool:

@@ -1,16 +1,16 @@
-"""The one certifier: it asks the listed bounds what they say of a context, and puts that into a certificate."""
+"""The one certifier: it asks the listed bounds what they say of a context, and whether they contradict each other."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
 
 from torch import nn
 
 from ocp_torch.certificate.bound import LOWER, PERFORMANCE, UPPER, Bound
 from ocp_torch.certificate.bounds import BOUNDS
 from ocp_torch.certificate.certificate import Certificate
-from ocp_torch.certificate.checks.contradictions import examined
-from ocp_torch.certificate.checks.tails import notes_on
 from ocp_torch.certificate.context import Context
-from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.estimate import Estimate, known_of
 from ocp_torch.certificate.external.controller import ControllerContext
 from ocp_torch.certificate.external.dataset import RecordedContext
 from ocp_torch.certificate.settings import CertificateSettings, Progress, Run, silent
@@ -18,8 +18,14 @@ from ocp_torch.certificate.trained import FieldsContext, Trained, TrainedContext
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.constants import Constants
+from ocp_torch.problems.needs import GUESSED
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.recorded.dataset import Dataset
+
+# Bounds contradict each other where their intervals at this joint level are apart,
+LEVEL = 0.999
+# and by more than so much of their size: equal numbers differ in the last digits of float64 and of what was given.
+ROUNDING = 1e-9
 
 
 def certify(context: Context) -> Certificate:
@@ -45,13 +51,17 @@ def certify(context: Context) -> Certificate:
             *context.checked.warnings,
             *context.notes,
             *(note for bound in bounds for note in bound.notes(context, sides[bound.side][bound.name])),
-            *notes_on(upper | lower),
+            *(
+                f"a few sampled states carry {name}: its interval is widened by {estimate.bias:.2g}."
+                for name, estimate in (upper | lower).items()
+                if estimate is not None and estimate.bias
+            ),
             *context.remarks,
         ],
         searches=list(dict.fromkeys(line for bound in bounds for line in bound.searches(context))),
         speaks={bound.name: bound.speaks(context) for bound in bounds if bound.side == UPPER},
         confidence=context.settings.confidence,
-        subject=context.subject,
+        subject=context.kind if context.recorded or context.external else None,
         perf_lower=perf_lower,
     )
     return examined(certificate)
@@ -61,6 +71,45 @@ def shown(bound: Bound, context: Context) -> Estimate | None:
     """What ``bound`` says, unless it is known to be wrong."""
     estimate = bound.evaluate(context)
     return estimate if estimate is not None and bound.valid(context) else None
+
+
+def examined(certificate: Certificate) -> Certificate:
+    """``certificate``, where a lower bound on `OPT` is above an upper one by more than their errors without anything that
+    counts. A guess that is shown to be wrong in this way is dropped, with a warning, and the rest stands."""
+    if not certificate.stands:
+        return certificate
+    truth = {} if certificate.exact is None else {"OPT": Estimate(certificate.exact, 0.0)}
+    # Whatever any controller costs, doing nothing included, OPT does not exceed it.
+    above = {n: e for n, e in known_of(certificate.upper).items() if certificate.counts(n)}
+    above |= {f"Perf ({n})": e for n, e in known_of(certificate.perf | certificate.baseline).items()}
+    lower = known_of(certificate.lower)
+    below = {n: e for n, e in lower.items() if certificate.counts(n)}
+    sound = [*product(below.items(), (above | truth).items()), *product(truth.items(), above.items())]
+    supposed = {n: e for n, e in lower.items() if certificate.conditional(n)}
+    guessed = [*product(supposed.items(), (above | truth).items())]
+    level = 1.0 - (1.0 - LEVEL) / max(1, len(sound) + len(guessed))
+    for (low, under), (high, over) in sound:
+        if apart(under, over, level):
+            needs = [need for name in (low, high) for need in certificate.needs(name)]
+            conditions = " or not ".join(dict.fromkeys(need.condition for need in needs))
+            doubts = f"either not {conditions}, or " if conditions else ""
+            sentence = (
+                f"nothing is certified: {low} = {under.value:.6g}, a lower bound, contradicts {high} = {over.value:.6g}, an "
+                f"upper one; {doubts}the problem's functions or constants are not what they are said to be."
+            )
+            return replace(certificate, contradiction=sentence, warnings=[sentence, *certificate.warnings])
+    for (low, under), (high, over) in guessed:
+        if apart(under, over, level):
+            condition = " and ".join(need.condition for need in certificate.needs(low))
+            note = f"{low} = {under.value:.6g} is above {high} = {over.value:.6g}: it is not so that {condition}."
+            wrong = {need.name for need in certificate.needs(low) if need.basis == GUESSED}
+            return replace(certificate, refuted=certificate.refuted | wrong, warnings=[*certificate.warnings, note])
+    return certificate
+
+
+def apart(under: Estimate, over: Estimate, level: float) -> bool:
+    """Whether the interval of ``under`` lies above that of ``over``, both at ``level``."""
+    return under.interval(level)[0] > over.interval(level)[1] + ROUNDING * abs(over.value)
 
 
 def certify_fields(

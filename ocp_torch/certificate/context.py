@@ -28,6 +28,9 @@ from ocp_torch.problems.scan import odd_states
 # A divergence takes a reverse pass through a network for each control at each state: what needs it, upper sides and
 # residuals, is computed on one state in eight, and beyond sixteen dimensions on one in `d / 2`.
 DIVERGENCE_PART = 8
+# However few the states of a certificate, its problem is scanned as if there were so many: a feature that is missed is one
+# that every bound misses.
+LEAST_SCANNED = 2**17
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +71,6 @@ class Context:
         return []
 
     @property
-    def subject(self) -> str | None:
-        """``kind``, where it is no choice between several."""
-        return self.kind if self.recorded or self.external else None
-
-    @property
     def occupation(self) -> str | None:
         return None
 
@@ -107,7 +105,8 @@ class Context:
     @cached_property
     def odd(self) -> Tensor | None:
         """States ``(K, d)`` where the problem's data are unlike elsewhere: narrow features that sampled states miss."""
-        return odd_states(self.problem, self.settings.scanned(self.problem), self.seed)
+        scanned = self.problem.scan_factor * max(self.settings.points * self.settings.replicates, LEAST_SCANNED)
+        return odd_states(self.problem, scanned, self.seed)
 
     @cached_property
     def posed(self) -> WellPosed:

@@ -12,9 +12,6 @@ from ocp_torch.problems.problem import Problem
 
 # Of the name of a problem or a method, in characters: a longer one would break tables.
 LONGEST_NAME = 120
-# However few the states of a certificate, its problem is scanned as if there were so many: a feature that is missed is one
-# that every bound misses.
-LEAST_SCANNED = 2**17
 # How performance deals with the infinite horizon: stop late and bound the rest, or stop at an exponential time.
 TRUNCATED, RANDOM = "truncated", "random"
 # Bytes of a number; and numbers that a simulated trajectory and a state of the occupation's supremum have in memory at once,
@@ -83,10 +80,6 @@ class CertificateSettings:
         require_number("certificate.tolerance", self.tolerance, above=0.0)
         require_choice("certificate.horizon", self.horizon, (TRUNCATED, RANDOM))
 
-    def scanned(self, problem: Problem) -> int:
-        """How many states the data of ``problem`` are scanned at for narrow features."""
-        return problem.scan_factor * max(self.points * self.replicates, LEAST_SCANNED)
-
     def searches(self, constants: Constants) -> bool:
         """Whether the bound without `M` is sought among functions made of `V` too, for a problem of these ``constants``."""
         return constants.needs_no_M if self.mollify is None else self.mollify
@@ -108,9 +101,7 @@ def require_possible(problem: Problem, settings: CertificateSettings, trains_val
             )
     sample = DOUBLE * (2 * d + 2)  # x, f, a and mu0; a constant B takes no room
     moving = DOUBLE * AT_ONCE * (d + m)
-    require_memory("certificate.replicates", replicates, sample)
-    require_memory("certificate.points", settings.points, replicates * sample)
-    require_memory("certificate.trajectories", settings.trajectories, replicates * moving)
-    require_memory("certificate.occupation_states", settings.occupation_states, moving)
-    require_memory("certificate.ascents", settings.ascents, moving)
+    each = {"replicates": sample, "points": replicates * sample, "trajectories": replicates * moving}
+    for name, size in {**each, "occupation_states": moving, "ascents": moving}.items():
+        require_memory(f"certificate.{name}", getattr(settings, name), size)
     require_memory("certificate.stage.batch", settings.stage.batch, sample)

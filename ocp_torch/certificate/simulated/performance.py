@@ -167,9 +167,8 @@ def simulate_candidates(
     on a quarter of the trajectories gets no more of them, where that saves time."""
 
     def simulate(candidate: Candidate, trajectories: int) -> Simulated:
-        policy, *V = candidate
-        how = settings.horizon, settings.tolerance
-        return simulate_performance(problem, policy, trajectories, settings.replicates, seed, *V, *how)
+        (policy, value, initial), how = candidate, (settings.horizon, settings.tolerance)
+        return simulate_performance(problem, policy, trajectories, settings.replicates, seed, value, initial, *how)
 
     few = max(2, settings.trajectories // BASELINE_PART)
     pays = best_only and len(candidates) > 1 and settings.trajectories * settings.replicates > CHEAP
