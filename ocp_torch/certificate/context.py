@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 from torch import Tensor
 
-from ocp_torch.certificate.checks.assumptions import Assumptions
-from ocp_torch.certificate.checks.check import Observed, check_assumptions
+from ocp_torch.certificate.checks.assumptions import Assumptions, check_assumptions
 from ocp_torch.certificate.checks.hidden import Hidden
+from ocp_torch.certificate.checks.observed import Observed
 from ocp_torch.certificate.checks.tails import sharpened
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
@@ -91,16 +91,13 @@ class Context:
     @cached_property
     def wide(self) -> list[Samples]:
         """Independent sets of many states, for expectations and suprema of `V` and its slack."""
-        return self._sets(self.settings.points, divergences=False)
+        return replicated_samples(self.problem, self.settings.points, self.settings.replicates, self.seed, False)
 
     @cached_property
     def few(self) -> list[Samples]:
         """Sets of fewer, for what takes divergences."""
-        part = max(DIVERGENCE_PART, self.problem.dim // 2)
-        return self._sets(max(1, self.settings.points // part), divergences=not self.external)
-
-    def _sets(self, count: int, divergences: bool) -> list[Samples]:
-        return replicated_samples(self.problem, count, self.settings.replicates, self.seed, divergences)
+        count = max(1, self.settings.points // max(DIVERGENCE_PART, self.problem.dim // 2))
+        return replicated_samples(self.problem, count, self.settings.replicates, self.seed, not self.external)
 
     @cached_property
     def odd(self) -> Tensor | None:
@@ -177,13 +174,10 @@ class Context:
         own = self.densities if self.kind == "density" and self.checked.value_holds else None
         return own is None or not own.J.value <= self.closed_loop.J.value
 
-    @property
-    def proved_C_V(self) -> float | None:
-        """The `C_V` that the bounds of the closed loop prove for the controller, where it is used."""
-        return self.closed_loop.C_V if self.closed_loop and self.takes_fitted_J else None
-
     @cached_property
     def assumptions(self) -> Assumptions:
         """What the bounds rest on, in the end."""
         found = self.checked if self.hidden is None else replace(self.checked, regular_holds=False)
-        return found if self.proved_C_V is None else found.with_value_bound(self.proved_C_V)
+        # What is proved of a given controller stands whatever its divergence; of trained fields it is used with their J.
+        proved = self.fitted if self.external else self.closed_loop if self.takes_fitted_J else None
+        return found if proved is None else found.with_value_bound(proved.C_V)

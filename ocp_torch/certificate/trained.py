@@ -9,7 +9,7 @@ from typing import TypeVar
 import torch
 from torch import nn
 
-from ocp_torch.certificate.checks.check import Observed, observe
+from ocp_torch.certificate.checks.observed import Observed, observe
 from ocp_torch.certificate.checks.tails import sharpened
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.context import Context
@@ -76,6 +76,10 @@ class FieldsContext(Context):
         """The controllers that the trained ``fields`` give, in their precision, by name."""
         return trained_policies(self.occupation, self.problem, fields, self.constants)
 
+    @cached_property
+    def policies(self) -> dict[str, Policy]:
+        return self.policies_of(self.fields)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainedContext(FieldsContext):
@@ -86,10 +90,6 @@ class TrainedContext(FieldsContext):
     @cached_property
     def posed(self) -> WellPosed:
         return check_problem(self.problem, self.few if self.value is None else self.wide)
-
-    @cached_property
-    def policies(self) -> dict[str, Policy]:
-        return self.policies_of(self.fields)
 
     @property
     def candidates(self) -> dict[str, Candidate]:
@@ -153,14 +153,13 @@ class TrainedContext(FieldsContext):
 
     @property
     def notes(self) -> list[str]:
-        notes = []
-        if self.kind == "density" and self.densities is not None:
-            with torch.no_grad():
-                if any(bool((self._mu(samples.x[:LOOKED_AT]) <= 0.0).any()) for samples in self.few):
-                    notes.append(
-                        "mu is 0 at sampled states, where w / mu is not regular: J and G may miss what it costs there."
-                    )
-        return notes + self._fit[1]
+        notes = list(self._fit[1])
+        with torch.no_grad():
+            empty = (bool((self._mu(samples.x[:LOOKED_AT]) <= 0.0).any()) for samples in self.few)
+            if self.kind == "density" and self.densities is not None and any(empty):
+                what = "where w / mu is not regular: J and G may miss what it costs there"
+                notes.insert(0, f"mu is 0 at sampled states, {what}.")
+        return notes
 
     @property
     def remarks(self) -> list[str]:

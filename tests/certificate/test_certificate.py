@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ocp_torch.certificate import Run, Trained, certify_fields
-from ocp_torch.certificate.checks.check import occupation_holds
+from ocp_torch.certificate.checks.assumptions import occupation_holds
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.policies import ValuePolicy

@@ -12,7 +12,7 @@ from functools import cached_property
 import torch
 from torch import nn
 
-from ocp_torch.certificate.checks.check import Observed, observe
+from ocp_torch.certificate.checks.observed import Observed, observe
 from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import integral
 from ocp_torch.certificate.external.black_box import BlackBox
@@ -69,10 +69,6 @@ class ControllerContext(Context):
         if self._fit is None:
             return None
         return self.bounds_of(self.policy, self._fit.value, self._fit.log_occupation, self._initial)
-
-    @property
-    def proved_C_V(self) -> float | None:
-        return self.fitted.C_V if self.fitted is not None else None
 
     @property
     def candidates(self) -> dict[str, Candidate]:

@@ -12,9 +12,8 @@ from typing import ClassVar
 import torch
 
 from ocp_torch.certificate.checks.assumptions import Assumptions
-from ocp_torch.certificate.checks.check import Observed
 from ocp_torch.certificate.checks.hidden import Hidden
-from ocp_torch.certificate.checks.regularity import largest_jump
+from ocp_torch.certificate.checks.observed import Observed, largest_jump
 from ocp_torch.certificate.checks.wellposed import WellPosed
 from ocp_torch.certificate.trained import FieldsContext
 from ocp_torch.certificate.upper.recorded import RecordedFit, fit_recorded
@@ -51,10 +50,10 @@ class RecordedContext(FieldsContext):
             return "value"
         return "density" if trained.fields.control_density is not None and trained.occupation == NETWORK else None
 
-    @cached_property
+    @property
     def policy(self) -> Policy | None:
         """The controller handed out."""
-        return None if self.kind is None else self.policies_of(self.fields)[self.kind]
+        return None if self.kind is None else self.policies[self.kind]
 
     @cached_property
     def _fit(self) -> tuple[RecordedFit | None, list[str]]:

@@ -1,5 +1,9 @@
-"""Are a controller, and the problem, regular? Jumps and layers, found by halving segments until only they are left to see."""
+"""What is observed of a controller: how large it gets, where it leads, and whether it and the problem are regular.
 
+Jumps and layers are found by halving segments until only they are left to see.
+"""
+
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -8,11 +12,17 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
+from ocp_torch.certificate.simulated.occupation import a_priori_sup_occupation, estimated_sup_occupation
+from ocp_torch.certificate.simulated.performance import Simulated
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.samples import Samples
 
+# Of each set of samples: states at which the control is looked at, and states that lines are drawn through in search of
+# jumps. More find rarer ones and take longer.
+CONTROLLED, CROSSED = 4096, 256
 SEGMENTS = 768
 # Lines of each length, half of them along an axis, the states on each, and how many of their pieces are followed by kind.
 LINES, LENGTHS, ON_LINE, FOLLOWED = 48, (1.0, 0.1, 0.01, 1e-3), 65, 64
@@ -44,6 +54,36 @@ class Jump:
     @property
     def verb(self) -> str:
         return "jumps" if self.width < 0.1 * LAYER else f"changes within {self.width:.1g}"
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What the checks found; `None` where it was not looked for."""
+
+    sup_occupation: float | None = None
+    a_priori_occupation: float | None = None  # >= sup mu^u, by the divergence of the closed loop
+    sup_control: float | None = None
+    largest_value: float | None = None  # V^u at a simulated start
+    jump: Jump | None = None
+
+
+def observe(
+    problem: Problem, policy: Policy, simulated: Simulated | None, sets: list[Samples], occupation_states: int
+) -> Observed:
+    """Look at the controller ``policy`` at the states of ``sets``, and where the trajectories of ``simulated`` end; its
+    occupation density is computed at so many ``occupation_states``, 0 for not at all."""
+    with torch.no_grad():
+        sup_control = max(float(policy(samples.x[:CONTROLLED]).norm(dim=-1).max()) for samples in sets)
+    near = torch.cat([samples.x[:CROSSED] for samples in sets])
+    occupation = a_priori = largest_value = None
+    if simulated is not None:
+        near, largest_value = torch.cat([near, simulated.end_states[:CONTROLLED]]), simulated.largest_value
+        # Where the problem says that mu* is unbounded there is no M to hold a largest density against.
+        if occupation_states and problem.occupation_bound != math.inf:
+            occupation = estimated_sup_occupation(problem, policy, simulated.end_states, occupation_states)
+            a_priori = a_priori_sup_occupation(problem, policy, sets[0].x[:CONTROLLED])
+    jump = largest_jump(policy, problem.dim, problem=problem, near=near)
+    return Observed(occupation, a_priori, sup_control, largest_value, jump)
 
 
 @torch.no_grad()
