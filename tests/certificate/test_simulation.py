@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from ocp_torch.certificate.simulated.occupation import backward_flow
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
+from ocp_torch.certificate.simulated.trajectories import backward_flow
 from ocp_torch.maths.runge_kutta import discounted_integral, refined
 from ocp_torch.maths.sampling import evaluation_points
 from ocp_torch.problems import Problem
