@@ -1,6 +1,4 @@
-"""Checks of arguments that several problems share: lists of numbers, points and round obstacles."""
-
-from __future__ import annotations
+"""A check of arguments that several problems share: lists of numbers."""
 
 from collections.abc import Sequence
 
@@ -13,14 +11,3 @@ def require_numbers(name: str, value: object, count: int | None = None, above: f
         wanted = "a list of" + (f" {count}" if count is not None else "") + " numbers"
         raise InputError(f"{name} is {shown(value)}, but must be {wanted}.")
     return [require_number(f"{name}[{i}]", v, above=above) for i, v in enumerate(value)]
-
-
-def require_obstacles(name: str, value: object, space: int = 2) -> list[list[float]]:
-    """``value`` as a list of round obstacles `[x, y, radius]`, or in ``space`` 3 `[x, y, z, radius]`, with positive radius;
-    else `InputError`."""
-    if isinstance(value, str) or not isinstance(value, Sequence):
-        raise InputError(f"{name} is {shown(value)}, but must be a list of [{', '.join('xyz'[:space])}, radius].")
-    rows = [require_numbers(f"{name}[{i}]", row, space + 1) for i, row in enumerate(value)]
-    for i, row in enumerate(rows):
-        require_number(f"{name}[{i}][{space}]", row[space], above=0.0)
-    return rows

@@ -1,7 +1,5 @@
 r"""Swing up a pendulum by a torque at its pivot: the model and parameters of Gymnasium's Pendulum-v1, made periodic."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor
