@@ -17,6 +17,7 @@ from ocp_torch.problems.checks.sameness import require_differentiable, require_p
 from ocp_torch.problems.checks.values import require_divergences, require_finite, require_signs
 from ocp_torch.problems.control_limit import control_cost
 from ocp_torch.problems.problem import MOST_COORDINATES, Problem
+from ocp_torch.problems.simulator.simulator import Simulator
 
 # Sizes of the batches that shapes are checked with: none a likely d or m, and one a single state.
 SIZES = (7, 1, 37, 2)
@@ -37,9 +38,8 @@ def check_once(problem: Problem) -> None:
     require_made(problem)
     if not problem.has_simulator:
         return
-    own = type(problem).__module__.startswith("ocp_torch.")
-    simulator = hasattr(problem, "answers")
-    if simulator or not own:
+    simulator = isinstance(problem, Simulator)
+    if simulator or not type(problem).__module__.startswith("ocp_torch."):
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             _check(Functions(problem, simulator))
     require_units(problem)

@@ -1,7 +1,5 @@
 """A problem given by one plain function, somebody's simulator: a black box that is asked, and never differentiated."""
 
-from __future__ import annotations
-
 from collections import abc
 
 import torch
@@ -11,9 +9,9 @@ from ocp_torch.errors import require_flag
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.oracle import Oracle
 
-# Half the distance of the two states of a difference quotient, by what the oracle computes in: near the cube root of its
+# Half the distance of the two states of a difference quotient, by what the oracle computes in, double or single precision: near the cube root of its
 # rounding, which balances what rounding and what curvature cost.
-STEPS = {"float64": 1e-5, "float32": 2e-3}
+STEP, COARSE_STEP = 1e-5, 2e-3
 # States scanned for narrow features for each at which a bound is evaluated, where the oracle takes batches.
 SCAN_FACTOR = 8
 
@@ -48,7 +46,7 @@ class Simulator(Problem):
         self.differences = require_flag("problem.differences", differences)
         self.workers = workers
         self._oracle = Oracle(target, self.dim, self.control_dim, workers)
-        self._step = STEPS["float32" if self._oracle.in_float32 else "float64"]
+        self._step = COARSE_STEP if self._oracle.in_float32 else STEP
 
     @property
     def scan_factor(self) -> int:
@@ -84,8 +82,8 @@ class Simulator(Problem):
     @torch.no_grad()
     def _divergences(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """`div a` and `div B` by central differences, all `2 d` shifted batches in one call."""
-        at = x.detach().cpu().double().remainder(1.0)
-        if "divergences" not in (kept := self.answers(at)):
+        at = _unit_cell(x)
+        if "divergences" not in (kept := self._oracle.answers(at)):
             moves = self._step * torch.eye(self.dim, dtype=torch.float64)
             shifted = torch.cat([at + s * e for e in moves for s in (1.0, -1.0)]).remainder(1.0)
             found = self._oracle.checked(shifted)
@@ -95,17 +93,13 @@ class Simulator(Problem):
             kept["divergences"] = torch.einsum("ini->n", a), torch.einsum("inik->nk", B)
         return tuple(part.to(x) for part in kept["divergences"])
 
-    def answers(self, at: Tensor) -> dict:
-        """All parts at float64 states of the unit cell (see `Oracle.answers`)."""
-        return self._oracle.answers(at)
-
 
 class _Ask(torch.autograd.Function):
     """One part of the oracle's answer: values by calling, derivatives by central differences; stacks flattened."""
 
     @staticmethod
     def forward(x: Tensor, problem: Simulator, name: str) -> Tensor:
-        return problem.answers(x.detach().cpu().double().remainder(1.0))[name].to(x)
+        return problem._oracle.answers(_unit_cell(x))[name].to(x)
 
     @staticmethod
     def setup_context(ctx, inputs, output) -> None:
@@ -133,6 +127,10 @@ class _Ask(torch.autograd.Function):
             return _Ask.apply(x, problem, name), None
         x = x.movedim(in_dims[0], 0)
         return _Ask.apply(x.flatten(0, 1), problem, name).unflatten(0, x.shape[:2]), 0
+
+
+def _unit_cell(x: Tensor) -> Tensor:
+    return x.detach().cpu().double().remainder(1.0)
 
 
 def _difference(problem: Simulator, name: str, x: Tensor, direction: Tensor) -> Tensor:

@@ -1,7 +1,5 @@
 """Somebody's function: found by its name, and asked for a batch of states at once or one by one."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import sys
@@ -36,8 +34,7 @@ def resolved(target: str) -> Callable:
         raise
     except (Exception, SystemExit) as error:  # whatever a stranger's module may raise
         raise InputError(f"problem.target = {target} cannot be imported: {type(error).__name__}: {error}.") from None
-    found = getattr(module, name, None)
-    if not callable(found):
+    if not callable(found := getattr(module, name, None)):
         known = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
         raise InputError(f"problem.target = {target}: the module has no function {name!r}{nearest(name, known)}.")
     return found
@@ -48,12 +45,14 @@ def asked(function: Callable, x: np.ndarray, one_by_one: bool):
     try:
         if not one_by_one:
             return function(x.copy())
-        rows = [function(state.copy()) for state in x]
+        return joined([function(state.copy()) for state in x], np.stack)
     except SystemExit as end:  # it would end the run without a word
         raise RuntimeError(f"it asks Python to exit (status {end.code})") from None
-    if not all(isinstance(row, tuple | list) for row in rows):
-        return rows[0]
-    return tuple(
-        None if any(p is None for p in parts) else np.stack([np.asarray(p) for p in parts])
-        for parts in zip(*rows, strict=True)
-    )
+
+
+def joined(answers: list, join: Callable):
+    """The ``answers`` at parts of the states as one: each of their columns by ``join``, `None` where there is none."""
+    if not all(isinstance(answer, tuple | list) for answer in answers):
+        return answers[0]
+    columns = zip(*answers, strict=True)
+    return tuple(None if any(p is None for p in parts) else join([np.asarray(p) for p in parts]) for parts in columns)

@@ -1,7 +1,5 @@
 """Processes that share the batches of somebody's simulator."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import signal
@@ -15,6 +13,7 @@ import numpy as np
 
 from ocp_torch.errors import InputError
 from ocp_torch.problems.simulator import worker
+from ocp_torch.problems.simulator.target import joined
 
 # Seconds that a process has to end by itself, so that a simulator can put its things away, before it is ended.
 PATIENCE = 2.0
@@ -53,10 +52,7 @@ class Workers:
         for good, answer in found:
             if not good:
                 raise answer
-        answers = [answer for _, answer in found]
-        if not all(isinstance(answer, tuple | list) for answer in answers):
-            return answers[0]
-        return tuple(None if column[0] is None else np.concatenate(column) for column in zip(*answers, strict=True))
+        return joined([answer for _, answer in found], np.concatenate)
 
     def _start(self) -> None:
         # Closed by whatever end this process meets; children get the reading end alone.

@@ -14,7 +14,7 @@ SYNCHRONISE, DESYNCHRONISE, ENTRAIN = "synchronise", "desynchronise", "entrain"
 class Oscillators(Problem):
     """Phases that pull at one another. A subclass gives the dynamics, and calls `aim` and `run_at`."""
 
-    goals = (SYNCHRONISE, DESYNCHRONISE)
+    goals: tuple[str, ...] = (SYNCHRONISE, DESYNCHRONISE)
 
     def aim(self, goal: str, weight: float) -> None:
         """Note the ``goal``, and the cost ``weight`` where it is missed altogether."""
