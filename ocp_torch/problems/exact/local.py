@@ -1,7 +1,5 @@
 r"""The optimal flow near a state it stays at: how fast it contracts there, which decides whether `mu*` can be bounded."""
 
-from __future__ import annotations
-
 import math
 
 import torch

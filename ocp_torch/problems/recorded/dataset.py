@@ -100,10 +100,11 @@ class Dataset(Problem):
     def recording(self) -> Recording:
         """What the file holds, read when it is first asked for."""
         if self._recording is None:
-            self._recording = read(self.path, self.wrap)
-            if (sizes := tuple(self._recording.samples.B.shape[1:])) != (self.dim, self.control_dim):
+            found = read(self.path, self.wrap)
+            if (sizes := tuple(found.samples.B.shape[1:])) != (self.dim, self.control_dim):
                 raise InputError(f"{self.path} is of d, m = {sizes}, not {(self.dim, self.control_dim)}.")
-            self._split(self._recording.samples)
+            self._split(found.samples)
+            self._recording = found
         return self._recording
 
     def _split(self, samples: Samples) -> None:

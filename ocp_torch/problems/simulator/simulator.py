@@ -9,8 +9,8 @@ from ocp_torch.errors import require_flag
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.oracle import Oracle
 
-# Half the distance of the two states of a difference quotient, by what the oracle computes in, double or single precision: near the cube root of its
-# rounding, which balances what rounding and what curvature cost.
+# Half the distance of the two states of a difference quotient, where the oracle computes in double or in single precision:
+# near the cube root of its rounding, which balances what rounding and what curvature cost.
 STEP, COARSE_STEP = 1e-5, 2e-3
 # States scanned for narrow features for each at which a bound is evaluated, where the oracle takes batches.
 SCAN_FACTOR = 8
