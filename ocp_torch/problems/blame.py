@@ -1,7 +1,5 @@
 """Whose fault an exception is: what came out of a user's own code becomes one sentence with the place and the state."""
 
-from __future__ import annotations
-
 import sys
 import sysconfig
 import traceback

@@ -6,8 +6,6 @@ with 95 % probability. Kept are the states where a column of the data is smalles
 there downhill and uphill, and the states where a column differs most from its value nearby.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -4,8 +4,6 @@ Every point carries a weight, so that means estimate the same integrals whatever
 uniform state carries its mass, and none of a few.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import torch
