@@ -26,8 +26,7 @@ class ForeignProblem(InputError):
 
 def quoted(value: object) -> str:
     """A value as Hydra reads it back, whatever signs it holds."""
-    text = str(value).replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{text}'"
+    return "'" + str(value).replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def as_typed(value: object) -> str:

@@ -41,6 +41,10 @@ class Constants:
     warnings: tuple[str, ...] = ()
     unbounded: bool = False
 
+    def __post_init__(self) -> None:
+        for name in ("M", "C_V", "C_u"):
+            require_number(name, getattr(self, name), above=0.0)
+
     @property
     def needs_no_M(self) -> bool:
         """Whether the bound without `M` has to carry the lower side: no `M` is large enough, or nobody gave one."""
@@ -51,10 +55,6 @@ class Constants:
         if self.sources[name] != ESTIMATED:
             return GIVEN
         return GUESSED if name == "M" else SEARCHED
-
-    def __post_init__(self) -> None:
-        for name in ("M", "C_V", "C_u"):
-            require_number(name, getattr(self, name), above=0.0)
 
 
 def resolve_constants(
@@ -102,10 +102,9 @@ def resolve_constants(
 def is_unbounded(problem: Problem, occupation_bound: float | None = None) -> bool:
     """Whether no `M` is known to be large enough: `mu*` has no bound, or neither problem nor user (``occupation_bound``)
     gives one. A data set has no bound without `M` to aim at instead."""
-    known = problem.occupation_bound
-    if known is None:
+    if problem.occupation_bound is None:
         return occupation_bound is None and problem.has_simulator
-    return math.isinf(known)
+    return math.isinf(problem.occupation_bound)
 
 
 def state_cost_supremum(problem: Problem) -> float:
@@ -132,8 +131,8 @@ def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
     if problem.driftless:
         return total ** (1.0 / q), "Proposition 2 of the paper with a sampled sup f"
     B, a = problem.probe(PROBED_MATRICES, 1, "B", "a")
-    alpha = torch.linalg.pinv(B) @ a.unsqueeze(-1)
-    largest = float(alpha.squeeze(-1).norm(dim=-1).max())
+    alpha = (torch.linalg.pinv(B) @ a.unsqueeze(-1)).squeeze(-1)
+    largest = float(alpha.norm(dim=-1).max())
     return (total + 2.0**q * (conjugate - 1.0) * largest) ** (1.0 / q), "Proposition 2 with a least-squares alpha"
 
 

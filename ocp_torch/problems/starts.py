@@ -40,9 +40,9 @@ def start_distribution(problem: Problem) -> Mixture:
 
 def evaluation_distribution(problem: Problem) -> Mixture:
     """The density states are drawn from at which bounds are evaluated; uniform where neither `mu0` nor `f` is narrow."""
-    distributions = [d for d in _fits(problem) if not d.is_uniform]
-    part = (1.0 - UNIFORM_STATES) / max(1, len(distributions))
-    return Mixture.uniform(problem.dim) if not distributions else Mixture.join([d.scaled(part) for d in distributions])
+    narrow = [d for d in _fits(problem) if not d.is_uniform]
+    parts = [d.scaled((1.0 - UNIFORM_STATES) / len(narrow)) for d in narrow]
+    return Mixture.join([Mixture.uniform(problem.dim), *parts])
 
 
 def starts_narrowly(problem: Problem) -> bool:

@@ -80,6 +80,7 @@ class Dataset(Problem):
             raise InputError("problem.discount is missing: the file does not hold it; give problem.discount=...")
         super().__init__(dim, control_dim, discount, exponent, control_limit)  # type: ignore[arg-type] # refused there
         self._B = None if constant_matrix is None else torch.tensor(constant_matrix, dtype=torch.float64)
+        self.constant_matrix = None if self._B is None else self._B.tolist()
         self.knows_control_matrix = self._B is not None
         if self._B is not None and self._B.shape != (self.dim, self.control_dim):
             raise InputError(f"problem.constant_matrix has shape {tuple(self._B.shape)}, but must be (d, m).")
@@ -88,13 +89,7 @@ class Dataset(Problem):
 
     @property
     def parameters(self) -> dict:
-        return {
-            **{name: getattr(self, name) for name in ("path", "discount", "exponent", "control_limit", "seed", "wrap")},
-            "held_out": self.held_out_part,
-            "dim": self.dim,
-            "control_dim": self.control_dim,
-            "constant_matrix": None if self._B is None else self._B.tolist(),
-        }
+        return {**super().parameters, "held_out": self.held_out_part}
 
     @property
     def recording(self) -> Recording:

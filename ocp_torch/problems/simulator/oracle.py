@@ -8,8 +8,7 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError, ProblemError, require_integer
 from ocp_torch.maths.sampling import scrambled_sobol
-from ocp_torch.problems.simulator.target import asked, resolved
-from ocp_torch.problems.simulator.workers import Workers
+from ocp_torch.problems.simulator.target import Workers, asked, resolved
 
 # Two calls may differ by so much, relative to the size of the answer, and still be a function of the state; in single
 # precision by the second number.

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import require_number
-from ocp_torch.problems.arguments import require_numbers
+from ocp_torch.errors import require_number, require_numbers
 from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.linkage import Linkage
 

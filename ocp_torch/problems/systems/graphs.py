@@ -8,10 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError, nearest
+from ocp_torch.errors import InputError, nearest, require_numbers
 from ocp_torch.files.arrays import read_npy
 from ocp_torch.files.reading import read_text
-from ocp_torch.problems.arguments import require_numbers
 
 GRAPHS = ("complete", "ring", "random")
 SUFFIXES = (".npy", ".txt")

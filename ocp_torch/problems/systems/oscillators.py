@@ -3,8 +3,7 @@ r"""What phase oscillators share: Kuramoto's order parameter, and goals and cost
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import require_choice, require_number
-from ocp_torch.problems.arguments import require_numbers
+from ocp_torch.errors import require_choice, require_number, require_numbers
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.angles import TURN, to_radians, to_turns
 

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError, require_number, shown
-from ocp_torch.problems.arguments import require_numbers
+from ocp_torch.errors import InputError, require_number, require_numbers, shown
 from ocp_torch.problems.problem import Problem
 
 

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError, require_number, shown
-from ocp_torch.problems.arguments import require_numbers
+from ocp_torch.errors import InputError, require_number, require_numbers, shown
 from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.urdf import read_chain
