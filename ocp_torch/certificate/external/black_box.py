@@ -7,13 +7,12 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError
+from ocp_torch.maths.differences import STEPS, Differenced
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.problems.problem import Problem
 
 # States a controller is tried on before anything is computed with it.
 PROBES = 7
-# Half the distance of the two states of a difference quotient, by what the controller computes in.
-STEPS = {torch.float64: 1e-5, torch.float32: 2e-3}
 # Two calls may differ by so much, relative to the control, and still be a function of the state; and a control may be longer
 # than the limit by so much, relative to it, as it was clipped in single precision: it is cut back.
 SAME, BEYOND = 1e-4, 1e-5
@@ -36,7 +35,7 @@ class BlackBox:
         self.step = STEPS[self.precision]
 
     def __call__(self, x: Tensor) -> Tensor:
-        return _Evaluate.apply(x, self)
+        return Differenced.apply(x, self.evaluate, self.step, True)
 
     def evaluate(self, x: Tensor) -> Tensor:
         """The controls at ``x`` in the precision of ``x``; raises `InputError` as above."""
@@ -114,42 +113,3 @@ def require_limit(u: Tensor, x: Tensor, limit: float | None) -> None:
             f"the controller gives a control of size {float(size[worst]):.6g} at x = {x[worst].tolist()}, "
             f"but problem.control_limit is {limit:g}; clip it."
         )
-
-
-class _Evaluate(torch.autograd.Function):
-    """Values by calling, tangents and gradients by central differences, batches of batches by flattening."""
-
-    @staticmethod
-    def forward(x: Tensor, box: BlackBox) -> Tensor:
-        return box.evaluate(x)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output) -> None:
-        x, ctx.box = inputs
-        ctx.save_for_backward(x)
-        ctx.save_for_forward(x)
-
-    @staticmethod
-    def jvp(ctx, tangent: Tensor, _) -> Tensor:
-        (x,) = ctx.saved_tensors
-        return _difference(ctx.box, x, tangent)
-
-    @staticmethod
-    def backward(ctx, outward: Tensor):
-        (x,) = ctx.saved_tensors
-        basis = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
-        slopes = [(outward * _difference(ctx.box, x, e.expand_as(x))).sum(dim=-1) for e in basis]
-        return torch.stack(slopes, dim=-1), None
-
-    @staticmethod
-    def vmap(info, in_dims, x: Tensor, box: BlackBox):
-        if in_dims[0] is None:
-            return _Evaluate.apply(x, box), None
-        x = x.movedim(in_dims[0], 0)
-        return _Evaluate.apply(x.flatten(0, 1), box).unflatten(0, x.shape[:2]), 0
-
-
-def _difference(box: BlackBox, x: Tensor, direction: Tensor) -> Tensor:
-    x, direction = x.double(), direction.double()
-    ahead, behind = (_Evaluate.apply(x + s * box.step * direction, box) for s in (1.0, -1.0))
-    return ((ahead - behind) / (2.0 * box.step)).to(direction)

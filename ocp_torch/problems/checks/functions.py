@@ -1,7 +1,5 @@
 """The functions of a problem, asked with care: what each gives has the right shape, precision and device."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

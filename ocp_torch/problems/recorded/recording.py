@@ -5,12 +5,9 @@ Arrays: ``x (N, d)`` in `[0, 1)`, ``f (N,)``, ``a (N, d)``, ``B (N, d, m)``; opt
 the numbers ``discount``, ``exponent`` and ``control_limit``. Samples must be independent draws.
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -58,7 +55,12 @@ def read(path: str | Path, wrap: bool = False) -> Recording:
     if kind(path) is None:
         raise InputError(f"problem.path is {str(path)!r}, which does not exist.")
     arrays = read_npz(path, KNOWN, MOST_BYTES) if path.suffix == ".npz" else _read_safetensors(path)
-    _require_names(path, arrays)
+    missing = [name for name in REQUIRED if name not in arrays]
+    if missing:
+        raise InputError(f"{path} lacks {', '.join(missing)}; a recording holds x, f, a and B.")
+    for name in arrays:
+        if name not in KNOWN:
+            raise InputError(f"{path} holds {name!r}, which is no array of a recording{nearest(name, KNOWN)}.")
     numbers = {name: _number(path, name, arrays.pop(name)) for name in NUMBERS if name in arrays}
     _require_shapes(path, arrays)
     for name, array in arrays.items():
@@ -76,17 +78,15 @@ def write(path: str | Path, samples: Samples, numbers: dict[str, float | None], 
         raise InputError(f"out is {str(path)!r}, but must be a file ending in {' or '.join(SUFFIXES)}.")
     columns = {name: getattr(samples, name) for name in ("x", "f", "a", "B", "div_a", "div_B", "mu0")}
     columns["density"] = density
-    arrays: dict[str, Any] = {
-        k: np.ascontiguousarray(v.detach().cpu().numpy()) for k, v in columns.items() if v is not None
-    }
-    arrays |= {k: np.float64(v) for k, v in numbers.items() if v is not None}
+    arrays = {k: np.ascontiguousarray(v.detach().cpu().numpy()) for k, v in columns.items() if v is not None}
+    arrays |= {k: np.asarray(v, dtype=np.float64) for k, v in numbers.items() if v is not None}
 
     def fill(temporary: Path) -> None:
         if path.suffix == ".safetensors":
-            save_file({k: np.asarray(v) for k, v in arrays.items()}, str(temporary))
+            save_file(arrays, str(temporary))
             return
         with temporary.open("wb") as file:
-            np.savez_compressed(file, **arrays)
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
     write_atomically(path, fill)
 
@@ -95,22 +95,12 @@ def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
     tensors, _ = read_safetensors(path, MOST_BYTES)
     for name, tensor in tensors.items():
         if tensor.dtype == torch.bool or tensor.is_complex():
-            raise InputError(
-                f"{path}: {name} has type {str(tensor.dtype).removeprefix('torch.')}, but must hold real numbers."
-            )
+            kind_of = str(tensor.dtype).removeprefix("torch.")
+            raise InputError(f"{path}: {name} has type {kind_of}, but must hold real numbers.")
     total = 8 * sum(tensor.numel() for tensor in tensors.values())
     if total > MOST_BYTES:
         raise InputError(f"{path} unpacks to {total:,} bytes, but at most {MOST_BYTES:,} are read.")
     return {name: tensor.double().numpy() for name, tensor in tensors.items()}
-
-
-def _require_names(path: Path, arrays: dict) -> None:
-    missing = [name for name in REQUIRED if name not in arrays]
-    if missing:
-        raise InputError(f"{path} lacks {', '.join(missing)}; a recording holds x, f, a and B.")
-    for name in arrays:
-        if name not in KNOWN:
-            raise InputError(f"{path} holds {name!r}, which is no array of a recording{nearest(name, KNOWN)}.")
 
 
 def _number(path: Path, name: str, array: np.ndarray) -> float:

@@ -3,8 +3,6 @@
 Nothing of the package is imported before the watch stands, so that no moment of a start outlives the parent.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import signal

@@ -1,18 +1,13 @@
 r"""A planar arm of `n` revolute joints under joint-velocity control: reach a target, keep the links off round obstacles."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from ocp_torch.problems.arguments import require_numbers
+from ocp_torch.errors import require_number, require_numbers
 from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.linkage import Linkage
-
-TARGET = (0.2, 0.65)
-OBSTACLES = ((0.75, -0.4, 0.08),)
 
 
 class Arm(Linkage):
@@ -34,8 +29,8 @@ class Arm(Linkage):
         self,
         dim: int = 2,
         lengths: list[float] | None = None,
-        target: Sequence[float] = TARGET,
-        obstacles: Sequence[Sequence[float]] = OBSTACLES,
+        target: Sequence[float] = (0.2, 0.65),
+        obstacles: Sequence[Sequence[float]] = ((0.75, -0.4, 0.08),),
         clearance: float = 0.2,
         target_weight: float = 1.0,
         obstacle_weight: float = 3.0,
@@ -44,8 +39,9 @@ class Arm(Linkage):
         exponent: float = 2.0,
         control_limit: float | None = None,
     ) -> None:
-        costs = (target, obstacles, clearance, target_weight, obstacle_weight)
-        super().__init__(dim, 2, *costs, speed, discount, exponent, control_limit)
+        super().__init__(dim, dim, discount, exponent, control_limit)
+        self.pursue(2, target, obstacles, clearance, target_weight, obstacle_weight)
+        self.speed = require_number("problem.speed", speed, above=0.0)
         equal = [1.0 / self.dim] * self.dim
         self.lengths = equal if lengths is None else require_numbers("problem.lengths", lengths, self.dim, above=0.0)
         self._lengths = torch.tensor(self.lengths, dtype=torch.float64)

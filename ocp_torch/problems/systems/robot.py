@@ -1,28 +1,28 @@
 r"""An arm as its URDF file describes it, under joint-velocity control: bring the tip to a point, past round obstacles."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError, shown
-from ocp_torch.problems.arguments import require_numbers
+from ocp_torch.errors import InputError, require_number, require_numbers, shown
 from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.urdf import read_chain
 
 # Without a file, an elbow arm of the usual build: where each joint sits against the one before, in metres, and its axis.
-ELBOW = (
-    ((0.0, 0.0, 0.2), (0.0, 0.0, 1.0)),
-    ((0.0, 0.0, 0.2), (0.0, 1.0, 0.0)),
-    ((0.4, 0.0, 0.0), (0.0, 1.0, 0.0)),
-    ((0.2, 0.0, 0.0), (1.0, 0.0, 0.0)),
-    ((0.2, 0.0, 0.0), (0.0, 1.0, 0.0)),
-    ((0.1, 0.0, 0.0), (1.0, 0.0, 0.0)),
-    ((0.1, 0.0, 0.0), (0.0, 0.0, 0.0)),
-)
+ELBOW = [
+    [1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z, *axis]
+    for (x, y, z), axis in (
+        ((0.0, 0.0, 0.2), (0.0, 0.0, 1.0)),
+        ((0.0, 0.0, 0.2), (0.0, 1.0, 0.0)),
+        ((0.4, 0.0, 0.0), (0.0, 1.0, 0.0)),
+        ((0.2, 0.0, 0.0), (1.0, 0.0, 0.0)),
+        ((0.2, 0.0, 0.0), (0.0, 1.0, 0.0)),
+        ((0.1, 0.0, 0.0), (1.0, 0.0, 0.0)),
+        ((0.1, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    )
+]
 
 
 class RobotArm(Linkage):
@@ -59,15 +59,16 @@ class RobotArm(Linkage):
             raise InputError("problem.urdf and problem.chain are both given, but either alone is the kinematics.")
         if tip is not None and urdf is None:
             raise InputError(f"problem.tip is {shown(tip)}, but it names a link of problem.urdf, which is not given.")
-        given = chain if urdf is None else read_chain(urdf, tip)
-        given = _elbow() if given is None else given
+        given = read_chain(urdf, tip) if urdf is not None else ELBOW if chain is None else chain
         if isinstance(given, str) or not isinstance(given, Sequence) or len(given) < 2:
             raise InputError(
                 "problem.chain must be a list of rows of 15 numbers, one for each joint and one for the tip."
             )
         self.chain = [require_numbers(f"problem.chain[{i}]", row, 15) for i, row in enumerate(given)]
-        costs = (target, obstacles, clearance, target_weight, obstacle_weight)
-        super().__init__(len(self.chain) - 1, 3, *costs, speed, discount, exponent, control_limit)
+        joints = len(self.chain) - 1
+        super().__init__(joints, joints, discount, exponent, control_limit)
+        self.pursue(3, target, obstacles, clearance, target_weight, obstacle_weight)
+        self.speed = require_number("problem.speed", speed, above=0.0)
         self.urdf, self.tip = None, None  # a saved controller needs no file
         rows = torch.tensor(self.chain, dtype=torch.float64)
         self._fixed, self._axes = rows[:, :12].reshape(-1, 3, 4), rows[:-1, 12:]
@@ -99,7 +100,3 @@ class RobotArm(Linkage):
         joints, held = self._frames(x)
         axes = torch.stack(held, dim=1) @ self._like(x, "axes", self._axes).unsqueeze(-1)
         return torch.linalg.cross(axes.squeeze(-1), joints[:, -1:] - joints[:, 1:-1], dim=-1).mT
-
-
-def _elbow() -> list[list[float]]:
-    return [[1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z, *axis] for (x, y, z), axis in ELBOW]

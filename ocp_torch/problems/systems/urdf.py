@@ -1,7 +1,5 @@
 """The kinematic chain of a robot's URDF file as plain numbers, read through yourdfpy (an optional extra)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

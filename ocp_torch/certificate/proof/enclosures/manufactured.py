@@ -11,8 +11,7 @@ from ocp_torch.certificate.proof.enclosures.enclosure import Enclosure, enclosur
 from ocp_torch.certificate.proof.functions import power, reciprocal
 from ocp_torch.certificate.proof.taylor import TaylorModel
 from ocp_torch.problems.exact.manufactured import Manufactured
-from ocp_torch.problems.exact.trigonometric import TrigonometricPolynomial
-from ocp_torch.problems.exact.wavy_matrix import DEPTH, WavyMatrix
+from ocp_torch.problems.exact.trigonometric import DEPTH, TrigonometricPolynomial, WavyMatrix
 
 
 @enclosure.register(Manufactured)
