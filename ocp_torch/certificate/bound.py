@@ -61,7 +61,7 @@ class Bound(ABC):
 
 
 def recorded(context: Context) -> RecordedContext:
-    """``context``, for bounds that apply only where it is `recorded`: no other kind is."""
+    """``context``, for bounds that apply only where it is `recorded`."""
     return cast("RecordedContext", context)  # its module imports bounds, so that its class cannot be asked for here
 
 

@@ -88,8 +88,9 @@ def examined(certificate: Certificate) -> Certificate:
     supposed = {n: e for n, e in lower.items() if certificate.conditional(n)}
     guessed = [*product(supposed.items(), (above | truth).items())]
     level = 1.0 - (1.0 - LEVEL) / max(1, len(sound) + len(guessed))
+    apart = lambda under, over: under.interval(level)[0] > over.interval(level)[1] + ROUNDING * abs(over.value)
     for (low, under), (high, over) in sound:
-        if apart(under, over, level):
+        if apart(under, over):
             needs = [need for name in (low, high) for need in certificate.needs(name)]
             conditions = " or not ".join(dict.fromkeys(need.condition for need in needs))
             doubts = f"either not {conditions}, or " if conditions else ""
@@ -99,17 +100,12 @@ def examined(certificate: Certificate) -> Certificate:
             )
             return replace(certificate, contradiction=sentence, warnings=[sentence, *certificate.warnings])
     for (low, under), (high, over) in guessed:
-        if apart(under, over, level):
+        if apart(under, over):
             condition = " and ".join(need.condition for need in certificate.needs(low))
             note = f"{low} = {under.value:.6g} is above {high} = {over.value:.6g}: it is not so that {condition}."
             wrong = {need.name for need in certificate.needs(low) if need.basis == GUESSED}
             return replace(certificate, refuted=certificate.refuted | wrong, warnings=[*certificate.warnings, note])
     return certificate
-
-
-def apart(under: Estimate, over: Estimate, level: float) -> bool:
-    """Whether the interval of ``under`` lies above that of ``over``, both at ``level``."""
-    return under.interval(level)[0] > over.interval(level)[1] + ROUNDING * abs(over.value)
 
 
 def certify_fields(
@@ -121,9 +117,7 @@ def certify_fields(
     progress: Progress = silent,
 ) -> Certificate:
     """The certificate of ``trained`` fields, on states that no training sampler draws, or on samples that were held out.
-
-    The name of each part is given to ``progress`` as it begins. Raises `InputError` where weights are not finite.
-    """
+    Raises `InputError` where weights are not finite."""
     trained.require_finite()
     kind: type[FieldsContext] = RecordedContext if isinstance(problem, Dataset) else TrainedContext
     return certify(kind(problem, constants, settings, run, progress, trained=trained))
@@ -140,9 +134,6 @@ def certify_policy(
     progress: Progress = silent,
 ) -> Certificate:
     """The certificate of any ``policy``; with ``value`` (float64), any `V`, also how far from optimal it is at most.
-
-    ``network`` makes the networks for `V^u` and `mu^u`; the name of each part is given to ``progress`` as it begins. Raises
-    `InputError` where the policy fails.
-    """
+    ``network`` makes the networks for `V^u` and `mu^u`. Raises `InputError` where the policy fails."""
     shared = problem, constants, settings, run, progress
     return certify(ControllerContext(*shared, policy=policy, value=value, network=network))

@@ -30,9 +30,8 @@ WAVES, CHUNK = 96, 8192
 
 @cache
 def t_factor(level: float, degrees: int) -> float:
-    """The `t` with `P(|T| <= t) = level` for Student's `T` of so many ``degrees`` of freedom: how many standard errors lie
-    on each side of a mean of ``degrees + 1`` replicates. Raises `InputError` unless ``level`` is in (0, 1) and ``degrees`` at
-    least 1."""
+    """The `t` with `P(|T| <= t) = level` for Student's `T` of so many ``degrees`` of freedom, at least 1, and a ``level`` in
+    (0, 1), else `InputError`: how many standard errors lie on each side of a mean of ``degrees + 1`` replicates."""
     require_number("level", level, above=0.0, at_most=1.0 - 1e-9)
     require_integer("degrees", degrees, 1)
     from scipy.special import stdtrit  # takes a third of a second to import, and only certificates need it
@@ -69,11 +68,6 @@ class Estimate:
     def above(self) -> float:
         """The upper end of the interval at `CONFIDENCE`: what an upper side may claim."""
         return self.interval(CONFIDENCE)[1]
-
-    @property
-    def below(self) -> float:
-        """The lower end of the interval at `CONFIDENCE`."""
-        return self.interval(CONFIDENCE)[0]
 
     def half_width(self, level: float) -> float:
         """Half of the confidence interval at ``level``: Student's t times the standard error, and all of the bias."""

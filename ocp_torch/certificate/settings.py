@@ -18,12 +18,9 @@ TRUNCATED, RANDOM = "truncated", "random"
 # at least, per coordinate of states and controls: those of a Runge-Kutta step.
 DOUBLE, AT_ONCE = 8, 4
 
-# Told the name of each part of a certificate as it begins.
+# Told the name of each part of a certificate as it begins; and for those who do not want to know.
 Progress = Callable[[str], None]
-
-
-def silent(part: str) -> None:
-    """The `Progress` of those who do not want to know."""
+silent: Progress = lambda part: None
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,10 @@ def check_problem(problem: Problem, sets: list[Samples]) -> WellPosed:
                 raise ProblemError(f"{NAMES[name]} is not finite at {at}; it must be finite on the whole torus.")
     warnings: list[str] = []
     sizes = {name: max(float(getattr(samples, name).abs().max()) for samples in sets) for name in NAMES}
-    shifted, seams = _periods(problem, sizes), _seams(problem, sizes)
+    x = scrambled_sobol(PROBES, problem.dim, 2, torch.float64)
+    whole_numbers = torch.randint(-2, 4, x.shape, generator=fixed_generator()).to(x)
+    shifted = _differences(problem, x, x + whole_numbers, ROUNDING, sizes)
+    seams = _seams(problem, sizes)
     for name, size in shifted.items():
         warnings.append(
             f"no bound is used: {NAMES[name]} is not periodic, it changes by {size:.3g} when whole numbers are added to x."
@@ -100,12 +103,6 @@ def _differences(problem: Problem, x: Tensor, y: Tensor, tolerance: float, sizes
         if not size <= tolerance * max(sizes[name], float(left.abs().max()), float(right.abs().max())):
             found[name] = size
     return found
-
-
-def _periods(problem: Problem, sizes: dict[str, float]) -> dict[str, float]:
-    x = scrambled_sobol(PROBES, problem.dim, 2, torch.float64)
-    whole = torch.randint(-2, 4, x.shape, generator=fixed_generator()).to(x)
-    return _differences(problem, x, x + whole, ROUNDING, sizes)
 
 
 def _seams(problem: Problem, sizes: dict[str, float]) -> dict[str, float]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.checks.tails import widened
-from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
 from ocp_torch.certificate.simulated.trajectories import Sliding, closed_loop_dynamics
 from ocp_torch.control.policies import Policy, zero_policy
@@ -29,20 +29,17 @@ GRADING = 2.0
 FEWEST_STEPS, DISCOUNTED, MOVED = 8, 0.4, 0.2
 # Simulation sets come after those of the bounds in the stream of evaluation points.
 SIMULATION_REPLICATE = 1000
-# What is left of the discount when simulation stops, times the rate's supremum, relative to the answer.
-TAIL = 2e-5
-# The answer is taken to be at least this part of the mean state cost at the starts.
-LEAST = 0.1
+# What is left of the discount when simulation stops, times the rate's supremum, relative to the answer; which is taken to be
+# at least the second part of the mean state cost at the starts.
+TAIL, LEAST = 2e-5, 0.1
 # States to which the starts' mean cost is compared, how many standard errors apart the two must be, and by how many times
 # that the interval is widened: trajectories may stay where no start was.
 COMPARED, UNLIKELY, UNSEEN_ROOM = 2**15, 2.5, 2.0
 # Head-room on the rate's supremum, met at starts and ends, for the states after the end.
 RATE_ROOM = 2.0
 # Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
-# a controller that another one clearly beats.
-BASELINE_PART = 4
-# But so few trajectories take hardly longer than a part of them.
-CHEAP = 256
+# a controller that another one clearly beats; but so few in all as the second number take hardly longer than a part of them.
+BASELINE_PART, CHEAP = 4, 256
 
 
 @dataclass(frozen=True)
@@ -175,6 +172,6 @@ def simulate_candidates(
     found = {name: simulate(candidate, few) for name, candidate in candidates.items()} if pays else {}
     best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
     for name, candidate in candidates.items():
-        if name not in found or not found[name].perf.below > best:
+        if name not in found or not found[name].perf.interval(CONFIDENCE)[0] > best:
             found[name] = simulate(candidate, settings.trajectories)
     return found, simulate(Candidate(zero_policy(problem), None, None), few).perf
