@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 
+import torch
 from torch import nn
 
 from ocp_torch.certificate.bound import LOWER, PERFORMANCE, UPPER, Bound
@@ -16,6 +17,7 @@ from ocp_torch.certificate.external.dataset import RecordedContext
 from ocp_torch.certificate.settings import CertificateSettings, Progress, Run, silent
 from ocp_torch.certificate.trained import FieldsContext, Trained, TrainedContext
 from ocp_torch.control.policies import Policy
+from ocp_torch.errors import InputError
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.needs import GUESSED
@@ -35,7 +37,7 @@ def certify(context: Context) -> Certificate:
     evaluated = lambda side: {bound.name: shown(bound, context) for bound in bounds if bound.side == side}
     _ = context.posed  # first of all: functions that are not finite are refused here
     lower = evaluated(LOWER)
-    perf, (_, zero) = context.perf, context.simulated  # before the upper side, which is of the best of them
+    simulated, zero = context.simulated  # before the upper side, which is of the best of them
     upper, perf_lower = evaluated(UPPER), evaluated(PERFORMANCE)
     sides = {LOWER: lower, UPPER: upper, PERFORMANCE: perf_lower}
     certificate = Certificate(
@@ -43,7 +45,7 @@ def certify(context: Context) -> Certificate:
         exact=context.problem.exact_optimum,
         lower=lower,
         upper=upper,
-        perf=perf,
+        perf=dict.fromkeys(context.listed) | {name: found.perf for name, found in simulated.items()},
         baseline={"zero": zero},
         assumptions=context.assumptions,
         warnings=[
@@ -118,7 +120,9 @@ def certify_fields(
 ) -> Certificate:
     """The certificate of ``trained`` fields, on states that no training sampler draws, or on samples that were held out.
     Raises `InputError` where weights are not finite."""
-    trained.require_finite()
+    for name, network in trained.fields.networks.items():
+        if not all(bool(torch.isfinite(p).all()) for p in network.parameters()):
+            raise InputError(f"the network for {name} holds weights that are not finite; there is nothing to certify.")
     kind: type[FieldsContext] = RecordedContext if isinstance(problem, Dataset) else TrainedContext
     return certify(kind(problem, constants, settings, run, progress, trained=trained))
 

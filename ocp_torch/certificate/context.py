@@ -127,10 +127,6 @@ class Context:
         self.progress("simulation")
         return simulate_candidates(self.problem, candidates, self.settings, self.seed, best_only=not self.external)
 
-    @property
-    def perf(self) -> dict[str, Estimate | None]:
-        return dict.fromkeys(self.listed) | {name: found.perf for name, found in self.simulated[0].items()}
-
     def bounds_of(
         self, policy: Policy, value: Field, log_occupation: Field, initial: list[float] | None
     ) -> ClosedLoopBounds:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from ocp_torch.certificate import bounds
 from ocp_torch.certificate.bound import LOWER, PERFORMANCE, UPPER
-from ocp_torch.certificate.estimate import known
+from ocp_torch.certificate.estimate import Estimate, known
 from ocp_torch.certificate.settings import LONGEST_NAME
 from ocp_torch.errors import visible
 from ocp_torch.problems.needs import GUESSED
@@ -21,8 +21,21 @@ SCHEMA = 2
 def to_dict(certificate: Certificate) -> dict:
     """The schema of ``certificate``, ready for JSON: what does not apply is null."""
     one = lambda e: e.to_dict(certificate.confidence) if known(e) else None
-    bound = lambda name, e: {**e.to_dict(certificate.confidence), **standing(certificate, name)} if known(e) else None
     below = certificate.perf_lower
+
+    def bound(name: str, estimate: Estimate | None) -> dict | None:
+        """Also what it rests on, whether it counts, and what it supposes where a guess may be right."""
+        if not known(estimate):
+            return None
+        needs = certificate.needs(name)
+        supposed = [need.condition for need in needs if need.basis == GUESSED] if certificate.conditional(name) else []
+        return {
+            **estimate.to_dict(certificate.confidence),
+            "rests_on": {need.name: need.basis for need in needs},
+            "counts": certificate.counts(name) and certificate.speaks.get(name, True),
+            **({"if": " and ".join(supposed)} if supposed else {}),
+        }
+
     return {
         "schema": SCHEMA,
         **vars(certificate.run),
@@ -38,17 +51,6 @@ def to_dict(certificate: Certificate) -> dict:
         "assumptions": {**certificate.assumptions.to_dict(), "hold": certificate.hold},
         "contradiction": certificate.contradiction,
         "warnings": list(certificate.warnings),
-    }
-
-
-def standing(certificate: Certificate, name: str) -> dict:
-    """What the bound ``name`` rests on, whether it counts, and what it supposes where a guess may be right."""
-    needs = certificate.needs(name)
-    supposed = [need.condition for need in needs if need.basis == GUESSED] if certificate.conditional(name) else []
-    return {
-        "rests_on": {need.name: need.basis for need in needs},
-        "counts": certificate.counts(name) and certificate.speaks.get(name, True),
-        **({"if": " and ".join(supposed)} if supposed else {}),
     }
 
 
@@ -72,7 +74,8 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
     def rows(side: str, order=list) -> None:
         for kind, listed in order(bounds.on(side).items()):
             found = certificate[side].get(kind)
-            row(f"{side}: {listed.label}{remark(found or {})}", found)
+            counts = found is None or found.get("counts", True)
+            row(f"{side}: {listed.label}{'' if counts else ', if' if 'if' in found else ', not used'}", found)
 
     rows(LOWER)
     if exact is not None:
@@ -97,11 +100,6 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
     lines += searches
     lines += [f"warning: {visible(warning)}" for warning in certificate["warnings"]]
     return "\n".join(lines)
-
-
-def remark(bound: dict) -> str:
-    """What its row adds to the name of a bound (as a dict of the schema): nothing where it counts."""
-    return "" if bound.get("counts", True) else ", if" if "if" in bound else ", not used"
 
 
 def in_words(certificate: dict) -> list[str]:

@@ -18,7 +18,6 @@ from ocp_torch.certificate.upper.density import DensityBounds, density_bounds
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
 from ocp_torch.control.policies import Density, Policy, admissible_density, occupation_density, trained_policies
-from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.samples import Samples
@@ -41,13 +40,6 @@ class Trained:
     fields: Fields
     occupation: str | None
     network: Callable[..., nn.Module]
-
-    def require_finite(self) -> None:
-        """Raises `InputError` where weights are not: no number computed from them would mean anything."""
-        for name, network in self.fields.networks.items():
-            if not all(bool(torch.isfinite(p).all()) for p in network.parameters()):
-                why = "holds weights that are not finite; there is nothing to certify"
-                raise InputError(f"the network for {name} {why}.")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -17,7 +17,7 @@ from ocp_torch.certificate.checks.observed import Observed, largest_jump
 from ocp_torch.certificate.checks.wellposed import WellPosed
 from ocp_torch.certificate.trained import FieldsContext
 from ocp_torch.certificate.upper.recorded import RecordedFit, fit_recorded
-from ocp_torch.control.policies import NETWORK, Policy
+from ocp_torch.control.policies import NETWORK
 from ocp_torch.problems.needs import SEARCHED
 from ocp_torch.problems.recorded.dataset import Dataset
 from ocp_torch.problems.samples import Samples
@@ -49,11 +49,6 @@ class RecordedContext(FieldsContext):
         if trained.fields.value is not None and self.problem.knows_control_matrix:
             return "value"
         return "density" if trained.fields.control_density is not None and trained.occupation == NETWORK else None
-
-    @property
-    def policy(self) -> Policy | None:
-        """The controller handed out."""
-        return None if self.kind is None else self.policies[self.kind]
 
     @cached_property
     def _fit(self) -> tuple[RecordedFit | None, list[str]]:
@@ -92,18 +87,17 @@ class RecordedContext(FieldsContext):
     @cached_property
     def observed(self) -> Observed:
         occupation = self.fit.sup_occupation if self.fit else None
-        if self.policy is None:
+        if self.kind is None:
             return Observed(occupation)
+        policy = self.policies[self.kind]
         with torch.no_grad():
-            control = max(float(self.policy(s.x).norm(dim=-1).max()) for s in self.sets)
-        jump = largest_jump(self.policy, self.problem.dim)
-        return Observed(sup_occupation=occupation, sup_control=control, jump=jump)
+            control = max(float(policy(s.x).norm(dim=-1).max()) for s in self.sets)
+        return Observed(occupation, sup_control=control, jump=largest_jump(policy, self.problem.dim))
 
     @cached_property
     def assumptions(self) -> Assumptions:
-        _, has_J = self.uses
-        basis = self.checked.basis | {"C_V": SEARCHED}
-        return replace(self.checked, C_V=self.fit.C_V if self.fit and has_J else None, basis=basis)
+        C_V = self.fit.C_V if self.fit and self.hidden is None else None
+        return replace(self.checked, C_V=C_V, basis=self.checked.basis | {"C_V": SEARCHED})
 
     @property
     def notes(self) -> list[str]:
