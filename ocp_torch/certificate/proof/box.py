@@ -1,16 +1,12 @@
 """A batch of cells of the torus, and the models over it that all others are made of."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.proof.monomials import Monomials, monomials
-from ocp_torch.certificate.proof.rounding import ROUNDING, upward
-from ocp_torch.certificate.proof.taylor import TaylorModel
+from ocp_torch.certificate.proof.taylor import ROUNDING, Monomials, TaylorModel, monomials, upward
 
 
 @dataclass(frozen=True)
@@ -31,7 +27,7 @@ class Box:
     def coordinates(self) -> TaylorModel:
         """The model of `x` itself, ``(N, d)``."""
         basis = self.basis
-        coefficients = self.centre.new_zeros(basis.count, *self.centre.shape)
+        coefficients = self.centre.new_zeros(len(basis.exponents), *self.centre.shape)
         coefficients[0] = self.centre
         for i in range(basis.dim):
             unit = tuple(int(n == i) for n in range(basis.dim))
@@ -40,9 +36,8 @@ class Box:
 
     def constant(self, value: Tensor | float, radius: Tensor | float = 0.0) -> TaylorModel:
         """A model of a function known up to ``radius`` by ``value``, ``(N, ...)`` or one number for all cells."""
-        value = torch.as_tensor(value, dtype=self.centre.dtype, device=self.centre.device)
-        value = value if value.dim() else value.expand(len(self))
-        return TaylorModel.constant(value, torch.as_tensor(radius, dtype=value.dtype).expand(value.shape), self.basis)
+        value, radius = (torch.as_tensor(given, dtype=self.centre.dtype) for given in (value, radius))
+        return TaylorModel.constant(value if value.dim() else value.expand(len(self)), radius, self.basis)
 
     def cosine(self, waves: Tensor, phases: Tensor) -> TaylorModel:
         """`cos(2 pi k_j . x + theta_j)` for integer ``waves`` `k` ``(J, d)`` and ``phases`` ``(J,)``: ``(N, J)``."""
@@ -51,7 +46,7 @@ class Box:
         angle = 2.0 * math.pi * (self.centre @ waves.T).remainder(1.0) + phases
         frequency = 2.0 * math.pi * self.half.unsqueeze(1) * waves
         turns = [(angle + 0.5 * math.pi * (k % 4)).cos() for k in range(min(degree + 1, 4))]
-        coefficients = angle.new_empty(basis.count, *angle.shape)
+        coefficients = angle.new_empty(len(basis.exponents), *angle.shape)
         for k, alpha in enumerate(basis.exponents):
             scale = math.prod(math.factorial(e) for e in alpha)
             coefficients[k] = turns[sum(alpha) % 4] * (frequency ** angle.new_tensor(alpha)).prod(dim=-1) / scale

@@ -1,7 +1,5 @@
 r"""Functions of Taylor models: `|g|`, `1 / g` and powers, by expansion about the constant term of `g` where `g` is smooth."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence
@@ -9,8 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.proof.rounding import ROUNDING, upward
-from ocp_torch.certificate.proof.taylor import TaylorModel
+from ocp_torch.certificate.proof.taylor import ROUNDING, TaylorModel, upward
 
 # `power` expands where the lower bound of g is above this part of the upper one. Nearer to a zero of g, which a power may
 # not be smooth at, the range is as good as an expansion.
@@ -43,11 +40,10 @@ def absolute(g: TaylorModel) -> TaylorModel:
     crosses = (low < 0.0) & (high > 0.0)
     width = torch.where(crosses, high - low, 1.0)
     height = -2.0 * low * high / width
-    chord = g * ((high + low) / width) + 0.5 * height
-    radius = upward(chord.radius + 0.5 * height.abs() + ROUNDING * width)
-    chord = TaylorModel(chord.coefficients, radius, g.basis)
+    line = g * ((high + low) / width) + 0.5 * height
+    radius = upward(line.radius + 0.5 * height.abs() + ROUNDING * width)
     signed = g * torch.where(low >= 0.0, 1.0, -1.0).to(low)
-    return chord.where(crosses, signed)
+    return TaylorModel(line.coefficients, radius, g.basis).where(crosses, signed)
 
 
 def reciprocal(g: TaylorModel) -> TaylorModel:

@@ -1,12 +1,11 @@
 """Why nothing can be proved of a network on a problem: told before any cell is evaluated."""
 
-from __future__ import annotations
-
 import torch
+from torch import Tensor
 
 from ocp_torch.certificate.proof.box import Box, equal_cells
 from ocp_torch.certificate.proof.cover import DEGREE
-from ocp_torch.certificate.proof.enclosures import conjugate_model, contradiction, enclosure
+from ocp_torch.certificate.proof.enclosures import EVALUATION, Enclosure, conjugate_model, enclosure
 from ocp_torch.certificate.proof.network_model import is_known
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.seeds import fixed_generator
@@ -42,4 +41,20 @@ def obstacle(problem: Problem, value: Field) -> str | None:
         wrong = contradiction(problem, small, enclosure(problem, small), t)
         if wrong is not None:
             return f"the problem's enclosure does not hold its own {wrong}"
+    return None
+
+
+def contradiction(problem: Problem, box: Box, found: Enclosure, t: Tensor) -> str | None:
+    """The name of a part of the enclosure ``found`` that does not hold the problem's own data at `centre + half t`, if there
+    is one: what somebody wrote by hand may be wrong. ``t`` is ``(N, d)`` with entries in `[-1, 1]`."""
+    x = box.centre + box.half * t
+    powers = torch.stack([(t ** t.new_tensor(alpha)).prod(dim=-1) for alpha in box.basis.exponents])
+    models = {"state_cost": found.f, "control_matrix": found.B, "initial_density": found.mu0}
+    models["drift"] = found.a or box.constant(torch.zeros_like(x))
+    for name, model in models.items():
+        value = getattr(problem, name)(x)
+        shaped = powers.reshape(*powers.shape, *[1] * (value.dim() - 1))
+        error = ((shaped * model.coefficients).sum(dim=0) - value).abs()
+        if not bool((error <= model.radius + EVALUATION * (1.0 + value.abs())).all()):
+            return name
     return None

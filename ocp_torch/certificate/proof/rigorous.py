@@ -9,11 +9,8 @@ problem's enclosure (or its Lipschitz constants) is true; float64 arithmetic rou
 their products in some order; library functions are accurate to 16 units in the last place. All rounding is accounted for.
 """
 
-from __future__ import annotations
-
 import math
-import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -23,7 +20,6 @@ from ocp_torch.certificate.lower.shifted import slack_function
 from ocp_torch.certificate.proof.cover import CHUNK, Cover
 from ocp_torch.certificate.proof.network_model import is_known
 from ocp_torch.certificate.proof.obstacle import obstacle
-from ocp_torch.certificate.proof.rounding import ROUNDING, upward
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.mlp import PeriodicMLP
 from ocp_torch.maths.jets import Field
@@ -54,7 +50,6 @@ class RigorousBound:
     integral: tuple[float, float]
     cells: int
     theta: float
-    seconds: float
     complete: bool
 
     @property
@@ -72,32 +67,6 @@ class RigorousBound:
         )
 
 
-@dataclass
-class _Finished:
-    """What is proved on the cells that are not bisected any more: ``slack`` of all, and the integral over each."""
-
-    slack: float = -math.inf
-    means: list[float] = field(default_factory=list)
-    radii: list[float] = field(default_factory=list)
-
-    def add(self, cells: Cover) -> None:
-        if len(cells):
-            self.slack = max(self.slack, float(cells.upper.max()))
-            self.means += cells.mean.tolist()
-            self.radii += cells.radius.tolist()
-
-    @property
-    def finite(self) -> bool:
-        return all(map(math.isfinite, (self.slack, *self.means, *self.radii)))
-
-    def integral(self) -> tuple[float, float]:
-        """Below and above the integral over all cells; `fsum` rounds once."""
-        middle = math.fsum(self.means)
-        rounded = math.fsum(self.radii) + ROUNDING * math.fsum(map(abs, self.means))
-        radius = float(upward(torch.tensor(rounded, dtype=torch.float64)))
-        return math.nextafter(middle - radius, -math.inf), math.nextafter(middle + radius, math.inf)
-
-
 def rigorous_lower_bound(
     problem: Problem,
     value: Field,
@@ -106,34 +75,32 @@ def rigorous_lower_bound(
     sampled_slack: float | None = None,
     tolerance: float | None = None,
     cells: int = 2**18,
-    seconds: float | None = None,
 ) -> RigorousBound | None:
     r"""`E[theta V mu0] - sup Q <= OPT`, proved; `None` where `obstacle` says why there is none, or nothing finite was found.
 
     Cells are bisected, worst first, until `sup Q` is known within ``tolerance``, relative to `E|theta V mu0|`, of
-    ``sampled_slack`` (searched for when not given), or until ``cells`` have been evaluated or ``seconds`` have passed:
-    the bound stands then as well, only less tight. ``value`` must be in float64 on the CPU. Raises `InputError` for a
-    ``tolerance`` or a number of ``cells`` that is not positive.
+    ``sampled_slack`` (searched for when not given), or until ``cells`` have been evaluated: the bound stands then as well,
+    only less tight. ``value`` must be in float64 on the CPU. Raises `InputError` for a ``tolerance`` or a number of
+    ``cells`` that is not positive.
     """
     require_integer("certificate.rigorous cells", cells, 1)
     if not is_known(value) or obstacle(problem, value) is not None:
         return None
     tolerance = TOLERANCE[problem.dim] if tolerance is None else tolerance
     require_number("certificate.rigorous tolerance", tolerance, above=0.0)
-    started = time.monotonic()
     points = scrambled_sobol(SAMPLED, problem.dim, 0, torch.float64)
     room = tolerance * _size(problem, value, theta, points)
     if sampled_slack is None:
         sampled_slack = supremum(slack_function(problem, lambda x: theta * value(x)), points).value
-    finished, pending = _Finished(), Cover.first(problem, value, theta)
+    pending, finished = Cover.first(problem, value, theta), []
     count, goal = len(pending), sampled_slack + room
     while True:
         # Where Q is larger than was met by sampling, more cannot be proved.
         goal = max(goal, float(pending.reached.max()) + room)
         done = _settled(pending, goal, room)
-        finished.add(pending.take(done))
+        finished.append(pending.take(done))
         pending = pending.take(~done)
-        if not len(pending) or count >= cells or (seconds is not None and time.monotonic() - started > seconds):
+        if not len(pending) or count >= cells:
             break
         worst = pending.upper.topk(min(CHUNK // 2, len(pending))).indices
         rest = torch.ones(len(pending), dtype=torch.bool)
@@ -143,14 +110,12 @@ def rigorous_lower_bound(
         halves.upper = torch.minimum(halves.upper, parents.upper.repeat(2))
         count += len(halves)
         pending = Cover.join([pending.take(rest), halves])
-    complete = len(pending) == 0
-    finished.add(pending)
-    if not finished.finite:
+    cover = Cover.join([*finished, pending])
+    if not all(bool(column.isfinite().all()) for column in (cover.upper, cover.mean, cover.radius)):
         return None
-    low, high = finished.integral()
-    bound = math.nextafter(low - finished.slack, -math.inf)
-    elapsed = time.monotonic() - started
-    return RigorousBound(bound, finished.slack, sampled_slack, (low, high), count, theta, elapsed, complete)
+    (low, high), slack = cover.integral(), float(cover.upper.max())
+    bound = math.nextafter(low - slack, -math.inf)
+    return RigorousBound(bound, slack, sampled_slack, (low, high), count, theta, complete=not len(pending))
 
 
 def _settled(cells: Cover, goal: float, room: float) -> Tensor:

@@ -2,10 +2,8 @@ r"""A layer's values and their gradient over a batch of cells: one polynomial fo
 
 A `SmoothModel` promises `|h - P| <= r_0` and `|dh/dt_i - dP/dt_i| <= r_i` on each cell `c + half t`, `t` in `[-1, 1]^d`.
 Affine layers act on `P` exactly, so that only the radii, of order `degree` in the size of the cell, meet `|W|`. All rounding
-is part of the radii (see `ocp_torch.certificate.proof.rounding`).
+is part of the radii (see `ROUNDING`).
 """
-
-from __future__ import annotations
 
 import itertools
 import math
@@ -15,9 +13,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.proof.box import Box
-from ocp_torch.certificate.proof.monomials import Monomials
-from ocp_torch.certificate.proof.rounding import ROUNDING, upward
-from ocp_torch.certificate.proof.taylor import TaylorModel
+from ocp_torch.certificate.proof.taylor import ROUNDING, Monomials, TaylorModel, upward
 from ocp_torch.maths.sums import summed
 
 # Room in the rounding of a dot product of n terms: it is bounded as if it had so many more.
@@ -32,9 +28,9 @@ class SmoothModel:
     radii: Tensor
     basis: Monomials
 
-    def degree_sizes(self) -> list[Tensor]:
+    def sizes(self) -> list[Tensor]:
         """`sum_{|alpha| = j} |P_alpha|` for each degree `j`."""
-        return [self.P[a:b].abs().sum(dim=0) for a, b in itertools.pairwise(self.basis.ends)]
+        return self.basis.sizes(self.P)
 
     def slope_sizes(self, i: int) -> list[Tensor]:
         """The same for `dP/dt_i`, of degrees `0 ... degree - 1`."""
@@ -46,15 +42,13 @@ class SmoothModel:
         """`h` ``(N, width)`` and `grad_x h` ``(N, width, d)`` on cells of half-widths ``half``."""
         slopes = []
         for i in range(self.basis.dim):
-            slope = torch.zeros_like(self.P)
+            slope, h = torch.zeros_like(self.P), half[:, i].unsqueeze(-1)
             for k, l, e in self.basis.derivative(i):
                 slope[l] = e * self.P[k]
             # A quotient by a power of two, and the factors e, change nothing but the last bit.
-            h = half[:, i].unsqueeze(-1)
             slope = slope / h
-            slopes.append(
-                TaylorModel(slope, upward(self.radii[1 + i] / h + ROUNDING * slope.abs().sum(dim=0)), self.basis)
-            )
+            radius = upward(self.radii[1 + i] / h + ROUNDING * slope.abs().sum(dim=0))
+            slopes.append(TaylorModel(slope, radius, self.basis))
         return TaylorModel(self.P, self.radii[0], self.basis), TaylorModel.stack(slopes)
 
 
@@ -71,13 +65,14 @@ def embed(box: Box, waves: Tensor) -> SmoothModel:
     return SmoothModel(both.coefficients, torch.cat([both.radius.unsqueeze(0), slope]), box.basis)
 
 
-def affine(model: SmoothModel, weight: Tensor, bias: Tensor) -> SmoothModel:
+def affine(model: SmoothModel, layer: torch.nn.Linear) -> SmoothModel:
     """`W h + b`; the rounding of a dot product of `n` terms is at most `gamma_n = n u / (1 - n u)`, in whatever order."""
+    weight, bias = layer.weight, layer.bias
     gamma = 2.0 * (weight.shape[1] + EXTRA_TERMS) * 2.0**-53
     P = model.P @ weight.T
     P[0] += bias
     slopes = [summed(model.slope_sizes(i)) for i in range(model.basis.dim)]
-    rounded = gamma * torch.stack([summed(model.degree_sizes()), *slopes])
+    rounded = gamma * torch.stack([summed(model.sizes()), *slopes])
     radii = (model.radii + rounded) @ weight.abs().T
     radii[0] += ROUNDING * P[0].abs() + gamma * bias.abs()
     # The last factor makes up for the rounding of the radii's own dot products.
@@ -87,13 +82,9 @@ def affine(model: SmoothModel, weight: Tensor, bias: Tensor) -> SmoothModel:
 def product(left: SmoothModel, right: SmoothModel) -> SmoothModel:
     """`g h`, with `d(g h)/dt_i = h dg/dt_i + g dh/dt_i`."""
     basis, m = left.basis, left.basis.degree
-    P = torch.zeros_like(left.P)
-    for i, j, k in basis.products:
-        P[k].addcmul_(left.P[i], right.P[j])
-    g, h = left.degree_sizes(), right.degree_sizes()
+    g, h = left.sizes(), right.sizes()
     G, H, rg, rh = summed(g), summed(h), left.radii[0], right.radii[0]
-    cut = summed(g[a] * h[b] for a in range(1, m + 1) for b in range(m + 1 - a, m + 1))
-    value = G * rh + H * rg + rg * rh + cut + ROUNDING * G * H
+    value = G * rh + H * rg + rg * rh + basis.left_out(g, h) + ROUNDING * G * H
     slopes = []
     for i in range(basis.dim):
         dg, dh, sg, sh = left.slope_sizes(i), right.slope_sizes(i), left.radii[1 + i], right.radii[1 + i]
@@ -101,4 +92,4 @@ def product(left: SmoothModel, right: SmoothModel) -> SmoothModel:
         tail = summed(dg[a] * h[b] + g[b] * dh[a] for a in range(m) for b in range(m - a, m + 1))
         spread = sg * (H + rh) + DG * rh + sh * (G + rg) + DH * rg
         slopes.append(spread + tail + m * ROUNDING * (DG * H + G * DH))
-    return SmoothModel(P, upward(torch.stack([value, *slopes])), basis)
+    return SmoothModel(basis.product(left.P, right.P), upward(torch.stack([value, *slopes])), basis)
