@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from ocp_torch.certificate.bound import Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions
-from ocp_torch.certificate.lower.penalised import PenalisedDual
-from ocp_torch.certificate.lower.recorded import RecordedDual
+from ocp_torch.certificate.lower.penalised import PenalisedDual, RecordedDual
 from ocp_torch.certificate.lower.rigorous import Rigorous
 from ocp_torch.certificate.lower.shifted import Shifted
 from ocp_torch.certificate.upper.evaluation import Evaluation, EvaluationBelow

@@ -7,8 +7,6 @@ around: averaged, they are gone, and hardly anything else changes. That a subsol
 is how the theory of viscosity solutions treats convex Hamiltonians (Barron and Jensen, 1990).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -36,8 +34,7 @@ class Mollified:
     def __init__(self, value: Field, dim: int, radius: float) -> None:
         axes = torch.eye(dim, dtype=torch.float64)
         if dim > DIRECTIONS:
-            generator = fixed_generator()
-            mixed = torch.randn(dim, DIRECTIONS, generator=generator, dtype=torch.float64)
+            mixed = torch.randn(dim, DIRECTIONS, generator=fixed_generator(), dtype=torch.float64)
             axes = torch.linalg.qr(mixed).Q.T
         self.value, self.radius = value, radius
         self.offsets = radius * torch.cat([torch.zeros_like(axes[:1]), axes, -axes])  # (2 k + 1, d)
@@ -80,19 +77,16 @@ def mollified_shift(
     worst = Samples.concatenate([worst, *beside])
     few = [samples.take(slice(0, max(1, FEW // len(sets)))) for samples in sets]
     on_few = lambda radius: _shift(problem, value, radius, few, worst, min(ascents, FEW_ASCENTS)).bound
-    looks = {radius: on_few(radius) for radius in RADII}
-    best = own
+    best, looks = own, {radius: on_few(radius) for radius in RADII}
     for _ in range(TRIALS):
-        radius = max(looks, key=looks.__getitem__)
-        if looks[radius] <= best.bound:
+        radius = max(looks, key=looks.__getitem__, default=None)
+        if radius is None or looks[radius] <= best.bound:
             break
         tried = _shift(problem, value, radius, sets, worst, ascents)
         best = max(best, replace(tried, name=own.name), key=lambda shift: shift.bound)
         found = problem.samples(tried.largest.x.unsqueeze(0), divergences=False)
         worst = Samples.concatenate([worst, found])
         looks = {r: on_few(r) for r, look in looks.items() if r != radius and look > best.bound}
-        if not looks:
-            break
     return best
 
 

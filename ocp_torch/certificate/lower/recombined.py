@@ -7,10 +7,8 @@ ascents end. The maximum is smoothed (`tau log E exp(Q / tau)`), ever less, and 
 one's ascents found. What the bound is in the end is measured on other states, as for any `W`.
 """
 
-from __future__ import annotations
-
 import math
-from typing import Protocol, TypeGuard
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -33,6 +31,7 @@ ROUNDS, ITERATIONS, ASCENTS, SHARPER = 5, 60, 128, 0.4
 NEGLIGIBLE = 1e-6
 
 
+@runtime_checkable
 class Recombinable(Protocol):
     """A `V` whose last layer combines features."""
 
@@ -41,10 +40,6 @@ class Recombinable(Protocol):
     def features(self, x: Tensor) -> Tensor: ...
 
     def shifted_by(self, weights: Tensor) -> Field: ...
-
-
-def shows_features(value: Field) -> TypeGuard[Recombinable]:
-    return hasattr(value, "features")
 
 
 class Program:
@@ -94,7 +89,7 @@ class Program:
 @torch.no_grad()
 def recombined(problem: Problem, value: Field, seed: int) -> Field | None:
     """`W` for ``value`` `V` in float64; `None` where its model does not show its features, or no weights were found."""
-    if not shows_features(value):
+    if not isinstance(value, Recombinable):
         return None
     width = value.features(torch.zeros(1, problem.dim, dtype=torch.float64)).shape[1]
     count = min(STATES, NUMBERS // (width * (problem.control_dim + 2)))

@@ -1,7 +1,5 @@
 """The shifted bound of a multiple of `V`, proved over cells that cover the torus (`ocp_torch.certificate.proof`)."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from ocp_torch.certificate.bound import LOWER, Bound, once
@@ -39,7 +37,7 @@ class Rigorous(Bound):
 
 
 @once
-def proved(context: Context) -> tuple[RigorousBound | None, str | None]:
+def proved(context: Context) -> "tuple[RigorousBound | None, str | None]":
     """The proved counterpart of `SampledValue.own`, or why there is none; neither where there is no `V` to speak of."""
     V = context.sampled_value
     if V is None:

@@ -1,7 +1,5 @@
 """`V` and its slack at sampled states: what the lower bounds of one `V` share."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 

@@ -6,10 +6,8 @@ every state, so the bound is concave in `theta`: its maximum is found by a searc
 changes nothing.) Where `V` has large slack, at kinks for instance, a `theta` below 1 trades a little of `E[V mu0]` for it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -38,24 +36,22 @@ TOP = 1.5
 class SlackParts:
     """What the slack of every `theta V` at sampled states is made of."""
 
+    cost: PowerCost
     x: Tensor  # (N, d)
     initial: Tensor  # (N,) V mu0
     value: Tensor  # (N,) V - L^0 V / rho
     f: Tensor  # (N,)
     push: Tensor  # (N, m) -B^T grad V / rho
-    cost: PowerCost
 
     @classmethod
-    def of(cls, generator: Generator, V: Jet) -> SlackParts:
-        samples = generator.data
-        value = V.value - generator.transport(V)
-        return cls(samples.x, V.value * samples.mu0, value, samples.f, generator.push(V), generator.cost)
+    def of(cls, generator: Generator, V: Jet) -> "SlackParts":
+        samples, value = generator.data, V.value - generator.transport(V)
+        return cls(generator.cost, samples.x, V.value * samples.mu0, value, samples.f, generator.push(V))
 
     @staticmethod
-    def join(parts: list[SlackParts]) -> SlackParts:
+    def join(parts: "list[SlackParts]") -> "SlackParts":
         names = ("x", "initial", "value", "f", "push")
-        x, initial, value, f, push = (torch.cat([getattr(p, n) for p in parts]) for n in names)
-        return SlackParts(x, initial, value, f, push, parts[0].cost)
+        return SlackParts(parts[0].cost, *(torch.cat([getattr(p, name) for p in parts]) for name in names))
 
     def slack(self, theta: float) -> Tensor:
         """`Q_{theta V}`, ``(N,)``."""
@@ -93,14 +89,21 @@ class Shift:
         radius: float = 0.0,
         beside: Sequence[SlackParts] = (),
         initial: list[float] | None = None,
-    ) -> Shift:
-        """The best multiple of ``value``, whose ``parts`` on ``sets`` are known; the supremum is sought ``beside`` too.
+    ) -> "Shift":
+        r"""The best multiple of ``value``, whose ``parts`` on ``sets`` are known; the supremum is sought ``beside`` too.
 
-        ``initial`` is `E[W mu0]` per set, if that is known."""
+        ``initial`` is `E[W mu0]` per set, if that is known. `theta` is 1, or the maximiser of the bound over the sampled
+        states. The supremum there is searched for anew, and 1 stays where that shows no gain. Where `f < 0` is met the
+        problem breaks its promise, `0` is no subsolution to scale towards, and `theta` is 1.
+        """
         initial = initial or initials(sets, parts)
         everywhere = SlackParts.join([*parts, *beside])
-        theta, largest = best_shift(problem, value, everywhere, sum(initial) / len(initial), ascents)
-        return cls(theta, largest, initial, radius)
+        tried = lambda theta: cls(theta, climbed(problem, value, everywhere, theta, ascents), initial, radius)
+        plain = tried(1.0)
+        if bool((everywhere.f < 0.0).any()):
+            return plain
+        scaled = tried(scaled_by(everywhere, sum(initial) / len(initial)))
+        return scaled if scaled.bound > plain.bound else plain
 
     @property
     def estimate(self) -> Estimate:
@@ -114,9 +117,8 @@ class Shift:
     @property
     def sentence(self) -> str:
         """What the slack is of."""
-        return f"sup Q of {self.theta:.4g} {self.name}" + (
-            f", averaged {self.radius:.2g} around," if self.radius else ""
-        )
+        averaged = f", averaged {self.radius:.2g} around," if self.radius else ""
+        return f"sup Q of {self.theta:.4g} {self.name}{averaged}"
 
 
 def slack_function(problem: Problem, value: Field):
@@ -135,29 +137,17 @@ def _live(problem: Problem, x: Tensor) -> Samples:
     return Samples(x, problem.state_cost(x), problem.drift(x), problem.control_matrix(x), one, one)
 
 
+def climbed_from(function: Field, values: Tensor, states: Tensor, ascents: int) -> Extremum:
+    """The supremum of a ``function`` whose ``values`` ``(N,)`` at ``states`` are known: the largest of those, then local
+    ascents from the largest; an estimate from below."""
+    start = states[values.topk(min(ascents, len(values))).indices]
+    return replace(supremum(function, start, ascents=ascents), points=len(states))
+
+
 def climbed(problem: Problem, value: Field, parts: SlackParts, theta: float, ascents: int) -> Extremum:
-    """`sup Q_{theta V}`: the largest of all sampled states, then local ascents from the worst; an estimate from below."""
-    start = parts.x[parts.slack(theta).topk(min(ascents, len(parts.x))).indices]
+    """`sup Q_{theta V}`."""
     scaled = value if theta == 1.0 else lambda x: theta * value(x)
-    found = supremum(slack_function(problem, scaled), start, ascents=ascents)
-    return Extremum(found.value, found.x, len(parts.x), found.ascents)
-
-
-def best_shift(
-    problem: Problem, value: Field, parts: SlackParts, initial: float, ascents: int
-) -> tuple[float, Extremum]:
-    r"""`theta` and `sup Q_{theta V}`: 1, or the maximiser of `theta initial - max Q_{theta V}` over the sampled states.
-
-    The supremum at the chosen `theta` is searched for anew, and 1 stays where that shows no gain. Where `f < 0` is met
-    the problem breaks its promise, `0` is no subsolution to scale towards, and `theta` is 1.
-    """
-    plain = climbed(problem, value, parts, 1.0, ascents)
-    if bool((parts.f < 0.0).any()):
-        return 1.0, plain
-    theta = scaled_by(parts, initial)
-    scaled = climbed(problem, value, parts, theta, ascents)
-    gains = theta * initial - scaled.value > initial - plain.value
-    return (theta, scaled) if gains else (1.0, plain)
+    return climbed_from(slack_function(problem, scaled), parts.slack(theta), parts.x, ascents)
 
 
 def scaled_by(parts: SlackParts, initial: float) -> float:
@@ -173,10 +163,10 @@ class Shifted(Bound):
     def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
         return (found_by_search("sup Q"),)
 
-    def evaluate(self, context: Context) -> Estimate | None:
+    def evaluate(self, context: "Context") -> Estimate | None:
         return None if context.sampled_value is None else context.sampled_value.best.estimate
 
-    def searches(self, context: Context) -> list[str]:
+    def searches(self, context: "Context") -> list[str]:
         if context.sampled_value is None:
             return []
         best = context.sampled_value.best

@@ -1,10 +1,9 @@
 r"""`J` and `G` of a flux `w` and a density `mu`, at the same states: what the bounds of trained densities share."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from ocp_torch.certificate.checks.hidden import Flux, Hidden, hidden_divergence
 from ocp_torch.certificate.checks.tails import widened
@@ -22,7 +21,7 @@ class DensityBounds(NamedTuple):
     J: Estimate
     G: Estimate | None
     hidden: Hidden | None
-    contributions: list[list[torch.Tensor]] = []  # of `J` and `G`, as parts of each
+    contributions: list[list[Tensor]]  # of `J` and `G`, as parts of each
 
 
 def density_bounds(
@@ -33,18 +32,15 @@ def density_bounds(
     `OPT <= J` for every `w` and `mu >= 0` once `C_V >= sup V*`; `Perf(w/mu) <= J` once `C_V >= sup V^u` (Proposition 6).
     """
     fluxes: list[Flux] = []
-    of: dict[str, list[torch.Tensor]] = {"J": [], "G": []}
+    of: dict[str, list[Tensor]] = {"J": [], "G": []} if problem.driftless else {"J": []}
     for samples in sets:
         parts = [_upper_integrands(problem, control_density, occupation, s, C_V) for s in samples.split(CHUNK)]
-        of["J"].append(samples.weight * torch.cat([j for j, *_ in parts]))
-        if problem.driftless:
-            of["G"].append(samples.weight * torch.cat([g for _, g, *_ in parts]))
-        moved = (torch.cat(columns) / problem.discount for columns in list(zip(*parts, strict=True))[2:])
-        fluxes.append(Flux(samples.x, samples.weight, *moved))
-    means = {
-        name: widened(Estimate.of([float(v.mean()) for v in values]), values) for name, values in of.items() if values
-    }
-    parts_of = [[v / (abs(means[name].value) or 1.0) for v in of[name]] for name in means]
+        *integrands, spread, pushed = (torch.cat(columns) for columns in zip(*parts, strict=True))
+        fluxes.append(Flux(samples.x, samples.weight, spread / problem.discount, pushed / problem.discount))
+        for values, integrand in zip(of.values(), integrands, strict=True):
+            values.append(samples.weight * integrand)
+    means = {name: widened(Estimate.of([float(v.mean()) for v in values]), values) for name, values in of.items()}
+    parts_of = [[v / (abs(means[name].value) or 1.0) for v in values] for name, values in of.items()]
     return DensityBounds(means["J"], means.get("G"), hidden_divergence(fluxes), parts_of)
 
 
@@ -57,13 +53,10 @@ def _upper_integrands(problem, control_density, occupation, samples: Samples, C_
     spread, pushed = rho * (samples.mu0 - inflow), torch.einsum("ndm,nm->nd", samples.B, w)
     if problem.driftless:
         mu = occupation(samples.x)
+        finite, G = torch.isfinite(mu), cost.primal_minimum(w, samples.f, C_V, inflow)
         # An infinite mu stands still at no cost where f = 0: the closed minimum has that limit, J needs the number.
-        J = torch.where(
-            torch.isfinite(mu),
-            generator.primal_integrand(w, torch.where(torch.isfinite(mu), mu, 1.0), inflow - mu, C_V),
-            cost.primal_minimum(w, samples.f, C_V, inflow),
-        )
-        return J, cost.primal_minimum(w, samples.f, C_V, inflow), spread, pushed
+        J = generator.primal_integrand(w, torch.where(finite, mu, 1.0), inflow - mu, C_V)
+        return torch.where(finite, J, G), G, spread, pushed
     mu, drifted = generator.drift_flux_divergence(occupation)
     J = generator.primal_integrand(w, mu, inflow - mu - drifted / rho, C_V)
-    return J, None, spread + drifted, pushed + mu.unsqueeze(-1) * samples.a
+    return J, spread + drifted, pushed + mu.unsqueeze(-1) * samples.a

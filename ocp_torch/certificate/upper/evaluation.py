@@ -1,7 +1,5 @@
 """What the Bellman slack of any `V` says of a given controller's performance, without divergences (1. in `lagrangian`)."""
 
-from __future__ import annotations
-
 from ocp_torch.certificate.bound import PERFORMANCE, UPPER, Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
 from ocp_torch.certificate.context import Context

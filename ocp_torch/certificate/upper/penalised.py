@@ -1,7 +1,5 @@
 r"""`J(w, mu) = E[(f + R(w/mu)) mu + C_V max(r, 0)]`, with `r` the Liouville residual of `w` and `mu` (Proposition 6)."""
 
-from __future__ import annotations
-
 from ocp_torch.certificate.bound import UPPER, Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.context import Context
