@@ -19,8 +19,8 @@ from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.progress import Progress, silent
 from ocp_torch.certificate.run import Run
 from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.certificate.upper.density import DensityBounds
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds, closed_loop_bounds
+from ocp_torch.certificate.upper.penalised import DensityBounds
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.closed_loop import ClosedLoop

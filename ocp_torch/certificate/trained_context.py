@@ -15,8 +15,8 @@ from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.simulated.candidates import simulate_candidates
 from ocp_torch.certificate.simulated.performance import Simulated
 from ocp_torch.certificate.trained import FieldsContext, in_float64
-from ocp_torch.certificate.upper.density import DensityBounds, density_bounds
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
+from ocp_torch.certificate.upper.penalised import DensityBounds, density_bounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
 from ocp_torch.control.policies import Density, Policy, admissible_density, occupation_density
 from ocp_torch.problems.samples import Samples

@@ -15,14 +15,11 @@ from hypothesis import strategies as st
 from ocp_torch.certificate import CertificateSettings, Run, Trained, certify_fields, table
 from ocp_torch.certificate.lower.shifted import slack_function
 from ocp_torch.certificate.proof.activations import SERIES
-from ocp_torch.certificate.proof.box import Box
 from ocp_torch.certificate.proof.cover import cell_models
 from ocp_torch.certificate.proof.enclosures import Enclosure, enclosure
-from ocp_torch.certificate.proof.functions import absolute, power, reciprocal
-from ocp_torch.certificate.proof.network_model import activate, network_model
-from ocp_torch.certificate.proof.obstacle import contradiction, obstacle
-from ocp_torch.certificate.proof.rigorous import rigorous_lower_bound
-from ocp_torch.certificate.proof.smooth_model import SmoothModel, embed, product
+from ocp_torch.certificate.proof.models import Box, SmoothModel, absolute, power, reciprocal
+from ocp_torch.certificate.proof.network_model import activate, embed, network_model, product
+from ocp_torch.certificate.proof.rigorous import contradiction, obstacle, rigorous_lower_bound
 from ocp_torch.certificate.proof.taylor import TaylorModel
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP

@@ -29,7 +29,7 @@ def require_possible(problem: Problem, settings: CertificateSettings, trains_val
 
 
 def _require_provable(dim: int, trains_value: bool) -> None:
-    from ocp_torch.certificate.proof.obstacle import MOST_DIMENSIONS  # a proof is loaded only where one is asked for
+    from ocp_torch.certificate.proof.rigorous import MOST_DIMENSIONS  # a proof is loaded only where one is asked for
 
     if dim > MOST_DIMENSIONS or not trains_value:
         why = f"d = {dim}" if dim > MOST_DIMENSIONS else "no V that the proof could speak of"

@@ -50,9 +50,8 @@ class RecordedDual(PenalisedDual):
 
 def penalised(V: SampledValue, M: float) -> Estimate:
     """`F_M`, its interval widened where a few states carry `E[max(Q, 0)]`."""
-    violation = [part.slack(1.0).clamp_min(0.0) for part in V.parts]
-    pairs = zip(V.initial, V.sets, violation, strict=True)
-    found = Estimate.of([e - M * integral(samples, v) for e, samples, v in pairs])
-    spread = torch.cat([samples.weight * v for samples, v in zip(V.sets, violation, strict=True)])
-    rare = rarity(spread, sum(V.initial) / len(V.initial) / M)
+    pairs = zip(V.sets, V.own.parts, strict=True)
+    violations = [samples.weight * part.slack(1.0).clamp_min(0.0) for samples, part in pairs]
+    found = Estimate.of([e - M * float(v.mean()) for e, v in zip(V.initial, violations, strict=True)])
+    rare = rarity(torch.cat(violations), sum(V.initial) / len(V.initial) / M)
     return replace(found, bias=M * rare) if rare > 0.0 else found

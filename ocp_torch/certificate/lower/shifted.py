@@ -6,8 +6,8 @@ every state, so the bound is concave in `theta`: its maximum is found by a searc
 changes nothing.) Where `V` has large slack, at kinks for instance, a `theta` below 1 trades a little of `E[V mu0]` for it.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
@@ -58,61 +58,70 @@ class SlackParts:
         return hjb_slack(theta * self.value, self.f, None, self.cost.conjugate(theta * self.push))
 
 
-def slack_parts(problem: Problem, value: Field, sets: list[Samples]) -> list[SlackParts]:
-    """The parts on each of ``sets``."""
-    return [SlackParts.of(Generator.of(problem, s), chunked_jet(value, s.x)) for s in sets]
-
-
-def initials(sets: list[Samples], parts: list[SlackParts]) -> list[float]:
-    """`E[V mu0]`, per set."""
-    return integrals([s.x for s in sets], [p.initial for p in parts], [s.weight for s in sets])
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Shift:
-    """`E[theta W mu0] - sup Q_{theta W}`, for `W` the average of `V` at ``radius``, or `V` itself where that is 0."""
+    """The shifted bound of the best multiple of a ``value`` `W` on ``sets`` of samples of ``problem``.
 
-    theta: float
-    largest: Extremum
-    initial: list[float]  # E[W mu0] per set
-    radius: float = 0.0
+    The supremum of the slack is climbed from the ``ascents`` worst states, and sought ``beside`` too. `W` is what ``name``
+    says, averaged over neighbours at ``radius`` where that is not 0. All is computed when it is first asked for.
+    """
+
+    problem: Problem
+    value: Field
+    sets: list[Samples]
+    ascents: int
+    beside: list[Samples]
     name: str = "V"
+    radius: float = 0.0
 
-    @classmethod
-    def of(
-        cls,
-        problem: Problem,
-        value: Field,
-        sets: list[Samples],
-        parts: list[SlackParts],
-        ascents: int,
-        radius: float = 0.0,
-        beside: Sequence[SlackParts] = (),
-        initial: list[float] | None = None,
-    ) -> "Shift":
-        r"""The best multiple of ``value``, whose ``parts`` on ``sets`` are known; the supremum is sought ``beside`` too.
+    @cached_property
+    def parts(self) -> list[SlackParts]:
+        """What the slack of every multiple is made of, per set."""
+        return self._parts_on(self.sets)
 
-        ``initial`` is `E[W mu0]` per set, if that is known. `theta` is 1, or the maximiser of the bound over the sampled
-        states. The supremum there is searched for anew, and 1 stays where that shows no gain. Where `f < 0` is met the
+    def _parts_on(self, sets: list[Samples]) -> list[SlackParts]:
+        return [SlackParts.of(Generator.of(self.problem, s), chunked_jet(self.value, s.x)) for s in sets]
+
+    @cached_property
+    def initial(self) -> list[float]:
+        """`E[W mu0]`, per set."""
+        return integrals([s.x for s in self.sets], [p.initial for p in self.parts], [s.weight for s in self.sets])
+
+    @cached_property
+    def _found(self) -> tuple[float, Extremum]:
+        """`theta`, which is 1 or the maximiser of the bound over the sampled states, and `sup Q_{theta W}`.
+
+        The supremum at the maximiser is searched for anew, and 1 stays where that shows no gain. Where `f < 0` is met the
         problem breaks its promise, `0` is no subsolution to scale towards, and `theta` is 1.
         """
-        initial = initial or initials(sets, parts)
-        everywhere = SlackParts.join([*parts, *beside])
-        tried = lambda theta: cls(theta, climbed(problem, value, everywhere, theta, ascents), initial, radius)
-        plain = tried(1.0)
+        everywhere = SlackParts.join([*self.parts, *self._parts_on(self.beside)])
+        mean = sum(self.initial) / len(self.initial)
+        largest = lambda theta: climbed(self.problem, self.value, everywhere, theta, self.ascents)
+        plain = largest(1.0)
         if bool((everywhere.f < 0.0).any()):
-            return plain
-        scaled = tried(scaled_by(everywhere, sum(initial) / len(initial)))
-        return scaled if scaled.bound > plain.bound else plain
+            return 1.0, plain
+        theta = scaled_by(everywhere, mean)
+        scaled = largest(theta)
+        return (theta, scaled) if theta * mean - scaled.value > mean - plain.value else (1.0, plain)
+
+    @property
+    def theta(self) -> float:
+        return self._found[0]
+
+    @property
+    def largest(self) -> Extremum:
+        """`sup Q_{theta W}`."""
+        return self._found[1]
+
+    @property
+    def bound(self) -> float:
+        """`E[theta W mu0] - sup Q_{theta W}`."""
+        return self.theta * sum(self.initial) / len(self.initial) - self.largest.value
 
     @property
     def estimate(self) -> Estimate:
         """The bound; a negative supremum shifts `W` up."""
         return Estimate.of([self.theta * e - self.largest.value for e in self.initial])
-
-    @property
-    def bound(self) -> float:
-        return self.theta * sum(self.initial) / len(self.initial) - self.largest.value
 
     @property
     def sentence(self) -> str:
@@ -125,16 +134,13 @@ def slack_function(problem: Problem, value: Field):
     """`x -> Q(x)` for the whole torus, differentiable in `x` where the problem is."""
 
     def slack(x: Tensor) -> Tensor:
-        samples = Samples.of(problem, x, divergences=False) if not x.requires_grad else _live(problem, x)
-        return Generator.of(problem, samples).hjb_slack(jet(value, x))
+        one = torch.ones_like(x[:, 0])
+        # `Samples.of` gives data without derivatives: only suprema over `x` want any.
+        with torch.set_grad_enabled(x.requires_grad and torch.is_grad_enabled()):
+            data = Samples(x, problem.state_cost(x), problem.drift(x), problem.control_matrix(x), one, one)
+        return Generator.of(problem, data).hjb_slack(jet(value, x))
 
     return slack
-
-
-def _live(problem: Problem, x: Tensor) -> Samples:
-    """Samples whose data carry derivatives in `x`; only suprema over `x` want that."""
-    one = torch.ones_like(x[:, 0])
-    return Samples(x, problem.state_cost(x), problem.drift(x), problem.control_matrix(x), one, one)
 
 
 def climbed_from(function: Field, values: Tensor, states: Tensor, ascents: int) -> Extremum:

@@ -6,6 +6,7 @@ come from Cauchy's estimate, `sup |g^{(k)}| / k! <= sup_{|Im z| <= R} |g| / R^k`
 Library exp, erf, tanh and log1p are assumed to be accurate to 16 units in the last place.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from functools import reduce
@@ -27,9 +28,7 @@ def horner(coefficients: Sequence, at: Tensor) -> Tensor:
 
 def _family(first: list[float], step: Callable[[Polynomial], Polynomial], count: int) -> list[list[float]]:
     """The coefficients of ``count`` polynomials, each made from the one before."""
-    family = [Polynomial(first)]
-    while len(family) < count:
-        family.append(step(family[-1]))
+    family = itertools.accumulate(range(count - 1), lambda q, _: step(q), initial=Polynomial(first))
     return [q.coef.tolist() for q in family]
 
 
@@ -37,8 +36,7 @@ class Gelu:
     r"""`z Phi(z)`, with the normal distribution function `Phi` and density `phi`: `sigma^{(k)} = q_k phi` from `k = 2` on."""
 
     def __init__(self, order: int) -> None:
-        z = Polynomial([0.0, 1.0])
-        self.q = [[0.0], [0.0], *_family([2.0, 0.0, -1.0], lambda q: q.deriv() - z * q, order)]
+        self.q = [[0.0], [0.0], *_family([2.0, 0.0, -1.0], lambda q: q.deriv() - Polynomial([0.0, 1.0]) * q, order)]
 
     def series(self, z: Tensor, order: int) -> list[Tensor]:
         cut = z.clamp(-38.0, 38.0)  # beyond, phi and every derivative underflow
@@ -65,8 +63,7 @@ class Tanh:
     r"""`sigma^{(k)}` is a polynomial in `T = tanh z`; `|tanh| <= 1` on the strip `|Im z| <= pi/4`."""
 
     def __init__(self, order: int) -> None:
-        slope = Polynomial([1.0, 0.0, -1.0])
-        self.q = _family([0.0, 1.0], lambda q: slope * q.deriv(), order + 1)
+        self.q = _family([0.0, 1.0], lambda q: Polynomial([1.0, 0.0, -1.0]) * q.deriv(), order + 1)
 
     def series(self, z: Tensor, order: int) -> list[Tensor]:
         T = z.tanh()
@@ -96,39 +93,33 @@ class _Sigmoid:
         return RELATIVE * (1.0 + sum((j + 1) * abs(a) for j, a in enumerate(self.q[k]))) / math.factorial(k)
 
 
-class Softplus:
+class Softplus(_Sigmoid):
     r"""`log(1 + e^z)`, whose derivative is the sigmoid."""
 
-    def __init__(self, order: int) -> None:
-        self.s = _Sigmoid(order)
-
     def series(self, z: Tensor, order: int) -> list[Tensor]:
-        sigmoid = self.s.series(z, order - 1)
+        sigmoid = super().series(z, order - 1)
         value = z.clamp_min(0.0) + (-z.abs()).exp().log1p()
         return [value, *(s / (k + 1.0) for k, s in enumerate(sigmoid))]
 
     def error(self, k: int) -> float:
-        return RELATIVE if k == 0 else self.s.error(k - 1)
+        return RELATIVE if k == 0 else super().error(k - 1)
 
     def ceiling(self, k: int) -> float:
         return UP if k == 1 else 0.5 * (2.0 / math.pi) ** (k - 1) / k * UP
 
 
-class Silu:
+class Silu(_Sigmoid):
     r"""`z s(z)`, `sigma^{(k)} = z s^{(k)} + k s^{(k-1)}`; `|sigma'| <= |s| + |z s'| <= 1 + 0.92` on `|Im z| <= pi/2`.
 
     There `|s'| = 1 / (4 |cosh(z/2)|^2) <= 1 / (2 cosh Re z)`, and `(x + pi/2) / (2 cosh x) <= 0.92`.
     """
 
-    def __init__(self, order: int) -> None:
-        self.s = _Sigmoid(order)
-
     def series(self, z: Tensor, order: int) -> list[Tensor]:
-        sigmoid = self.s.series(z, order)
+        sigmoid = super().series(z, order)
         return [z * sigmoid[0], *(z * sigmoid[k] + sigmoid[k - 1] for k in range(1, order + 1))]
 
     def error(self, k: int) -> float:
-        return RELATIVE * 2.0 if k == 0 else self.s.error(k) + self.s.error(k - 1)
+        return RELATIVE * 2.0 if k == 0 else super().error(k) + super().error(k - 1)
 
     def ceiling(self, k: int) -> float:
         return 1.93 * (2.0 / math.pi) ** (k - 1) / k * UP

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ocp_torch.certificate.proof.box import Box, equal_cells
 from ocp_torch.certificate.proof.enclosures import conjugate_model, enclosure
+from ocp_torch.certificate.proof.models import Box
 from ocp_torch.certificate.proof.network_model import network_model
 from ocp_torch.certificate.proof.taylor import ROUNDING, TaylorModel, upward
 from ocp_torch.fields.mlp import PeriodicMLP
@@ -17,9 +17,6 @@ from ocp_torch.problems.problem import Problem
 
 # Degree of the models, by dimension: with a higher one fewer cells are needed, and each takes longer.
 DEGREE = {1: 4, 2: 5}
-# Cells a side to start with, by dimension, and cells evaluated at once, which bounds the memory.
-FIRST_CELLS = {1: 64, 2: 32}
-CHUNK = 256
 # A cell that is longer than so many times its shortest side is bisected along its longest, whatever its models say: without
 # it some would become slivers.
 LONGEST = 4.5
@@ -61,13 +58,6 @@ class Cover:
         upper = upper.nan_to_num(nan=math.inf, posinf=math.inf)
         reached = (Q.coefficients[0] - Q.radius).nan_to_num(nan=-math.inf)
         return cls(centre, half, upper, reached, mean * volume, radius * volume, _loosest(Q, box))
-
-    @classmethod
-    def first(cls, problem: Problem, value: PeriodicMLP, theta: float) -> "Cover":
-        """Equal cells that cover the torus."""
-        cells = equal_cells(problem.dim, FIRST_CELLS[problem.dim], DEGREE[problem.dim])
-        pieces = zip(cells.centre.split(CHUNK), cells.half.split(CHUNK), strict=True)
-        return cls.join([cls.of(problem, value, theta, centre, half) for centre, half in pieces])
 
     @classmethod
     def join(cls, parts: list["Cover"]) -> "Cover":

@@ -68,11 +68,6 @@ class Monomials:
         degree = self.degree
         return summed(left[i] * right[j] for i in range(1, degree + 1) for j in range(degree + 1 - i, degree + 1))
 
-    def derivative(self, i: int) -> list[tuple[int, int, int]]:
-        """`(k, l, e)`: differentiating monomial `k` along `t_i` gives `e` times monomial `l`."""
-        lowered = lambda a: tuple(e - (n == i) for n, e in enumerate(a))
-        return [(k, self.index[lowered(a)], a[i]) for k, a in enumerate(self.exponents) if a[i]]
-
 
 monomials = cache(Monomials)
 

@@ -66,11 +66,8 @@ def closed_loop_bounds(
     initial: list[float] | None = None,
     odd: Tensor | None = None,
 ) -> ClosedLoopBounds:
-    """Evaluate all bounds on ``sets`` of samples of ``loop``; the suprema are sampled on them, and at the states ``odd``
-    ``(K, d)`` too, and climbed.
-
-    ``initial``, if given, is `E[V mu0]` per set from more states: it carries nearly all of the variance.
-    """
+    """All bounds on ``sets`` of samples of ``loop``; suprema are climbed from the worst of them and of the states ``odd``
+    ``(K, d)``. ``initial``, if given, is `E[V mu0]` per set from more states: it carries nearly all of the variance."""
     found = [terms_on(Generator.of(loop, samples), value, log_occupation) for samples in sets]
     terms, slacks, _, fluxes = zip(*found, strict=True)
     states, slack_of = torch.cat([samples.x for samples in sets]), slack_function(loop, value)
@@ -79,9 +76,9 @@ def closed_loop_bounds(
         states = torch.cat([states, odd])
         values = torch.cat([values, batched(value, odd)])
         slack = torch.cat([slack, batched(slack_of, odd)])
-    top = _positive_part(value, values, states, ascents)
-    eps_lo = _positive_part(slack_of, slack, states, ascents)
-    eps_hi = _positive_part(lambda x: -slack_of(x), -slack, states, ascents)
+    suprema = [(value, values), (slack_of, slack), (lambda x: -slack_of(x), -slack)]
+    climbed = (climbed_from(function, met, states, ascents) for function, met in suprema)
+    top, eps_lo, eps_hi = (replace(e, value=max(e.value, 0.0)) for e in climbed)
     hi, lo, C_V = eps_hi.value, eps_lo.value, top.value + eps_hi.value
     started = initial or [integral(t.samples, t.v * t.samples.mu0) for t in terms]
 
@@ -97,24 +94,11 @@ def closed_loop_bounds(
     J, of_J = bound(lambda t, s: t.J(s, C_V))
     masses = [integral(samples, samples.mu0) for samples in sets]
     shifted = lambda by: Estimate.of([e + by * mass for e, mass in zip(started, masses, strict=True)])
-    parts_of = lambda estimate, weighted: [v / (abs(estimate.value) or 1.0) for v in weighted]
-    return ClosedLoopBounds(
-        replace(lagrangian, controller=controller),
-        J,
-        C_V,
-        eps_hi,
-        eps_lo,
-        below,
-        (shifted(-lo), shifted(hi)),
-        hidden_divergence(list(fluxes)),
-        [parts_of(lagrangian, of_lagrangian), parts_of(J, of_J)],
-    )
-
-
-def _positive_part(function: Field, values: Tensor, states: Tensor, ascents: int) -> Extremum:
-    """`sup max(function, 0)`."""
-    found = climbed_from(function, values, states, ascents)
-    return replace(found, value=max(found.value, 0.0))
+    sandwich, hidden = (shifted(-lo), shifted(hi)), hidden_divergence(list(fluxes))
+    pairs = (lagrangian, of_lagrangian), (J, of_J)
+    contributions = [[v / (abs(estimate.value) or 1.0) for v in weighted] for estimate, weighted in pairs]
+    lagrangian = replace(lagrangian, controller=controller)
+    return ClosedLoopBounds(lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions)
 
 
 class Lagrangian(Bound):

@@ -98,10 +98,9 @@ class Pool:
     """
 
     def __init__(self, loop: ClosedLoop, seed: int, like: torch.Tensor, count: int, double: bool = False) -> None:
-        self.loop, self.like = loop, like
+        self.loop, self.like, self.drawn = loop, like, 0
         self.states = SobolSampler(loop.dim, seed, torch.float64 if double else like.dtype)
         self.samples = self._fresh(count)
-        self.drawn = 0
 
     def _fresh(self, count: int) -> Samples:
         states = self.states.draw(count).to(self.like.device).split(CHUNK)

@@ -54,11 +54,8 @@ class RecordedPrimal(PenalisedPrimal):
         if context.hidden is not None:
             return [f"J is not used: {context.hidden.sentence}."]
         fit = recorded(context).fit
-        if fit is None:
-            return []
-        return [
-            f"J is above the controller's performance if C_V = {fit.C_V:.4g}, by the samples met, bounds its value."
-        ]
+        said = "J is above the controller's performance if C_V = {:.4g}, by the samples met, bounds its value."
+        return [said.format(fit.C_V)] if fit else []
 
 
 @torch.no_grad()
@@ -92,19 +89,18 @@ def fit_recorded(context: "RecordedContext", kind: str) -> RecordedFit:
     `ArithmeticError` where the fit fails.
     """
     problem, trained, constants, seed = context.problem, context.trained, context.constants, context.seed
-    cost, rho = problem.control_cost, problem.discount
+    cost, rho, stage = problem.control_cost, problem.discount, context.settings.stage
     policy, rough = (context.policies_of(fields)[kind] for fields in (context.fields, trained.fields))
     like = next(trained.fields.parameters())
     training = closed_loop_samples(problem.training.to(like), rough, cost)
     pool = Drawn(training, derive_seed(seed, Branch.POLICY_EVALUATION, 2))
-    stage = context.settings.stage
     fitted = in_float64(fit_closed_loop(problem, rough, trained.fields, trained.network, constants, stage, seed, pool))
     value = context.value if context.value is not None else fitted.value
     loops = [closed_loop_samples(samples, policy, cost) for samples in context.sets]
     found = [terms_on(Generator(loop, rho, cost), value, fitted.log_occupation) for loop in loops]
     terms, slacks, densities, fluxes = zip(*found, strict=True)
+    seen = training.to(torch.zeros((), dtype=torch.float64))
     with torch.no_grad():
-        seen = training.to(torch.zeros((), dtype=torch.float64))
         V = jet(value, seen.x)
         slack = Generator(seen, rho, cost).hjb_slack(V)
     largest = max(0.0, *(float(v.max()) for v in (*(t.v for t in terms), V.value)))
@@ -120,9 +116,8 @@ def fit_recorded(context: "RecordedContext", kind: str) -> RecordedFit:
 def highest_occupation(mu: Tensor, spread: Tensor, rho: float) -> float:
     """The largest of the fitted densities ``mu`` ``(N,)``; infinite where it need not end there, by ``spread`` `= div g_u`.
 
-    Where a density is largest its gradient is 0, and Liouville's equation says `-div g_u = rho (1 - mu0 / mu) < rho`. A flow
-    that contracts faster than the discount forgets, there where the fit has most mass, has a density without bound, of
-    which a fit shows the lower part.
+    Where a density is largest its gradient is 0, and Liouville's equation says `-div g_u = rho (1 - mu0 / mu) < rho`. Where a
+    flow contracts faster, at the states with most mass, the density has no bound, and a fit shows its lower part.
     """
     top = mu.topk(min(TOP, len(mu))).indices
     return float(mu.max()) if float((-spread[top]).max()) < rho else math.inf
