@@ -1,8 +1,7 @@
 """The bounds of a certificate, listed once: gaps, tables, files and the benchmark's columns follow from this list."""
 
 from ocp_torch.certificate.bound import Bound
-from ocp_torch.certificate.lower.penalised import PenalisedDual
-from ocp_torch.certificate.lower.recorded import RecordedDual
+from ocp_torch.certificate.lower.penalised import PenalisedDual, RecordedDual
 from ocp_torch.certificate.lower.rigorous import Rigorous
 from ocp_torch.certificate.lower.shifted import Shifted
 from ocp_torch.certificate.upper.evaluation import Evaluation, EvaluationBelow

@@ -88,7 +88,7 @@ def require_possible(problem: Problem, settings: CertificateSettings, trains_val
     d, m, replicates = problem.dim, problem.control_dim, settings.replicates
     if settings.rigorous:
         # A proof is loaded only where one is asked for.
-        from ocp_torch.certificate.proof.obstacle import MOST_DIMENSIONS
+        from ocp_torch.certificate.proof.rigorous import MOST_DIMENSIONS
 
         if d > MOST_DIMENSIONS or not trains_value:
             why = f"d = {d}" if d > MOST_DIMENSIONS else "no V that the proof could speak of"

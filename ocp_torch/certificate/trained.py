@@ -14,8 +14,8 @@ from ocp_torch.certificate.checks.tails import sharpened
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.simulated.performance import Candidate
-from ocp_torch.certificate.upper.density import DensityBounds, density_bounds
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
+from ocp_torch.certificate.upper.penalised import DensityBounds, density_bounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
 from ocp_torch.control.policies import Density, Policy, admissible_density, occupation_density, trained_policies
 from ocp_torch.fields.fields import Fields

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from ocp_torch.certificate.lower.recombined import Program
 from ocp_torch.certificate.lower.shifted import SlackParts, slack_function
-from ocp_torch.certificate.proof.box import Box
 from ocp_torch.certificate.proof.cover import cell_models
+from ocp_torch.certificate.proof.models import Box
 from ocp_torch.errors import InputError
 from ocp_torch.maths.jets import Jet, jet
 from ocp_torch.problems.generator import Generator, hjb_slack

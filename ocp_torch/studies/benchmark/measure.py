@@ -12,7 +12,7 @@ from ocp_torch.certificate import BOUNDS, LOWER, UPPER, CertificateSettings, Run
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.certificate.trained import Trained, TrainedContext
-from ocp_torch.certificate.upper.density import DensityBounds
+from ocp_torch.certificate.upper.penalised import DensityBounds
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import InputError
 from ocp_torch.fields.fields import Fields
