@@ -27,7 +27,7 @@ from ocp_torch.files.storage import digest, load_tensors, save_tensors
 from ocp_torch.problems import Kuramoto, Torus
 from ocp_torch.problems.recorded.recording import read
 from ocp_torch.problems.simulator.target import resolved
-from ocp_torch.problems.systems.urdf import read_chain
+from ocp_torch.problems.systems.robot import read_chain
 from ocp_torch.runs import figures
 from ocp_torch.runs.compare import compare
 from ocp_torch.runs.configuration import read_configuration, saved_configuration
