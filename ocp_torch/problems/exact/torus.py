@@ -54,16 +54,17 @@ class Torus(Problem):
         rho, d = self.discount, self.dim
         self._alpha = (math.sqrt(1.0 + 8.0 / (d * rho**2)) - 1.0) * rho**2 / 4.0
         self._rate = 2.0 * self._alpha / rho
-        self._excess = rho - d * self._rate
+        excess = rho - d * self._rate
         self.state_cost_bound = 0.25
-        reach = math.sqrt(d) * self._alpha / rho
+        self.value_bound = d * self._alpha / 4.0
+        self.control_bound = reach = math.sqrt(d) * self._alpha / rho
+        self.occupation_bound = rho / excess if excess > CRITICAL * rho else math.inf
+        self.exact_optimum = d * self._alpha / 12.0
         self._exact = control_limit is None or reach <= control_limit
-        # Out of reach, it is another problem: only what bounds every problem with this cost is still known.
-        self.control_bound = reach if self._exact else self.control_limit
-        if self._exact:
-            self.value_bound = d * self._alpha / 4.0
-            self.occupation_bound = rho / self._excess if self._excess > CRITICAL * rho else math.inf
-            self.exact_optimum = d * self._alpha / 12.0
+        if not self._exact:
+            # Another problem: only what bounds every problem with this cost is still known.
+            self.value_bound = self.occupation_bound = self.exact_optimum = None
+            self.control_bound = self.control_limit
 
     def _offset(self, x: Tensor) -> Tensor:
         """`y - 1/2` in `[-1/2, 1/2)`, ``(N, d)``."""
@@ -79,16 +80,18 @@ class Torus(Problem):
         return torch.zeros_like(x)
 
     def exact_value(self, x: Tensor) -> Tensor | None:
-        return self._alpha * self._offset(x).square().sum(dim=-1) if self._exact else None
+        return None if not self._exact else self._alpha * self._offset(x).square().sum(dim=-1)
 
     def exact_control(self, x: Tensor) -> Tensor | None:
-        return -self._rate * self._offset(x) if self._exact else None
+        return None if not self._exact else -self._rate * self._offset(x)
 
     def exact_occupation(self, x: Tensor) -> Tensor | None:
         if not self._exact:
             return None
-        # When a start on the cube's face arrives: mu* integrates rho e^{-excess t} up to then.
-        arrival = -(2.0 * self._offset(x).abs().amax(dim=-1)).log() / self._rate
-        if abs(self._excess) < CRITICAL * self.discount:
+        reach = 2.0 * self._offset(x).abs().amax(dim=-1)
+        excess = self.discount - self.dim * self._rate
+        # log(1/reach)/k is when a start on the cube's face arrives: mu* integrates rho e^{-excess t} up to then.
+        arrival = -reach.log() / self._rate
+        if abs(excess) < CRITICAL * self.discount:
             return self.discount * arrival
-        return -self.discount / self._excess * torch.expm1(-self._excess * arrival)
+        return -self.discount / excess * torch.expm1(-excess * arrival)
