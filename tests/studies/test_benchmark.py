@@ -16,17 +16,15 @@ from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.studies.benchmark import measure
+from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender
 from ocp_torch.studies.benchmark.contest import build, contest
 from ocp_torch.studies.benchmark.curve import Curve, Point, due, median_and_spread
-from ocp_torch.studies.benchmark.kernels import KernelContender
 from ocp_torch.studies.benchmark.measure import Judge, relative, tabulated
-from ocp_torch.studies.benchmark.networks import NetworkContender
 from ocp_torch.studies.benchmark.report import contest_table, load, reference, save
-from ocp_torch.studies.benchmark.require import require_rl
+from ocp_torch.studies.benchmark.rl import require_rl
 from ocp_torch.studies.paper import figures
-from ocp_torch.studies.paper.recipes import RECIPES
 from ocp_torch.studies.paper.reproduce import check, report, reproduce
-from ocp_torch.studies.paper.runs import carry_out, circle, compare_with_exact
+from ocp_torch.studies.paper.runs import RECIPES, carry_out, circle, compare_with_exact
 from support import zoo
 
 TINY = (
@@ -300,7 +298,7 @@ def test_observations_are_periodic():
 
 
 def small(name):
-    return dataclasses.replace(RECIPES[name], looks=(20, 60), drawn=(20, 60), tabled=(60,), known={})
+    return dataclasses.replace(RECIPES[name], looks=(20, 60), drawn=(20, 60), known={60: {}})
 
 
 @pytest.mark.parametrize("name", RECIPES)

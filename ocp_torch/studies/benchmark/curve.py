@@ -1,9 +1,8 @@
 """What a contender reached, and when: points along one run, and several runs together."""
 
-from __future__ import annotations
-
 import math
 import statistics
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from ocp_torch.certificate import LOWER, UPPER, bounds
@@ -66,6 +65,6 @@ def due(first: int, per_decade: int = 4):
             yield count
 
 
-def median_and_spread(values: list[float]) -> tuple[float, float, float]:
+def median_and_spread(values: Sequence[float]) -> tuple[float, float, float]:
     """Median, smallest and largest."""
     return statistics.median(values), min(values), max(values)

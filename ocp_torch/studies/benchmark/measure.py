@@ -1,7 +1,5 @@
 """The numbers a method is judged by at one moment: bounds and performances of its fields, as certificates compute them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,9 +1,8 @@
 """Curves of several seeds as a table and as plots."""
 
-from __future__ import annotations
-
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,22 +30,17 @@ def reference(curves: list[Curve], exact: float | None) -> tuple[float, str]:
     return max(found, default=math.nan), "the best lower bound found"
 
 
-def columns(curves: list[Curve]) -> list[str]:
-    """The names of the listed bounds on `OPT` that any of ``curves`` ends with."""
-    ends = [c.points[-1].numbers for c in curves]
-    return [n for side in (LOWER, UPPER) for n in bounds.on(side) if any(n in numbers for numbers in ends)]
-
-
 def by_contender(curves: list[Curve]) -> dict[str, list[Curve]]:
-    names = dict.fromkeys(c.contender for c in curves)
-    return {name: [c for c in curves if c.contender == name] for name in names}
+    return {name: [c for c in curves if c.contender == name] for name in dict.fromkeys(c.contender for c in curves)}
 
 
 def contest_table(curves: list[Curve], exact: float | None) -> str:
     """A Markdown table: at each contender's end, median over seeds and, where there are several, smallest to largest."""
     optimum, what = reference(curves, exact)
     off = lambda number: 100.0 * (number / optimum - 1.0)
-    names = columns(curves)
+    groups = by_contender(curves)
+    hits = {name: [hit for c in own if (hit := c.first_within(TOLERANCE, optimum))] for name, own in groups.items()}
+    names = [n for side in (LOWER, UPPER) for n in bounds.on(side) if any(n in c.points[-1].numbers for c in curves)]
     heads = ["contender", "samples", "seconds", *names, "Perf", "gap, certified", "times smaller"]
     heads += ["1 % on Perf after samples", "seconds"]
     lines = [
@@ -58,44 +52,34 @@ def contest_table(curves: list[Curve], exact: float | None) -> str:
         f"| {' | '.join(heads)} |",
         "|---" * len(heads) + "|",
     ]
-    widest = gaps(by_contender(curves).get(BASELINE, []))
-    for name, own in by_contender(curves).items():
-        ends = [c.points[-1] for c in own]
+    widest = gaps(groups.get(BASELINE, []))
+    for name, own in groups.items():
+        ends, certified, reached = [c.points[-1] for c in own], gaps(own), hits[name]
         number = lambda key, ends=ends: spread([off(p.numbers[key]) for p in ends if key in p.numbers], "+.3g", " %")
-        certified = gaps(own)
         ratio = median_and_spread(widest)[0] / median_and_spread(certified)[0] if widest and certified else math.nan
-        hits = [c.first_within(TOLERANCE, optimum) for c in own]
-        reached = [hit for hit in hits if hit is not None]
         few = "" if len(reached) == len(own) else f" ({len(reached)} of {len(own)} seeds)"
-        seconds = spread([p.seconds for p in ends], ".3g", "")
         later = [c.certificate_seconds for c in own if c.certificate_seconds > 0.0]
         cells = [
             name,
-            spread([float(p.samples) for p in ends], ",.0f", ""),
-            seconds + (f" + {median_and_spread(later)[0]:.3g}" if later else ""),
+            spread([p.samples for p in ends], ",.0f"),
+            spread([p.seconds for p in ends], ".3g") + (f" + {median_and_spread(later)[0]:.3g}" if later else ""),
             *map(number, names),
             spread([off(p.perf) for p in ends if math.isfinite(p.perf)], "+.3g", " %"),
             spread(certified, ".3g", " %") + ("*" if certified and any(c.certified is None for c in own) else ""),
             f"{ratio:.3g}" if math.isfinite(ratio) else "-",
-            spread([float(p.samples) for p in reached], ",.0f", "") + few if reached else "not reached",
-            spread([p.seconds for p in reached], ".3g", "") if reached else "-",
+            spread([p.samples for p in reached], ",.0f") + few if reached else "not reached",
+            spread([p.seconds for p in reached], ".3g"),
         ]
         lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", *winners(curves, optimum)])
+    sure = {name: reached for name, reached in hits.items() if len(reached) == len(groups[name])}
+    return "\n".join([*lines, "", *(winners(sure) if sure else [])])
 
 
-def winners(curves: list[Curve], optimum: float) -> list[str]:
-    """Who reaches the tolerance first with every seed, in samples and in CPU seconds, by the median over seeds."""
-    reached = {
-        name: [hit for c in own if (hit := c.first_within(TOLERANCE, optimum)) is not None]
-        for name, own in by_contender(curves).items()
-    }
-    sure = {name: hits for name, hits in reached.items() if len(hits) == len(by_contender(curves)[name])}
-    if not sure:
-        return []
+def winners(reached: dict[str, list[Point]]) -> list[str]:
+    """Who reaches the tolerance first, in samples and in CPU seconds, by the median over seeds."""
     found = []
-    for unit, measure in (("samples", lambda p: p.samples), ("seconds", lambda p: p.seconds)):
-        medians = {name: median_and_spread([measure(hit) for hit in hits])[0] for name, hits in sure.items()}
+    for unit in ("samples", "seconds"):
+        medians = {name: median_and_spread([getattr(hit, unit) for hit in hits])[0] for name, hits in reached.items()}
         first = min(medians, key=lambda name: medians[name])
         found.append(f"1 % on Perf in the fewest {unit}: {first}, {medians[first]:,.6g}.")
     return found
@@ -107,7 +91,7 @@ def gaps(curves: list[Curve]) -> list[float]:
     return [100.0 * gap for gap in found if math.isfinite(gap)]
 
 
-def spread(values: list[float], form: str, unit: str) -> str:
+def spread(values: Sequence[float], form: str, unit: str = "") -> str:
     """`median [smallest, largest]`, or the one value, or a dash."""
     if not values:
         return "-"
@@ -115,7 +99,7 @@ def spread(values: list[float], form: str, unit: str) -> str:
     return f"{middle}{unit}" + (f" [{low}, {high}]" if low != high else "")
 
 
-def plot(curves: list[Curve], exact: float | None) -> Figure:
+def plot(curves: list[Curve], exact: float | None) -> "Figure":
     """Sub-optimality of the controller and the gap of the bounds, against samples and against CPU seconds."""
     optimum, what = reference(curves, exact)
     rows = {

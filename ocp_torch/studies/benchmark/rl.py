@@ -1,7 +1,5 @@
 """SAC and PPO of Stable-Baselines3 as contenders; need the optional extra `rl`."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import dataclass
@@ -10,19 +8,30 @@ import numpy as np
 import torch
 
 from ocp_torch.certificate import CertificateSettings
-from ocp_torch.errors import require_integer
+from ocp_torch.errors import InputError, require_integer
 from ocp_torch.gym.environment import make_environment, observe
 from ocp_torch.problems import Problem
 from ocp_torch.studies.benchmark.curve import Curve, Point, due
 from ocp_torch.studies.benchmark.measure import Judge
-from ocp_torch.studies.benchmark.require import require_rl
+
+
+def require_rl() -> tuple:
+    """The modules `gymnasium` and `stable_baselines3`, or an `InputError` that says how to get them."""
+    try:
+        import gymnasium
+        import stable_baselines3
+    except ImportError as error:
+        raise InputError(
+            f'SAC and PPO need packages that are not installed ({error.name}); get them with pip install -e ".[rl]".'
+        ) from None
+    return gymnasium, stable_baselines3
 
 
 @dataclass(frozen=True)
 class RLContender:
-    """``algorithm`` is sac or ppo with the library's defaults; actions reach ``control_bound``, as all methods may know."""
+    """``name`` is sac or ppo with the library's defaults; actions reach ``control_bound``, as all methods may know."""
 
-    algorithm: str
+    name: str
     problem: Problem
     control_bound: float
     steps: int
@@ -30,18 +39,14 @@ class RLContender:
     horizon: float
 
     def __post_init__(self) -> None:
-        require_integer(f"rl.steps.{self.algorithm}", self.steps, 1)
+        require_integer(f"rl.steps.{self.name}", self.steps, 1)
 
-    @property
-    def name(self) -> str:
-        return self.algorithm
-
-    def run(self, seed: int, judge: Judge, certificate: CertificateSettings | None) -> Curve:
+    def run(self, seed: int, judge: Judge, settings: CertificateSettings) -> Curve:
         """Learn for ``steps`` transitions; the policy is simulated in continuous time like every other controller."""
         _, sb3 = require_rl()
         environment = make_environment(self.problem, self.control_bound, self.time_step, self.horizon, seed)
         discount = math.exp(-self.problem.discount * self.time_step)
-        made = {"sac": sb3.SAC, "ppo": sb3.PPO}[self.algorithm]
+        made = {"sac": sb3.SAC, "ppo": sb3.PPO}[self.name]
         model = made("MlpPolicy", environment, gamma=discount, seed=seed, device="cpu", verbose=0)
         points, spent = [], 0.0
         for count in due(500):

@@ -4,8 +4,6 @@ r"""The exact kernel of the periodic Sobolev space of whole regularity `s`, and 
 kernel of the paper's example (section 4.4). In several dimensions the product of one such kernel per coordinate.
 """
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 
@@ -31,7 +29,7 @@ class BernoulliKernel:
     def __init__(self, regularity: int = 2) -> None:
         self.regularity = s = require_integer("regularity", regularity, 2, maximum=8)
         sign = (-1) ** (s + 1) * (2.0 * math.pi) ** (2 * s)
-        # B_n' = n B_{n-1}; highest power first, for Horner's rule.
+        # B_n' = n B_{n-1}; highest power first, as np.polyval takes them.
         self._polynomials = [
             [sign / math.factorial(2 * s - k) * float(c) for c in reversed(bernoulli_polynomial(2 * s - k))]
             for k in (0, 1, 2)
@@ -41,7 +39,7 @@ class BernoulliKernel:
     def derivatives(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`kappa`, `kappa'` and `kappa''` at each entry of ``t``."""
         t = t - np.floor(t)
-        value, slope, curvature = (_horner(polynomial, t) for polynomial in self._polynomials)
+        value, slope, curvature = (np.polyval(polynomial, t) for polynomial in self._polynomials)
         return value, slope, curvature
 
     def jets(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -61,11 +59,3 @@ class BernoulliKernel:
                     entry = entry * factors[orders[i]][..., i]
                 block[..., a, b] = -entry if b > 0 else entry
         return block
-
-
-def _horner(coefficients: list[float], t: np.ndarray) -> np.ndarray:
-    total = np.full_like(t, coefficients[0])
-    for c in coefficients[1:]:
-        total *= t
-        total += c
-    return total

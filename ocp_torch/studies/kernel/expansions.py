@@ -4,8 +4,6 @@ Both move along `sum_a c_a d_a Phi(x)` at one state `x` (`d_0 Phi = Phi`), whose
 jets at one state. ``mark`` and ``restore`` go back to where a look-ahead began.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -13,13 +11,13 @@ import torch
 
 from ocp_torch.fields.sobolev import SobolevFeatures, SobolevField
 from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
-from ocp_torch.studies.kernel.stream import Datum
+from ocp_torch.studies.kernel.rules import Datum
 
 
 class FeatureExpansion:
     """`V = theta . features`: a step costs the same at every `n`. ``radius`` is that of the ball it is projected on."""
 
-    def __init__(self, features: SobolevFeatures, runs: int, outputs: int, radius: float | None = None) -> None:
+    def __init__(self, features: SobolevFeatures, runs: int, outputs: int, radius: float | None) -> None:
         self.features, self.radius = features, radius
         self.theta = np.zeros((runs, features.count, outputs))
         self.total, self.count = np.zeros_like(self.theta), 0
@@ -46,9 +44,13 @@ class FeatureExpansion:
         self.total += self.theta
         self.count += 1
 
+    @torch.no_grad()
     def field(self, run: int, scalar: bool) -> SobolevField:
-        """The averaged iterate of one run as a network; ``(N,)`` if ``scalar``."""
-        return as_field(self.features, self.total[run] / max(self.count, 1), scalar)
+        """The averaged iterate of one run as a float64 network in units of 1; ``(N,)`` if ``scalar``."""
+        theta = self.total[run] / max(self.count, 1)
+        field = SobolevField.of(self.features, None if scalar else theta.shape[1]).double()
+        field.coefficients.copy_(torch.from_numpy(theta[:, 0] if scalar else theta.T))
+        return field.requires_grad_(False)
 
 
 class KernelExpansion:
@@ -58,7 +60,7 @@ class KernelExpansion:
     """
 
     def __init__(
-        self, kernel: BernoulliKernel, dim: int, runs: int, outputs: int, capacity: int, radius: float | None = None
+        self, kernel: BernoulliKernel, dim: int, capacity: int, runs: int, outputs: int, radius: float | None
     ) -> None:
         self.kernel, self.radius, self.known = kernel, radius, 0
         self.x = np.zeros((runs, capacity, dim))
@@ -98,7 +100,7 @@ class KernelExpansion:
         return self.coefficients[:, : self.known].copy(), self.squared_norm
 
     def restore(self, mark: Any) -> None:
-        """States met since then stay, with the coefficient 0: the average may hold them."""
+        """States added since then stay, with the coefficient 0: the average may hold them."""
         coefficients, self.squared_norm = mark
         kept = coefficients.shape[1]
         self.coefficients[:, :kept] = coefficients
@@ -108,17 +110,3 @@ class KernelExpansion:
         """Count the present iterate in the average."""
         self.total[:, : self.known] += self.coefficients[:, : self.known]
         self.count += 1
-
-    def field(self, run: int, scalar: bool, features: SobolevFeatures) -> SobolevField:
-        """The averaged iterate of one run, as seen by ``features``: its Fourier coefficients are exact."""
-        jets = features.jets(torch.from_numpy(self.x[run, : self.known])).numpy()
-        theta = np.einsum("kaf,kao->fo", jets, self.total[run, : self.known] / max(self.count, 1))
-        return as_field(features, theta, scalar)
-
-
-@torch.no_grad()
-def as_field(features: SobolevFeatures, theta: np.ndarray, scalar: bool) -> SobolevField:
-    """The float64 network with coefficients ``theta`` ``(F, o)``, in units of 1."""
-    field = SobolevField.of(features, None if scalar else theta.shape[1]).double()
-    field.coefficients.copy_(torch.from_numpy(theta[:, 0] if scalar else theta.T))
-    return field.requires_grad_(False)

@@ -1,22 +1,24 @@
-"""The paper's kernel methods as contenders."""
+"""Contenders: the paper's kernel methods, and the package's trained fields, any method with any model as `scripts/train.py`
+would train it."""
 
-from __future__ import annotations
-
+import copy
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields
+from ocp_torch.certificate import CertificateSettings, Run, Trained, certify_fields
 from ocp_torch.control import policies
 from ocp_torch.errors import InputError, require_integer, require_number
-from ocp_torch.fields import PeriodicMLP
+from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.fields.sobolev import SobolevFeatures
 from ocp_torch.files.memory import require_memory
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
+from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.studies.benchmark.curve import Curve, Point, due
 from ocp_torch.studies.benchmark.measure import Judge
 from ocp_torch.studies.kernel import Iteration, step_sizes
+from ocp_torch.training.monitor import Silent
 
 OCCUPATION = {"dual": None, "primal": policies.CLOSED, "pd": policies.SADDLE}
 # The paper's: constant for one player, 25 % less every 20,000 steps for two.
@@ -54,11 +56,7 @@ class KernelContender:
     def name(self) -> str:
         return f"kernel {self.method}"
 
-    def in_time(self, seconds: float) -> KernelContender:
-        """The same within ``seconds``, where none are given."""
-        return self if self.seconds is not None else replace(self, seconds=seconds)
-
-    def run(self, seed: int, judge: Judge, certificate: CertificateSettings | None) -> Curve:
+    def run(self, seed: int, judge: Judge, settings: CertificateSettings) -> Curve:
         """Train, look at the bounds at growing counts outside the clock, and certify the end."""
         features = SobolevFeatures(self.problem.dim, self.regularity, modes=self.modes)
         iteration = Iteration(self.problem, self.method, self.constants, (seed,), features=features)
@@ -74,15 +72,56 @@ class KernelContender:
             points.append(Point(iteration.samples, spent, judge(fields, OCCUPATION[self.method])))
             if spent >= most or iteration.n >= self.longest:
                 break
-        if certificate is None:
-            return Curve(self.name, seed, points)
         started = time.process_time()
-        certified = self.certify(fields, seed, iteration, certificate)
+        # Policy evaluation in the certificate is done with a network: a kernel method gets the same help as the others.
+        trained = Trained(fields, OCCUPATION[self.method], lambda **form: PeriodicMLP(modes=6, **form))
+        run = Run(type(self.problem).__name__.lower(), self.method, seed, iteration.n, iteration.samples)
+        certified = certify_fields(self.problem, trained, self.constants, settings, run)
         return Curve(self.name, seed, points, certified.gap["certified"], time.process_time() - started)
 
-    def certify(self, fields, seed: int, iteration: Iteration, settings: CertificateSettings) -> Certificate:
-        """The full certificate, its policy evaluation with a network: a kernel method gets the same help as the others."""
-        network = lambda **form: PeriodicMLP(modes=6, **form)
-        trained = Trained(fields, OCCUPATION[self.method], network)
-        run = Run(type(self.problem).__name__.lower(), self.method, seed, iteration.n, iteration.samples)
-        return certify_fields(self.problem, trained, self.constants, settings, run)
+
+class Recorder(Silent):
+    """Keeps the averaged fields at growing sample counts; `seconds` is CPU time without what keeping them took."""
+
+    def __init__(self) -> None:
+        self.due = due(10_000)
+        self.next = next(self.due)
+        self.kept: list[tuple[int, float, Fields]] = []
+        self.started = time.process_time()
+
+    @property
+    def seconds(self) -> float:
+        return time.process_time() - self.started
+
+    def stepped(self, trainer, report, log: bool) -> None:
+        last = trainer.step == trainer.end
+        if trainer.samples < self.next and not last:
+            return
+        before = time.process_time()
+        self.kept.append((trainer.samples, self.seconds, copy.deepcopy(trainer.averaged_fields)))
+        while self.next <= trainer.samples:
+            self.next = next(self.due)
+        self.started += time.process_time() - before
+
+
+@dataclass(frozen=True)
+class NetworkContender:
+    """``config`` is a resolved training configuration; the method and the model are read from it."""
+
+    config: dict
+
+    @property
+    def name(self) -> str:
+        return f"{self.config['model']['name']} {self.config['method']['name']}"
+
+    def run(self, seed: int, judge: Judge, settings: CertificateSettings) -> Curve:
+        """Train with the default budget; the certificate at the end is the configuration's."""
+        trainer = build_trainer({**self.config, "seed": seed})
+        recorder = Recorder()
+        trainer.fit(recorder)
+        judge = Judge(trainer.problem, trainer.constants, judge.seed, judge.effort)
+        occupation = trainer.objective.occupation
+        points = [Point(samples, seconds, judge(fields, occupation)) for samples, seconds, fields in recorder.kept]
+        started = time.process_time()
+        certified = trainer.certify(build_certificate_settings(trainer.config))
+        return Curve(self.name, seed, points, certified.gap["certified"], time.process_time() - started)
