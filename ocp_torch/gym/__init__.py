@@ -5,8 +5,6 @@ Arguments of the problem and of `make_environment` are given to `gymnasium.make`
 registered, and `register` says how to get it.
 """
 
-from __future__ import annotations
-
 import os
 from importlib.util import find_spec
 
@@ -17,12 +15,7 @@ from ocp_torch.problems import PROBLEMS, Problem
 # Arguments of the environment; every other one is the problem's.
 ENVIRONMENT = ("control_bound", "time_step", "horizon", "render_mode")
 
-__all__ = ["make", "names", "register"]
-
-
-def names() -> dict[str, str]:
-    """Environment id -> name of the problem, for all that can be simulated."""
-    return {f"ocp_torch/{c.__name__}-v0": name for name, c in PROBLEMS.items() if c.has_simulator}
+__all__ = ["make", "register"]
 
 
 def make(problem: str | Problem | None = None, **options):
@@ -44,11 +37,10 @@ def make(problem: str | Problem | None = None, **options):
 def register() -> None:
     """Put all of them into Gymnasium's registry. Raises `InputError` where it is not installed."""
     gymnasium = require_gymnasium()
-    for environment, name in names().items():
+    given = {f"ocp_torch/{c.__name__}-v0": {"problem": name} for name, c in PROBLEMS.items() if c.has_simulator}
+    for environment, arguments in (given | {"ocp_torch/Problem-v0": {}}).items():
         if environment not in gymnasium.registry:
-            gymnasium.register(environment, entry_point="ocp_torch.gym:make", kwargs={"problem": name})
-    if "ocp_torch/Problem-v0" not in gymnasium.registry:
-        gymnasium.register("ocp_torch/Problem-v0", entry_point="ocp_torch.gym:make")
+            gymnasium.register(environment, entry_point="ocp_torch.gym:make", kwargs=arguments)
 
 
 if find_spec("gymnasium") is not None:

@@ -1,7 +1,5 @@
 """A problem as a Gymnasium environment; needs the optional extra `gym`. Registered under its name by `ocp_torch.gym`."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from typing import Any
@@ -95,8 +93,7 @@ def _environment_class() -> type:
                 self.generator.manual_seed(derive_seed(seed, Branch.EPISODES))
             self.elapsed = 0.0
             if self._drawn is not None:
-                row = torch.randint(len(self._drawn), (1,), generator=self.generator)
-                self.x = self._drawn[row]
+                self.x = self._drawn[torch.randint(len(self._drawn), (1,), generator=self.generator)]
                 return observe(self.x), {"state": self.x[0].numpy()}
             for _ in range(MOST_TRIES):
                 self.x = torch.rand(1, self.problem.dim, dtype=torch.float64, generator=self.generator)
@@ -120,8 +117,7 @@ def _environment_class() -> type:
             return clocks(self.x[0]) if self.render_mode == "rgb_array" else None
 
         # What an agent made for the problem needs to know of its environment.
-        def from_observation(self, observation: np.ndarray) -> np.ndarray:
-            return state_of(observation)
+        from_observation = staticmethod(state_of)
 
         def to_action(self, control: np.ndarray) -> np.ndarray:
             return np.clip(np.asarray(control) / self.control_bound, -1.0, 1.0).astype(np.float32)

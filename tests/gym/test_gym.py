@@ -10,9 +10,8 @@ import torch
 from PIL import Image
 
 from ocp_torch.errors import InputError
-from ocp_torch.gym.agent import Agent
 from ocp_torch.gym.environment import clocks, make_environment, observe, require_gymnasium, state_of
-from ocp_torch.gym.rollout import made, play, rollout_job, save_gif
+from ocp_torch.gym.rollout import Agent, made, play, rollout_job, save_gif
 from ocp_torch.problems import PROBLEMS, Dataset, Manufactured
 from ocp_torch.runs.record import Recorder
 from support import zoo
@@ -129,7 +128,7 @@ def test_a_controller_acts_in_an_environment_of_ours(gymnasium, run, tmp_path):
     assert len(found.returns) == 8
     assert (found.lengths == 50).all()
     # Better than doing nothing from the same starts.
-    env = made("ocp_torch/Circle-v0", None)
+    env = made("ocp_torch/Circle-v0")
     idle = []
     for k in range(8):
         env.reset(seed=k)
@@ -200,7 +199,7 @@ def test_a_problem_maps_a_foreign_environment(gymnasium, foreign, run, monkeypat
     # The cost is least at x = 1/2, half a turn: the dial is turned there.
     job = asked(run, env=foreign)
     acted = job.run()
-    env = made(foreign, None)
+    env = made(foreign)
     last = []
     for k in range(8):
         agent = Agent(job.controller, env, foreign)
@@ -282,7 +281,7 @@ def test_a_saved_pendulum_controller_plays_gymnasiums_untouched(gymnasium, tmp_p
         def __call__(self, x):
             return policy(torch.from_numpy(x)).numpy()
 
-    env = made("Pendulum-v1", None)
+    env = made("Pendulum-v1")
     found = play(Classical(), env, "Pendulum-v1", 20, 0)
     env.close()
     assert (found.lengths == 200).all()
