@@ -79,15 +79,19 @@ class Rollouts:
         )
 
 
-@dataclass(frozen=True)
 class RolloutJob:
-    """What was asked for, checked."""
+    """What was asked for: a saved controller and an environment it can act in. Raises `InputError` for a wrong field."""
 
-    controller: Controller
-    env: str
-    episodes: int
-    seed: int
-    video: Path | None
+    def __init__(self, config: dict) -> None:
+        self.controller = load_run(config)
+        self.video = None if config["video"] is None else Path(str(config["video"]))
+        if self.video is not None and self.video.suffix != ".gif":
+            raise InputError(f"video is {str(self.video)!r}, but must be a file whose name ends in .gif.")
+        self.env = str(config["env"])
+        with closing(made(self.env)) as env:
+            Agent(self.controller, env, self.env).act(env.reset(seed=0)[0])
+        self.episodes = require_integer("episodes", config["episodes"], 1, maximum=10**6)
+        self.seed = require_integer("seed", config["seed"], 0)
 
     def run(self) -> Rollouts:
         """Play and print; then film the first episode again, if asked to."""
@@ -148,16 +152,3 @@ def save_gif(path: Path, frames: list[np.ndarray], rate: float) -> None:
     images = [Image.fromarray(frame) for frame in frames]
     options: dict[str, Any] = dict(save_all=True, append_images=images[1:], duration=round(1000.0 / rate), loop=0)
     write_atomically(path, lambda temporary: images[0].save(temporary, format="GIF", **options))
-
-
-def rollout_job(config: dict) -> RolloutJob:
-    """Check every field. Raises `InputError` for a wrong one."""
-    controller = load_run(config)
-    video = None if config["video"] is None else Path(str(config["video"]))
-    if video is not None and video.suffix != ".gif":
-        raise InputError(f"video is {str(video)!r}, but must be a file whose name ends in .gif.")
-    name = str(config["env"])
-    with closing(made(name)) as env:
-        Agent(controller, env, name).act(env.reset(seed=0)[0])
-    episodes = require_integer("episodes", config["episodes"], 1, maximum=10**6)
-    return RolloutJob(controller, name, episodes, require_integer("seed", config["seed"], 0), video)

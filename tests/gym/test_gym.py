@@ -11,7 +11,7 @@ from PIL import Image
 
 from ocp_torch.errors import InputError
 from ocp_torch.gym.environment import clocks, make_environment, observe, require_gymnasium, state_of
-from ocp_torch.gym.rollout import Agent, made, play, rollout_job, save_gif
+from ocp_torch.gym.rollout import Agent, RolloutJob, made, play, save_gif
 from ocp_torch.problems import PROBLEMS, Dataset, Manufactured
 from ocp_torch.runs.record import Recorder
 from support import zoo
@@ -117,7 +117,7 @@ def run(tmp_path_factory):
 
 
 def asked(run, **changes):
-    return rollout_job({"run": str(run), "problem": {}, "episodes": 8, "seed": 0, "video": None, **changes})
+    return RolloutJob({"run": str(run), "problem": {}, "episodes": 8, "seed": 0, "video": None, **changes})
 
 
 def test_a_controller_acts_in_an_environment_of_ours(gymnasium, run, tmp_path):

@@ -20,9 +20,9 @@ CHECKS = {
     "train": "training_run",
     "certify": "arguments",
     "evaluate": "recertification",
-    "reference": "reference_job",
+    "reference": "ReferenceJob",
     "record": "recorder",
-    "rollout": "rollout_job",
+    "rollout": "RolloutJob",
     "benchmark": "build",
     "reproduce_paper": "check",
 }

@@ -1,7 +1,5 @@
 """What a grid can solve: few dimensions, enough memory, finite and periodic data, the power cost."""
 
-from __future__ import annotations
-
 import torch
 
 from ocp_torch.errors import InputError, require_integer, require_number
@@ -57,7 +55,7 @@ def require_solvable(problem: Problem, grid: Grid) -> None:
     d, m = problem.dim, problem.control_dim
     shapes = {"state_cost": (), "drift": (d,), "control_matrix": (d, m), "initial_density": ()}
     probe = torch.rand(PROBED, d, generator=fixed_generator(), dtype=torch.float64)
-    nodes = grid.nodes()
+    parts = probe, *grid.nodes().split(PIECE)
     for name, shape in shapes.items():
         function = getattr(problem, name)
         first = function(probe)
@@ -67,8 +65,8 @@ def require_solvable(problem: Problem, grid: Grid) -> None:
                 f"{name} gives shape {tuple(first.shape)} at {len(probe)} states, but must give ({wanted})."
             )
         size = 0.0
-        for part in (probe, *nodes.split(PIECE)):
-            values = function(part).flatten(1) if shape else function(part).unsqueeze(-1)
+        for part in parts:
+            values = function(part).reshape(len(part), -1)
             bad = ~torch.isfinite(values).all(dim=-1)
             if bad.any():
                 at = [round(c, 6) for c in part[bad][0].tolist()]

@@ -1,16 +1,9 @@
 """A periodic grid on the unit torus: nodes, interpolation stencils and differences."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 OFFSETS = 4  # nodes of the cubic stencil per coordinate
 
@@ -55,6 +48,11 @@ class Grid:
             low, high = outer(low, linear[:, k]), outer(high, cubic[:, k])
         return Stencil(flat, low, high)
 
+    def interpolated(self, field: Tensor, x: Tensor) -> Tensor:
+        """A vector field ``(side^d, k)``, multilinearly between the nodes, at points ``(N, d)``; ``(N, k)``."""
+        stencil = self.stencil(x)
+        return (stencil.linear.unsqueeze(-1) * field[stencil.index]).sum(dim=1)
+
     def shifted(self, field: Tensor, coordinate: int, cells: int) -> Tensor:
         """At each node the value of ``field`` ``(side^d, ...)`` that many ``cells`` further along ``coordinate``."""
         shape = [self.side] * self.dim
@@ -62,17 +60,6 @@ class Grid:
 
     def gradient(self, values: Tensor) -> Tensor:
         """Central differences of fourth order, ``(side^d, d)``."""
-        columns = []
-        for k in range(self.dim):
-            near = self.shifted(values, k, 1) - self.shifted(values, k, -1)
-            far = self.shifted(values, k, 2) - self.shifted(values, k, -2)
-            columns.append((8.0 * near - far) / (12.0 * self.spacing))
-        return torch.stack(columns, dim=-1)
-
-    def matrix(self, index: Tensor, weights: Tensor) -> csr_array:
-        """The sparse matrix whose row `i` takes ``weights[i]`` at ``index[i]``; both ``(side^d, k)``."""
-        from scipy.sparse import csr_array
-
-        rows = np.arange(0, index.numel() + 1, index.shape[1], dtype=np.int32)
-        columns = index.flatten().int().numpy()
-        return csr_array((weights.flatten().numpy(), columns, rows), shape=(self.count, self.count))
+        across = lambda k, cells: self.shifted(values, k, cells) - self.shifted(values, k, -cells)
+        slope = lambda k: (8.0 * across(k, 1) - across(k, 2)) / (12.0 * self.spacing)
+        return torch.stack([slope(k) for k in range(self.dim)], dim=-1)
