@@ -74,7 +74,8 @@ class SemiLagrangian:
         """The midpoint and the end of the path from each of ``nodes`` under ``u``."""
         x = self.x[nodes]
         middle = x + 0.5 * self.step * (self.a[nodes] + torch.einsum("ndm,nm->nd", self.B[nodes], u))
-        return middle, x + self.step * self.problem.velocity(middle, u)
+        pushed = torch.einsum("ndm,nm->nd", self.problem.control_matrix(middle), u)
+        return middle, x + self.step * (self.problem.drift(middle) + pushed)
 
     def right_side(self, value: Tensor, nodes: slice | Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The right side ``(N,)`` under ``u``, which is linear in `V`; with it the nodes of `V` that enter, their weights,
