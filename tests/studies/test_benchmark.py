@@ -17,9 +17,8 @@ from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.studies.benchmark import measure
 from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender
-from ocp_torch.studies.benchmark.contest import build, contest
-from ocp_torch.studies.benchmark.curve import Curve, Point, due, median_and_spread
-from ocp_torch.studies.benchmark.measure import Judge, relative, tabulated
+from ocp_torch.studies.benchmark.contest import Contest
+from ocp_torch.studies.benchmark.measure import Curve, Judge, Point, due, median_and_spread, relative, tabulated
 from ocp_torch.studies.benchmark.report import contest_table, load, reference, save
 from ocp_torch.studies.benchmark.rl import require_rl
 from ocp_torch.studies.paper import figures
@@ -179,19 +178,18 @@ def test_a_kernel_method_without_a_time_of_its_own_gets_that_of_the_longest_run_
     for made in (KernelContender, NetworkContender):
         monkeypatch.setattr(made, "run", run)
     free = [o for o in TINY if "kernel.seconds" not in o]
-    contest(
-        build(composed("benchmark", [*free, "seeds=[0,2]", "contenders=[kernel_pd,network_dual,kernel_dual]"])),
-        tmp_path,
+    Contest(composed("benchmark", [*free, "seeds=[0,2]", "contenders=[kernel_pd,network_dual,kernel_dual]"])).run(
+        tmp_path
     )
     assert given == [30.0, 30.0, None, None, 9.0, 9.0]
-    contest(build(composed("benchmark", [*TINY, "seeds=[0]", "contenders=[network_dual,kernel_dual]"])), tmp_path)
+    Contest(composed("benchmark", [*TINY, "seeds=[0]", "contenders=[network_dual,kernel_dual]"])).run(tmp_path)
     assert given[6:] == [None, 0.01]
 
 
 @pytest.mark.nightly
 def test_a_whole_contest_in_small(tmp_path, quick):
     config = composed("benchmark", [*TINY, "seeds=[0,1]", "contenders=[kernel_dual,network_dual]"])
-    curves = contest(build(config), tmp_path)
+    curves = Contest(config).run(tmp_path)
     assert [(c.contender, c.seed) for c in curves] == [
         (name, seed) for name in ("kernel dual", "mlp dual") for seed in (0, 1)
     ]
@@ -207,7 +205,7 @@ def test_a_whole_contest_in_small(tmp_path, quick):
 
 def test_a_problem_with_drift_loses_the_kernel_primal_alone():
     config = composed("benchmark", [*TINY, "problem=manufactured", "problem.dim=1"])
-    assert [m.name for m in build(config).contenders] == [
+    assert [m.name for m in Contest(config).contenders] == [
         "mlp dual",
         "mlp primal",
         "mlp pd",
@@ -232,7 +230,7 @@ def test_a_problem_with_drift_loses_the_kernel_primal_alone():
 )
 def test_wrong_fields_of_a_benchmark_are_refused_before_it_runs(contender, override, words):
     with pytest.raises(InputError, match=words):
-        build(composed("benchmark", [*TINY, f"contenders=[{contender}]", override]))
+        Contest(composed("benchmark", [*TINY, f"contenders=[{contender}]", override]))
 
 
 def test_without_the_extra_packages_one_sentence_says_how_to_get_them(monkeypatch):
@@ -240,7 +238,7 @@ def test_without_the_extra_packages_one_sentence_says_how_to_get_them(monkeypatc
     with pytest.raises(InputError, match=r"\[rl\]"):
         require_rl()
     with pytest.raises(InputError, match=r"\[rl\]"):
-        build(composed("benchmark", [*TINY, "contenders=[sac]"]))
+        Contest(composed("benchmark", [*TINY, "contenders=[sac]"]))
 
 
 def test_the_environment_pays_the_performance_of_a_controller():

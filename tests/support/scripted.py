@@ -23,7 +23,7 @@ CHECKS = {
     "reference": "ReferenceJob",
     "record": "recorder",
     "rollout": "RolloutJob",
-    "benchmark": "build",
+    "benchmark": "Contest",
     "reproduce_paper": "check",
 }
 

@@ -15,8 +15,7 @@ from ocp_torch.files.memory import require_memory
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
-from ocp_torch.studies.benchmark.curve import Curve, Point, due
-from ocp_torch.studies.benchmark.measure import Judge
+from ocp_torch.studies.benchmark.measure import Curve, Judge, Point, due
 from ocp_torch.studies.kernel import Iteration, step_sizes
 from ocp_torch.training.monitor import Silent
 
@@ -119,7 +118,7 @@ class NetworkContender:
         trainer = build_trainer({**self.config, "seed": seed})
         recorder = Recorder()
         trainer.fit(recorder)
-        judge = Judge(trainer.problem, trainer.constants, judge.seed, judge.effort)
+        judge = Judge(trainer.problem, trainer.constants)
         occupation = trainer.objective.occupation
         points = [Point(samples, seconds, judge(fields, occupation)) for samples, seconds, fields in recorder.kept]
         started = time.process_time()

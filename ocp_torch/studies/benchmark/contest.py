@@ -2,21 +2,19 @@
 
 import logging
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from tqdm import tqdm
 
-from ocp_torch.certificate import CertificateSettings
 from ocp_torch.certificate.checks.possible import require_possible
 from ocp_torch.errors import InputError, call, require_choice, require_integer, require_number, require_section
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.runs.build import build_certificate_settings, build_problem, build_trainer
 from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender
-from ocp_torch.studies.benchmark.curve import Curve
-from ocp_torch.studies.benchmark.measure import Judge
+from ocp_torch.studies.benchmark.measure import Curve, Judge
 from ocp_torch.studies.benchmark.report import plot, save
 from ocp_torch.studies.benchmark.rl import RLContender, require_rl
 from ocp_torch.training.budgets import fill
@@ -52,36 +50,48 @@ def contender(name: str, config: dict, problem: Problem, constants: Constants):
     return call(RLContender, "rl", options, name=name, problem=problem, control_bound=reach, steps=steps)
 
 
-@dataclass(frozen=True)
 class Contest:
-    """Who runs on what, and how the end of each is certified."""
+    """Who runs on what, and how the end of each is certified; kernel methods and judge use the bounds a run with null bounds
+    would. Raises `InputError` for a wrong field."""
 
-    problem: Problem
-    constants: Constants
-    contenders: list
-    seeds: list[int]
-    certificate: CertificateSettings
+    def __init__(self, config: dict) -> None:
+        self.problem = build_problem(config["problem"])
+        torch.set_num_threads(1)
+        self.constants = resolve_constants(self.problem)
+        names, seeds = config["contenders"], config["seeds"]
+        if not isinstance(names, list) or not names:
+            raise InputError(f"contenders is {names!r}, but must be a list of {', '.join(EVERYONE)}.")
+        if not isinstance(seeds, list) or not seeds:
+            raise InputError(f"seeds is {seeds!r}, but must be a list of whole numbers, as in [0,1,2].")
+        self.seeds = [require_integer("seeds", seed, 0) for seed in seeds]
+        if not self.problem.driftless and "kernel_primal" in names:
+            log.info("kernel_primal is left out: Lemma 2 needs a problem without drift.")
+            names = [name for name in names if name != "kernel_primal"]
+        _require_numbers(config)
+        self.contenders = [contender(name, config, self.problem, self.constants) for name in names]
+        training = fill({group: config[group] for group in TRAINING}, self.problem)
+        self.certificate = build_certificate_settings(training)
+        require_possible(self.problem, self.certificate)
 
+    def run(self, folder: Path) -> list[Curve]:
+        """Run everyone with every seed; what is there so far is saved after each run.
 
-def build(config: dict) -> Contest:
-    """Everything a contest needs; kernel methods and judge use the bounds a run with null bounds would."""
-    problem = build_problem(config["problem"])
-    torch.set_num_threads(1)
-    constants = resolve_constants(problem)
-    names, seeds = config["contenders"], config["seeds"]
-    if not isinstance(names, list) or not names:
-        raise InputError(f"contenders is {names!r}, but must be a list of {', '.join(EVERYONE)}.")
-    if not isinstance(seeds, list) or not seeds:
-        raise InputError(f"seeds is {seeds!r}, but must be a list of whole numbers, as in [0,1,2].")
-    seeds = [require_integer("seeds", seed, 0) for seed in seeds]
-    if not problem.driftless and "kernel_primal" in names:
-        log.info("kernel_primal is left out: Lemma 2 needs a problem without drift.")
-        names = [name for name in names if name != "kernel_primal"]
-    _require_numbers(config)
-    made = [contender(name, config, problem, constants) for name in names]
-    certificate = build_certificate_settings(fill({group: config[group] for group in TRAINING}, problem))
-    require_possible(problem, certificate)
-    return Contest(problem, constants, made, seeds, certificate)
+        A kernel method without a time of its own gets that of the longest run before it: they are compared at equal time.
+        """
+        judge, exact = Judge(self.problem, self.constants), self.problem.exact_optimum
+        curves: list[Curve] = []
+        with tqdm(total=len(self.contenders) * len(self.seeds), unit="run", disable=None) as bar:
+            for one in self.contenders:
+                if isinstance(one, KernelContender) and one.seconds is None:
+                    one = replace(one, seconds=max((c.points[-1].seconds for c in curves), default=UNHURRIED))
+                for seed in self.seeds:
+                    bar.set_postfix_str(f"{one.name}, seed {seed}")
+                    curves.append(one.run(seed, judge, self.certificate))
+                    text = save(curves, exact, folder)
+                    bar.update()
+        plot(curves, exact).savefig(folder / "benchmark.png", dpi=130)
+        log.info("\n%s\n\nwritten to %s", text, folder)
+        return curves
 
 
 def _require_numbers(config: dict) -> None:
@@ -93,24 +103,3 @@ def _require_numbers(config: dict) -> None:
         require_number(f"rl.{name}", rl.get(name), above=0.0)
     for algorithm, steps in require_section("rl.steps", rl.get("steps")).items():
         require_integer(f"rl.steps.{algorithm}", steps, 1)
-
-
-def contest(made: Contest, folder: Path) -> list[Curve]:
-    """Run everyone with every seed; what is there so far is saved after each run.
-
-    A kernel method without a time of its own gets that of the longest run before it: they are compared at equal time.
-    """
-    judge, exact = Judge(made.problem, made.constants), made.problem.exact_optimum
-    curves: list[Curve] = []
-    with tqdm(total=len(made.contenders) * len(made.seeds), unit="run", disable=None) as bar:
-        for one in made.contenders:
-            if isinstance(one, KernelContender) and one.seconds is None:
-                one = replace(one, seconds=max((c.points[-1].seconds for c in curves), default=UNHURRIED))
-            for seed in made.seeds:
-                bar.set_postfix_str(f"{one.name}, seed {seed}")
-                curves.append(one.run(seed, judge, made.certificate))
-                text = save(curves, exact, folder)
-                bar.update()
-    plot(curves, exact).savefig(folder / "benchmark.png", dpi=130)
-    log.info("\n%s\n\nwritten to %s", text, folder)
-    return curves

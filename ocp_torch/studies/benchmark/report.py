@@ -5,16 +5,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ocp_torch.certificate import LOWER, UPPER, bounds
 from ocp_torch.runs.canvas import blank_figure
-from ocp_torch.studies.benchmark.curve import Curve, Point, median_and_spread
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from ocp_torch.studies.benchmark.measure import Curve, Point, median_and_spread
 
 # The certified gaps of all are held against that of the paper's primal-dual.
 BASELINE = "kernel pd"
@@ -99,7 +95,7 @@ def spread(values: Sequence[float], form: str, unit: str = "") -> str:
     return f"{middle}{unit}" + (f" [{low}, {high}]" if low != high else "")
 
 
-def plot(curves: list[Curve], exact: float | None) -> "Figure":
+def plot(curves: list[Curve], exact: float | None):
     """Sub-optimality of the controller and the gap of the bounds, against samples and against CPU seconds."""
     optimum, what = reference(curves, exact)
     rows = {
@@ -121,10 +117,9 @@ def plot(curves: list[Curve], exact: float | None) -> "Figure":
 
 def draw(axis, curves: list[Curve], place, height, color: str, name: str) -> None:
     """The median over seeds at each point, and the range between seeds."""
-    count = min(len(c.points) for c in curves)
-    at = lambda measure, i: [measure(c.points[i]) for c in curves]
-    x = np.array([np.median(at(place, i)) for i in range(count)])
-    values = np.array([at(height, i) for i in range(count)])
+    rows = list(zip(*(c.points for c in curves), strict=False))  # up to where the shortest run ends
+    x = np.array([np.median([place(p) for p in row]) for row in rows])
+    values = np.array([[height(p) for p in row] for row in rows])
     values[~np.isfinite(values) | (values <= 0.0)] = np.nan
     usable = ~np.isnan(values).any(axis=1) & (x > 0.0)
     if not usable.any():

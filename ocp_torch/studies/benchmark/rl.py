@@ -11,8 +11,7 @@ from ocp_torch.certificate import CertificateSettings
 from ocp_torch.errors import InputError, require_integer
 from ocp_torch.gym.environment import make_environment, observe
 from ocp_torch.problems import Problem
-from ocp_torch.studies.benchmark.curve import Curve, Point, due
-from ocp_torch.studies.benchmark.measure import Judge
+from ocp_torch.studies.benchmark.measure import Curve, Judge, Point, due
 
 
 def require_rl() -> tuple:

@@ -52,10 +52,7 @@ class BernoulliKernel:
         block = np.empty((*factors[0].shape[:-1], 1 + d, 1 + d))
         for a in range(1 + d):
             for b in range(1 + d):
-                # The order of the derivative in each coordinate; one in y changes the sign.
-                orders = [int(i + 1 == a) + int(i + 1 == b) for i in range(d)]
-                entry = factors[orders[0]][..., 0]
-                for i in range(1, d):
-                    entry = entry * factors[orders[i]][..., i]
+                # In each coordinate the order of the derivative; one in y changes the sign.
+                entry = math.prod(factors[(i + 1 == a) + (i + 1 == b)][..., i] for i in range(d))
                 block[..., a, b] = -entry if b > 0 else entry
         return block

@@ -1,7 +1,5 @@
 """Every figure of the paper's numerical sections, and the cost of a step in both forms."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 
@@ -10,9 +8,6 @@ from ocp_torch.problems import Circle
 from ocp_torch.runs.canvas import blank_figure
 from ocp_torch.studies.benchmark.contenders import OCCUPATION
 from ocp_torch.studies.paper.runs import Comparison, History, circle
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 DISCOUNTS = (0.5, 1.0, 1.5, 2.0, 4.0)
 LABELS = {
@@ -24,7 +19,7 @@ LABELS = {
 }
 
 
-def _figure(columns: int, rows: int = 1, width: float = 5.0) -> tuple["Figure", np.ndarray]:
+def _figure(columns: int, rows: int = 1, width: float = 5.0):
     figure = blank_figure(width * columns, 3.8 * rows)
     return figure, figure.subplots(rows, columns, squeeze=False).ravel()
 
@@ -34,7 +29,7 @@ def _grid(count: int = 601) -> torch.Tensor:
     return ((torch.arange(count, dtype=torch.float64) + 0.5) / count).unsqueeze(-1)
 
 
-def optimal_occupation() -> "Figure":
+def optimal_occupation():
     """`mu*` for several discounts: bounded exactly when `rho > 1`."""
     figure, (axis,) = _figure(1, width=6.0)
     x = _grid(2000)
@@ -45,7 +40,7 @@ def optimal_occupation() -> "Figure":
     return figure
 
 
-def evolution(history: History) -> "Figure":
+def evolution(history: History):
     """The costs and performances against the number of steps, in units of `OPT` and how far from it; bands are seeds."""
     figure, (axis, distance) = _figure(2)
     recipe, looks = history.recipe, list(history.numbers)
@@ -67,7 +62,7 @@ def evolution(history: History) -> "Figure":
 
 
 @torch.no_grad()
-def iterates(history: History) -> "Figure":
+def iterates(history: History):
     """What a method learns, for growing `n`, with the exact functions: `V` or `w` and the controller; all four for pd."""
     problem, constants = circle()
     kind, x = OCCUPATION[history.recipe.method], _grid()
@@ -102,7 +97,7 @@ def iterates(history: History) -> "Figure":
     return figure
 
 
-def costs(comparisons: list[Comparison]) -> "Figure":
+def costs(comparisons: list[Comparison]):
     """CPU time per step against `n`: it grows for the exact kernel, and does not for truncated features."""
     figure, (axis,) = _figure(1, width=6.0)
     for k, c in enumerate(comparisons):

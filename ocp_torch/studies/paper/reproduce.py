@@ -10,7 +10,7 @@ import torch
 from tqdm import tqdm
 
 from ocp_torch.errors import InputError, require_choice, require_integer, require_section
-from ocp_torch.studies.benchmark.curve import median_and_spread
+from ocp_torch.studies.benchmark.measure import median_and_spread
 from ocp_torch.studies.paper import figures
 from ocp_torch.studies.paper.runs import RECIPES, Comparison, History, carry_out, compare_with_exact
 

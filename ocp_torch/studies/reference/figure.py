@@ -1,7 +1,5 @@
 """The grid's `V` and `u` beside those of a trained controller: curves in one dimension, maps beyond."""
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
@@ -10,15 +8,12 @@ from ocp_torch.maths.supremum import batched
 from ocp_torch.runs.canvas import blank_figure
 from ocp_torch.studies.reference.reference import Reference
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 # States along a curve, along each side of a map, and arrows along each side of it.
 LINE_POINTS, MAP_POINTS, ARROWS = 400, 96, 16
 
 
 @torch.no_grad()
-def draw(reference: Reference, controller: Controller) -> "Figure":
+def draw(reference: Reference, controller: Controller):
     """`V` and `u` of ``reference`` and ``controller``, and their differences; `V` only where the controller holds one.
 
     In three dimensions the cut `x_3 = 1/2`.
@@ -42,7 +37,7 @@ def _states(dim: int) -> Tensor:
     return x
 
 
-def _curves(x: Tensor, rows: dict[str, dict[str, Tensor]]) -> "Figure":
+def _curves(x: Tensor, rows: dict[str, dict[str, Tensor]]):
     """Grid and network on one axis, their difference on another."""
     figure = blank_figure(9.6, 7.6)
     for line, (symbol, drawn) in zip(figure.subplots(2, 2), rows.items(), strict=True):
@@ -55,7 +50,7 @@ def _curves(x: Tensor, rows: dict[str, dict[str, Tensor]]) -> "Figure":
     return figure
 
 
-def _maps(x: Tensor, rows: dict[str, dict[str, Tensor]]) -> "Figure":
+def _maps(x: Tensor, rows: dict[str, dict[str, Tensor]]):
     """A map for each; a control of several components as its size, with arrows for its first two."""
     figure = blank_figure(14.4, 7.6)
     line = (torch.arange(MAP_POINTS) + 0.5) / MAP_POINTS
