@@ -1,6 +1,6 @@
 """Our problems as Gymnasium environments: `import ocp_torch.gym`, then `gymnasium.make("ocp_torch/Circle-v0")`.
 
-Arguments of the problem and of `make_environment` are given to `gymnasium.make`; a problem of your own is
+Arguments of the problem and of `ControlEnvironment` are given to `gymnasium.make`; a problem of your own is
 `gymnasium.make("ocp_torch/Problem-v0", problem=MyProblem())`. Needs the optional extra `gym`: without it nothing is
 registered, and `register` says how to get it.
 """
@@ -9,7 +9,7 @@ import os
 from importlib.util import find_spec
 
 from ocp_torch.errors import InputError, call, require_choice
-from ocp_torch.gym.environment import make_environment, require_gymnasium
+from ocp_torch.gym.environment import ControlEnvironment, require_gymnasium
 from ocp_torch.problems import PROBLEMS, Problem
 
 # Arguments of the environment; every other one is the problem's.
@@ -30,8 +30,8 @@ def make(problem: str | Problem | None = None, **options):
     if isinstance(problem, Problem):
         if options:
             raise InputError(f"{next(iter(options))} is no argument of an environment; the problem is made already.")
-        return make_environment(problem, **own)
-    return make_environment(call(PROBLEMS[require_choice("problem", problem, PROBLEMS)], "problem", options), **own)
+        return ControlEnvironment(problem, **own)
+    return ControlEnvironment(call(PROBLEMS[require_choice("problem", problem, PROBLEMS)], "problem", options), **own)
 
 
 def register() -> None:

@@ -66,15 +66,11 @@ class Rollouts:
     returns: np.ndarray
     lengths: np.ndarray
 
-    @property
-    def mean(self) -> float:
-        return float(self.returns.mean())
-
     def __str__(self) -> str:
         low, high, count = self.returns.min(), self.returns.max(), len(self.returns)
         se = self.returns.std(ddof=1) / math.sqrt(count) if count > 1 else 0.0
         return (
-            f"return {self.mean:.6g} ± {se:.2g} (standard error of {count} episodes), from {low:.6g} to "
+            f"return {self.returns.mean():.6g} ± {se:.2g} (standard error of {count} episodes), from {low:.6g} to "
             f"{high:.6g}; {self.lengths.mean():.1f} steps each"
         )
 

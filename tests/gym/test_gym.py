@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from ocp_torch.errors import InputError
-from ocp_torch.gym.environment import clocks, make_environment, observe, require_gymnasium, state_of
+from ocp_torch.gym.environment import ControlEnvironment, clocks, observe, require_gymnasium, state_of
 from ocp_torch.gym.rollout import Agent, RolloutJob, made, play, save_gif
 from ocp_torch.problems import PROBLEMS, Dataset, Manufactured
 from ocp_torch.runs.record import Recorder
@@ -90,7 +90,7 @@ def test_episodes_repeat_by_seed_and_differ_without(gymnasium):
 
 def test_actions_beyond_the_limit_are_cut_to_the_ball(gymnasium):
     problem = Manufactured(control_limit=0.3)
-    env = make_environment(problem)
+    env = ControlEnvironment(problem)
     env.reset(seed=0)
     paid = env.step(np.ones(2, dtype=np.float32))[4]["cost"]
     x = env.x.clone()
@@ -104,7 +104,7 @@ def test_a_data_set_is_no_environment(tmp_path):
     path = tmp_path / "a.npz"
     Recorder(zoo.build("circle rho=2"), 300, path, 0, True, 0.0).run()
     with pytest.raises(InputError, match="cannot be simulated"):
-        make_environment(Dataset(str(path)))
+        ControlEnvironment(Dataset(str(path)))
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +137,7 @@ def test_a_controller_acts_in_an_environment_of_ours(gymnasium, run, tmp_path):
             _, reward, _, over, _ = env.step(np.zeros(1, dtype=np.float32))
             total += reward
         idle.append(total)
-    assert found.mean > np.mean(idle)
+    assert found.returns.mean() > np.mean(idle)
     assert "standard error of 8 episodes" in str(found)
 
 
@@ -229,7 +229,7 @@ def test_gifs_hold_their_frames(tmp_path):
 
 
 def test_actions_apply_the_controls_they_are_made_of(gymnasium):
-    env = make_environment(Manufactured(control_size=0.4))
+    env = ControlEnvironment(Manufactured(control_size=0.4))
     u = np.array([0.1, -0.2])
     assert env.to_action(u) * env.control_bound == pytest.approx(u)
     assert env.to_action(9.0 * u).tolist() == [1.0, -1.0]
@@ -285,7 +285,7 @@ def test_a_saved_pendulum_controller_plays_gymnasiums_untouched(gymnasium, tmp_p
     found = play(Classical(), env, "Pendulum-v1", 20, 0)
     env.close()
     assert (found.lengths == 200).all()
-    assert found.mean > -500.0
+    assert found.returns.mean() > -500.0
     folder = tmp_path / "run"
     few = ("certificate.points=64", "certificate.trajectories=4", "certificate.ascents=2", "trainer.figures=false")
     small_run = ("trainer.steps=5", "trainer.batch=32", "trainer.rounds=1", "model.width=16", "model.waves=0")

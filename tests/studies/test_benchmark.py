@@ -11,16 +11,15 @@ from ocp_torch.cli.launch import composed
 from ocp_torch.control import policies
 from ocp_torch.errors import InputError
 from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields, SobolevField
-from ocp_torch.gym.environment import make_environment, observe
+from ocp_torch.gym.environment import ControlEnvironment, observe
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.studies.benchmark import measure
-from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender
+from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender, RLContender, require_rl
 from ocp_torch.studies.benchmark.contest import Contest
 from ocp_torch.studies.benchmark.measure import Curve, Judge, Point, due, median_and_spread, relative, tabulated
 from ocp_torch.studies.benchmark.report import contest_table, load, reference, save
-from ocp_torch.studies.benchmark.rl import require_rl
 from ocp_torch.studies.paper import figures
 from ocp_torch.studies.paper.reproduce import check, report, reproduce
 from ocp_torch.studies.paper.runs import RECIPES, carry_out, circle, compare_with_exact
@@ -248,7 +247,7 @@ def test_the_environment_pays_the_performance_of_a_controller():
     problem = zoo.build("circle rho=2")
     errors = []
     for dt in (0.2, 0.05):
-        environment = make_environment(problem, 1.0, dt, horizon=4.0, seed=0)
+        environment = ControlEnvironment(problem, 1.0, dt, horizon=4.0, seed=0)
         total, factor, episodes = 0.0, math.exp(-problem.discount * dt), 0
         for start in (torch.arange(40, dtype=torch.float64) + 0.5) / 40:
             observation, _ = environment.reset(seed=1)
@@ -269,7 +268,7 @@ def test_the_environment_starts_from_the_initial_density():
     pytest.importorskip("gymnasium")
     pytest.importorskip("stable_baselines3")
     problem = zoo.Swing()
-    environment = make_environment(problem, 1.0, 0.1, horizon=1.0, seed=3)
+    environment = ControlEnvironment(problem, 1.0, 0.1, horizon=1.0, seed=3)
     starts = torch.cat([environment.reset()[0] is not None and environment.x.clone() for _ in range(1500)])
     found = (2 * math.pi * (starts[:, 0] + 2 * starts[:, 1])).cos().mean()
     assert found == pytest.approx(0.25, abs=0.08)
@@ -279,8 +278,6 @@ def test_the_environment_starts_from_the_initial_density():
 def test_sac_runs_as_a_contender():
     pytest.importorskip("gymnasium")
     pytest.importorskip("stable_baselines3")
-    from ocp_torch.studies.benchmark.rl import RLContender
-
     problem, constants = circle()
     made = RLContender("sac", problem, 0.5, steps=150, time_step=0.1, horizon=4.0)
     result = made.run(0, Judge(problem, constants), None)
@@ -330,10 +327,10 @@ def test_a_recipe_in_small_gives_its_numbers_and_figures(name, quick):
 def test_the_exact_kernel_does_more_work_at_each_step_and_features_do_not():
     """Counted instead of timed: the numbers that enter one evaluation."""
     problem, constants = circle()
-    from ocp_torch.studies.kernel import Iteration, step_sizes
+    from ocp_torch.fields.sobolev import SobolevFeatures
     from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
     from ocp_torch.studies.kernel.expansions import FeatureExpansion, KernelExpansion
-    from ocp_torch.studies.kernel.iterations import SobolevFeatures
+    from ocp_torch.studies.kernel.iterations import Iteration, step_sizes
 
     exact = Iteration(problem, "dual", constants, (0,), kernel=BernoulliKernel(2), capacity=60)
     truncated = Iteration(problem, "dual", constants, (0,), features=SobolevFeatures(1, modes=8))

@@ -1,10 +1,13 @@
-"""Contenders: the paper's kernel methods, and the package's trained fields, any method with any model as `scripts/train.py`
-would train it."""
+"""Contenders: the paper's kernel methods; the package's trained fields, any method with any model as `scripts/train.py` would
+train it; and SAC and PPO of Stable-Baselines3, which need the optional extra `rl`."""
 
 import copy
 import math
 import time
 from dataclasses import dataclass
+
+import numpy as np
+import torch
 
 from ocp_torch.certificate import CertificateSettings, Run, Trained, certify_fields
 from ocp_torch.control import policies
@@ -12,11 +15,12 @@ from ocp_torch.errors import InputError, require_integer, require_number
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.fields.sobolev import SobolevFeatures
 from ocp_torch.files.memory import require_memory
+from ocp_torch.gym.environment import ControlEnvironment, observe
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.studies.benchmark.measure import Curve, Judge, Point, due
-from ocp_torch.studies.kernel import Iteration, step_sizes
+from ocp_torch.studies.kernel.iterations import Iteration, step_sizes
 from ocp_torch.training.monitor import Silent
 
 OCCUPATION = {"dual": None, "primal": policies.CLOSED, "pd": policies.SADDLE}
@@ -80,7 +84,7 @@ class KernelContender:
 
 
 class Recorder(Silent):
-    """Keeps the averaged fields at growing sample counts; `seconds` is CPU time without what keeping them took."""
+    """Keeps the averaged fields at growing sample counts, with the CPU seconds until then, without what keeping them took."""
 
     def __init__(self) -> None:
         self.due = due(10_000)
@@ -88,19 +92,14 @@ class Recorder(Silent):
         self.kept: list[tuple[int, float, Fields]] = []
         self.started = time.process_time()
 
-    @property
-    def seconds(self) -> float:
-        return time.process_time() - self.started
-
     def stepped(self, trainer, report, log: bool) -> None:
-        last = trainer.step == trainer.end
-        if trainer.samples < self.next and not last:
+        if trainer.samples < self.next and trainer.step != trainer.end:
             return
-        before = time.process_time()
-        self.kept.append((trainer.samples, self.seconds, copy.deepcopy(trainer.averaged_fields)))
+        now = time.process_time()
+        self.kept.append((trainer.samples, now - self.started, copy.deepcopy(trainer.averaged_fields)))
         while self.next <= trainer.samples:
             self.next = next(self.due)
-        self.started += time.process_time() - before
+        self.started += time.process_time() - now
 
 
 @dataclass(frozen=True)
@@ -124,3 +123,54 @@ class NetworkContender:
         started = time.process_time()
         certified = trainer.certify(build_certificate_settings(trainer.config))
         return Curve(self.name, seed, points, certified.gap["certified"], time.process_time() - started)
+
+
+def require_rl() -> tuple:
+    """The modules `gymnasium` and `stable_baselines3`, or an `InputError` that says how to get them."""
+    try:
+        import gymnasium
+        import stable_baselines3
+    except ImportError as error:
+        raise InputError(
+            f'SAC and PPO need packages that are not installed ({error.name}); get them with pip install -e ".[rl]".'
+        ) from None
+    return gymnasium, stable_baselines3
+
+
+@dataclass(frozen=True)
+class RLContender:
+    """``name`` is sac or ppo with the library's defaults; actions reach ``control_bound``, as all methods may know."""
+
+    name: str
+    problem: Problem
+    control_bound: float
+    steps: int
+    time_step: float
+    horizon: float
+
+    def __post_init__(self) -> None:
+        require_integer(f"rl.steps.{self.name}", self.steps, 1)
+
+    def run(self, seed: int, judge: Judge, settings: CertificateSettings) -> Curve:
+        """Learn for ``steps`` transitions; the policy is simulated in continuous time like every other controller."""
+        _, sb3 = require_rl()
+        environment = ControlEnvironment(self.problem, self.control_bound, self.time_step, self.horizon, seed)
+        discount = math.exp(-self.problem.discount * self.time_step)
+        made = {"sac": sb3.SAC, "ppo": sb3.PPO}[self.name]
+        model = made("MlpPolicy", environment, gamma=discount, seed=seed, device="cpu", verbose=0)
+
+        def policy(x: torch.Tensor) -> torch.Tensor:
+            actions, _ = model.predict(np.atleast_2d(observe(x)), deterministic=True)
+            u = self.control_bound * torch.from_numpy(np.asarray(actions)).to(x)
+            return self.problem.control_cost.within(u, torch.ones_like(x[:, 0]))
+
+        points, spent = [], 0.0
+        for count in due(500):
+            started = time.process_time()
+            model.learn(min(count, self.steps) - model.num_timesteps, reset_num_timesteps=False)
+            spent += time.process_time() - started
+            perf = judge.performance(policy)
+            points.append(Point(model.num_timesteps, spent, {"policy": perf}))
+            if model.num_timesteps >= self.steps:
+                break
+        return Curve(self.name, seed, points)

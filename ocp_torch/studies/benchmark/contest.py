@@ -13,10 +13,9 @@ from ocp_torch.errors import InputError, call, require_choice, require_integer, 
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.runs.build import build_certificate_settings, build_problem, build_trainer
-from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender
+from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender, RLContender, require_rl
 from ocp_torch.studies.benchmark.measure import Curve, Judge
 from ocp_torch.studies.benchmark.report import plot, save
-from ocp_torch.studies.benchmark.rl import RLContender, require_rl
 from ocp_torch.training.budgets import fill
 
 log = logging.getLogger(__name__)

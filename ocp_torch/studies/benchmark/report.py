@@ -67,18 +67,16 @@ def contest_table(curves: list[Curve], exact: float | None) -> str:
             spread([p.seconds for p in reached], ".3g"),
         ]
         lines.append("| " + " | ".join(cells) + " |")
+    lines.append("")
+    # Who reaches the tolerance first with every seed, by the median over seeds.
     sure = {name: reached for name, reached in hits.items() if len(reached) == len(groups[name])}
-    return "\n".join([*lines, "", *(winners(sure) if sure else [])])
-
-
-def winners(reached: dict[str, list[Point]]) -> list[str]:
-    """Who reaches the tolerance first, in samples and in CPU seconds, by the median over seeds."""
-    found = []
-    for unit in ("samples", "seconds"):
-        medians = {name: median_and_spread([getattr(hit, unit) for hit in hits])[0] for name, hits in reached.items()}
-        first = min(medians, key=lambda name: medians[name])
-        found.append(f"1 % on Perf in the fewest {unit}: {first}, {medians[first]:,.6g}.")
-    return found
+    for unit in ("samples", "seconds") if sure else ():
+        medians = {
+            name: median_and_spread([getattr(hit, unit) for hit in reached])[0] for name, reached in sure.items()
+        }
+        first = min(medians, key=medians.__getitem__)
+        lines.append(f"1 % on Perf in the fewest {unit}: {first}, {medians[first]:,.6g}.")
+    return "\n".join(lines)
 
 
 def gaps(curves: list[Curve]) -> list[float]:

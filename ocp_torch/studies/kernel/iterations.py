@@ -64,19 +64,14 @@ class Iteration:
         average is that of the look-ahead points.
         """
         for gamma in steps:
+            marks = None
             if self.method == "pd":
                 marks = {name: e.mark() for name, e in self.expansions.items()}
                 self._move(gamma)
-                self._visit()
-                self._move(gamma, marks)
-            else:
-                self._visit()
-                self._move(gamma)
+            for expansion in self.expansions.values():
+                expansion.visit()
+            self._move(gamma, marks)
             self.n += 1
-
-    def _visit(self) -> None:
-        for expansion in self.expansions.values():
-            expansion.visit()
 
     def _move(self, gamma: float, marks: dict[str, Any] | None = None) -> None:
         """Move each field in its improving direction at a fresh sample, from where it is or from its mark."""

@@ -21,7 +21,7 @@ ORDER = 2.0
 SAFETY = 3.0
 # What is removed by extrapolation counts as uncertain by this share at least, times SAFETY.
 DOUBT = 0.1
-# Orders that are looked for: no scheme has one outside.
+# Orders between which that of the grids is looked for: no scheme has one outside.
 ORDERS = (1e-3, 12.0)
 # Numbers that differ by less, relative to their size, are the same.
 ROUNDING = 1e-10
@@ -61,27 +61,19 @@ def extrapolate(spacings: Sequence[float], numbers: Sequence[float], noise: floa
 
     Numbers that show no order say nothing about what they approach, unless all agree within ``noise``, their own error.
     """
+    from scipy.optimize import brentq
+
     (h1, h2, h3), (Q1, Q2, Q3) = spacings, numbers
     pair = lambda coarse, fine, h, k: fine + (fine - coarse) / ((h / k) ** ORDER - 1.0)
     earlier, optimum = pair(Q1, Q2, h1, h2), pair(Q2, Q3, h2, h3)
     error = SAFETY * max(abs(optimum - earlier), DOUBT * abs(optimum - Q3))
-    order = observed_order(spacings, numbers)
     settled = max(numbers) - min(numbers) <= noise + ROUNDING * max(map(abs, numbers))
-    return Extrapolation(optimum, error if settled or not math.isnan(order) else None, order)
-
-
-def observed_order(spacings: Sequence[float], numbers: Sequence[float]) -> float:
-    """`p` with `(Q_1 - Q_2) / (Q_2 - Q_3) = (h_1^p - h_2^p) / (h_2^p - h_3^p)`, which increases in `p`; NaN if there is none
-    between `ORDERS`, as where the changes have opposite signs."""
-    from scipy.optimize import brentq
-
-    (h1, h2, h3), (Q1, Q2, Q3) = spacings, numbers
-    if Q2 == Q3 or not (Q1 - Q2) / (Q2 - Q3) > 0.0:
-        return math.nan
-    ratio = (Q1 - Q2) / (Q2 - Q3)
+    # At the order p this is (h_1^p - h_2^p) / (h_2^p - h_3^p), which increases in p; none has changes of opposite signs.
+    ratio = (Q1 - Q2) / (Q2 - Q3) if Q2 != Q3 else math.nan
     excess = lambda p: (h1**p - h2**p) / (h2**p - h3**p) - ratio
-    low, high = ORDERS
-    return brentq(excess, low, high) if excess(low) < 0.0 < excess(high) else math.nan
+    shown = ratio > 0.0 and excess(ORDERS[0]) < 0.0 < excess(ORDERS[1])
+    order = brentq(excess, *ORDERS) if shown else math.nan
+    return Extrapolation(optimum, error if settled or shown else None, order)
 
 
 def look_between(problem: Problem, grid: Grid) -> tuple[float, float, str | None]:
