@@ -27,11 +27,12 @@ def make(problem: str | Problem | None = None, **options):
         raise InputError("problem is missing; give one of your own, as in problem=MyProblem().")
     own = {k: options.pop(k) for k in ENVIRONMENT if k in options}
     own["seed"] = int.from_bytes(os.urandom(4), "little")
-    if isinstance(problem, Problem):
-        if options:
-            raise InputError(f"{next(iter(options))} is no argument of an environment; the problem is made already.")
-        return ControlEnvironment(problem, **own)
-    return ControlEnvironment(call(PROBLEMS[require_choice("problem", problem, PROBLEMS)], "problem", options), **own)
+    if not isinstance(problem, Problem):
+        made = call(PROBLEMS[require_choice("problem", problem, PROBLEMS)], "problem", options)
+        return ControlEnvironment(made, **own)
+    if options:
+        raise InputError(f"{next(iter(options))} is no argument of an environment; the problem is made already.")
+    return ControlEnvironment(problem, **own)
 
 
 def register() -> None:

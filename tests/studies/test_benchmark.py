@@ -328,8 +328,7 @@ def test_the_exact_kernel_does_more_work_at_each_step_and_features_do_not():
     """Counted instead of timed: the numbers that enter one evaluation."""
     problem, constants = circle()
     from ocp_torch.fields.sobolev import SobolevFeatures
-    from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
-    from ocp_torch.studies.kernel.expansions import FeatureExpansion, KernelExpansion
+    from ocp_torch.studies.kernel.expansions import BernoulliKernel, FeatureExpansion, KernelExpansion
     from ocp_torch.studies.kernel.iterations import Iteration, step_sizes
 
     exact = Iteration(problem, "dual", constants, (0,), kernel=BernoulliKernel(2), capacity=60)

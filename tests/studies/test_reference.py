@@ -10,10 +10,11 @@ import torch
 
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Circle, Manufactured, Problem, Torus
-from ocp_torch.studies.reference import policy_iteration, solve_reference
+from ocp_torch.studies.reference import policy_iteration
 from ocp_torch.studies.reference.error import extrapolate
 from ocp_torch.studies.reference.grid import Grid
 from ocp_torch.studies.reference.policy_iteration import solve, solve_fixed_point
+from ocp_torch.studies.reference.reference import solve_reference
 from ocp_torch.studies.reference.semi_lagrangian import SemiLagrangian, discounted_weights
 from ocp_torch.studies.reference.session import ReferenceJob, reference_table, save_reference
 from support import zoo

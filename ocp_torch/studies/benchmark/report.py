@@ -5,6 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 
@@ -52,13 +53,13 @@ def contest_table(curves: list[Curve], exact: float | None) -> str:
     for name, own in groups.items():
         ends, certified, reached = [c.points[-1] for c in own], gaps(own), hits[name]
         number = lambda key, ends=ends: spread([off(p.numbers[key]) for p in ends if key in p.numbers], "+.3g", " %")
-        ratio = median_and_spread(widest)[0] / median_and_spread(certified)[0] if widest and certified else math.nan
+        ratio = median(widest) / median(certified) if widest and certified else math.nan
         few = "" if len(reached) == len(own) else f" ({len(reached)} of {len(own)} seeds)"
         later = [c.certificate_seconds for c in own if c.certificate_seconds > 0.0]
         cells = [
             name,
             spread([p.samples for p in ends], ",.0f"),
-            spread([p.seconds for p in ends], ".3g") + (f" + {median_and_spread(later)[0]:.3g}" if later else ""),
+            spread([p.seconds for p in ends], ".3g") + (f" + {median(later):.3g}" if later else ""),
             *map(number, names),
             spread([off(p.perf) for p in ends if math.isfinite(p.perf)], "+.3g", " %"),
             spread(certified, ".3g", " %") + ("*" if certified and any(c.certified is None for c in own) else ""),
@@ -71,9 +72,7 @@ def contest_table(curves: list[Curve], exact: float | None) -> str:
     # Who reaches the tolerance first with every seed, by the median over seeds.
     sure = {name: reached for name, reached in hits.items() if len(reached) == len(groups[name])}
     for unit in ("samples", "seconds") if sure else ():
-        medians = {
-            name: median_and_spread([getattr(hit, unit) for hit in reached])[0] for name, reached in sure.items()
-        }
+        medians = {name: median(getattr(hit, unit) for hit in reached) for name, reached in sure.items()}
         first = min(medians, key=medians.__getitem__)
         lines.append(f"1 % on Perf in the fewest {unit}: {first}, {medians[first]:,.6g}.")
     return "\n".join(lines)

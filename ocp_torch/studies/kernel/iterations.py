@@ -14,8 +14,7 @@ from ocp_torch.maths.sampling import UniformSampler
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
-from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
-from ocp_torch.studies.kernel.expansions import FeatureExpansion, KernelExpansion
+from ocp_torch.studies.kernel.expansions import BernoulliKernel, FeatureExpansion, KernelExpansion
 from ocp_torch.studies.kernel.rules import RULES, Datum
 
 # States whose data and features are computed together: vectorised, and small enough for the cache.

@@ -7,8 +7,7 @@ Proposition 9 of the paper). The closed forms are Lemmas 2 and 3, written throug
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,8 +21,7 @@ from ocp_torch.problems.problem import Problem
 Jets = dict[str, np.ndarray]
 
 
-@dataclass(frozen=True)
-class Datum:
+class Datum(NamedTuple):
     """A problem's data at one state for each of `R` runs, and there the jets of the features, if there are any."""
 
     x: np.ndarray  # (R, d)

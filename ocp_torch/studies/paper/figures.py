@@ -45,10 +45,8 @@ def evolution(history: History):
     figure, (axis, distance) = _figure(2)
     recipe, looks = history.recipe, list(history.numbers)
     for k, name in enumerate(recipe.numbers):
-        percents = [[m[name] for m in history.numbers[n] if name in m] for n in looks]
-        ratios = [[1.0 + p / 100.0 for p in row] for row in percents]
-        away = [[abs(p) for p in row] for row in percents]
-        for where, rows in ((axis, ratios), (distance, away)):
+        for where, shown in ((axis, lambda percent: 1.0 + percent / 100.0), (distance, abs)):
+            rows = [[shown(m[name]) for m in history.numbers[n] if name in m] for n in looks]
             where.plot(looks, [np.median(row) for row in rows], marker=".", color=f"C{k}", label=LABELS[name])
             if min(map(len, rows)) > 1:
                 where.fill_between(looks, list(map(min, rows)), list(map(max, rows)), color=f"C{k}", alpha=0.2)

@@ -49,10 +49,8 @@ def reproduce(checked: tuple[tuple[int, ...], int, dict[str, int]], folder: Path
             comparisons.append(compare_with_exact(recipe, exact[name], modes, seeds[0], tick=bar.update))
     text = report(histories, comparisons, seeds, modes) + f"\nIn all {time.perf_counter() - started:.0f} s.\n"
     (folder / "numbers.md").write_text(text)
-    record = {
-        "numbers": {name: history.numbers for name, history in histories.items()},
-        "comparisons": [asdict(c) for c in comparisons],
-    }
+    numbers = {name: history.numbers for name, history in histories.items()}
+    record = {"numbers": numbers, "comparisons": [asdict(c) for c in comparisons]}
     (folder / "numbers.json").write_text(json.dumps(record, indent=1) + "\n")
     drawn = {"mu_star": figures.optimal_occupation(), "cost_per_step": figures.costs(comparisons)}
     for name, history in histories.items():

@@ -14,7 +14,7 @@ from ocp_torch.problems import Circle
 from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.studies.benchmark.contenders import OCCUPATION, SCHEDULE
 from ocp_torch.studies.benchmark.measure import Judge, relative
-from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
+from ocp_torch.studies.kernel.expansions import BernoulliKernel
 from ocp_torch.studies.kernel.iterations import Iteration, step_sizes
 
 Tick = Callable[[int], None]
@@ -27,8 +27,7 @@ PARTS = 5
 class Recipe:
     """``looks`` are the step counts at which the averages are measured, ``drawn`` those at which they are drawn. ``numbers``
     are the method's own, in the order of the keys of `figures.LABELS`. The table has the step counts that ``known`` has: what
-    an independent re-implementation found there, in per cent of `OPT`, as ranges over seeds.
-    """
+    an independent re-implementation found there, in per cent of `OPT`, as ranges over seeds."""
 
     method: str
     section: str

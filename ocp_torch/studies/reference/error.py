@@ -3,7 +3,7 @@ another about another problem."""
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -42,8 +42,7 @@ FLAT = 1e-9
 KINK = 0.5
 
 
-@dataclass(frozen=True)
-class Extrapolation:
+class Extrapolation(NamedTuple):
     """``optimum`` with its stated ``error``, and the ``order`` the three grids show (NaN where they show none: the error is
     then unknown, `None`)."""
 

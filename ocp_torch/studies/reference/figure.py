@@ -64,13 +64,11 @@ def _maps(x: Tensor, rows: dict[str, dict[str, Tensor]]):
             limits = {} if name == "network - grid" else {"vmin": float(shared.min()), "vmax": float(shared.max())}
             image = axis.imshow(size.reshape(MAP_POINTS, -1).T, origin="lower", extent=(0, 1, 0, 1), **limits)
             values = drawn[name]
-            if values.ndim == 2 and values.shape[1] > 1:
+            several = values.ndim == 2 and values.shape[1] > 1
+            if several:
                 stride = MAP_POINTS // ARROWS
                 arrows = values[:, :2].reshape(MAP_POINTS, MAP_POINTS, 2)[::stride, ::stride]
                 axis.quiver(line[::stride], line[::stride], arrows[..., 0].T, arrows[..., 1].T, color="w")
-                axis.set_title(f"|{symbol}|, {name}")
-            else:
-                axis.set_title(f"{symbol}, {name}")
-            axis.set(xlabel="$x_1$", ylabel="$x_2$")
+            axis.set(title=f"|{symbol}|, {name}" if several else f"{symbol}, {name}", xlabel="$x_1$", ylabel="$x_2$")
             figure.colorbar(image, ax=axis)
     return figure

@@ -38,11 +38,8 @@ PATIENCE = 1.5
 
 @dataclass(frozen=True)
 class GridSolution:
-    """`V` ``(n,)`` and the controls `u` ``(n, m)`` held over a step, at the nodes of ``grid``.
-
-    ``residual`` bounds the effect on `V` of stopping early: the largest change one more policy makes, over `1 - beta`.
-    ``defect`` is what the function of that name gives.
-    """
+    """`V` ``(n,)`` and the controls `u` ``(n, m)`` held over a step, at the nodes of ``grid``. ``residual`` bounds the effect
+    on `V` of stopping early: the largest change one more policy makes, over `1 - beta`. ``defect`` is what `defect` gives."""
 
     grid: Grid
     value: Tensor

@@ -8,11 +8,10 @@ from torch import Tensor
 
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
-from ocp_torch.studies.reference.checks import grid_sides, require_solvable
 from ocp_torch.studies.reference.error import extrapolate, look_between
-from ocp_torch.studies.reference.grid import Grid
+from ocp_torch.studies.reference.grid import PIECE, Grid, grid_sides, require_solvable
 from ocp_torch.studies.reference.policy_iteration import GridSolution, solve
-from ocp_torch.studies.reference.semi_lagrangian import CLIP, PIECE, SemiLagrangian, minimiser
+from ocp_torch.studies.reference.semi_lagrangian import CLIP, SemiLagrangian, minimiser
 
 # The step moves a typical state by this many cells, and is at most this share of 1 / rho on the coarsest grid.
 CELLS, LONGEST = 1.0, 0.25
@@ -29,10 +28,9 @@ class Reference:
     """What three grids say of ``problem``.
 
     ``optimum`` is `OPT` extrapolated, ``error`` its stated error, ``order`` the order observed (see `extrapolate`); an error
-    that nobody knows is `None`, and ``unknown`` says why;
-    ``sides`` are nodes per coordinate and ``estimates`` the `OPT` of the three grids; ``value_change`` the largest change
-    of `V` from the second grid to the finest; ``unsettled`` is the part of ``error`` that iterations stopped early leave;
-    ``value`` ``(side,) * d`` is `V` on the finest grid.
+    that nobody knows is `None`, and ``unknown`` says why; ``sides`` are nodes per coordinate and ``estimates`` the `OPT` of
+    the three grids; ``value_change`` the largest change of `V` from the second grid to the finest; ``unsettled`` is the part
+    of ``error`` that iterations stopped early leave; ``value`` ``(side,) * d`` is `V` on the finest grid.
     """
 
     problem: Problem

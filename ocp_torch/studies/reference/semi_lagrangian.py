@@ -18,13 +18,11 @@ from torch import Tensor
 
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
-from ocp_torch.studies.reference.grid import Grid
+from ocp_torch.studies.reference.grid import PIECE, Grid
 
 # Of the cubic correction, relative to osc(V) h^{3/2}: a smaller one costs accuracy where V is smooth and the grid coarse, a
 # larger one overshoots more at kinks.
 CLIP = 4.0
-# Nodes worked on at a time: the stencils of a piece stay in the cache.
-PIECE = 2**14
 # Nodes of the Gauss-Legendre rule for the discounted weights: exact to rounding for steps of a part of 1 / rho.
 QUADRATURE = 12
 

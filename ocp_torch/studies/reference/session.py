@@ -15,9 +15,8 @@ from ocp_torch.files.reading import FOLDER, kind, require_unlinked
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.runs.build import build_problem
 from ocp_torch.runs.evaluate import load_run
-from ocp_torch.studies.reference.checks import grid_sides, require_solvable
 from ocp_torch.studies.reference.figure import draw
-from ocp_torch.studies.reference.grid import Grid
+from ocp_torch.studies.reference.grid import Grid, grid_sides, require_solvable
 from ocp_torch.studies.reference.reference import Reference, solve_reference
 from ocp_torch.training.settings import MOST_THREADS
 
@@ -25,10 +24,8 @@ log = logging.getLogger(__name__)
 
 
 class ReferenceJob:
-    """What was asked for: a problem, or a run that names one and beside whose controller the reference is drawn.
-
-    Every field is checked before anything is solved or written. Raises `InputError` for a wrong one.
-    """
+    """What was asked for: a problem, or a run that names one and beside whose controller the reference is drawn. Every field
+    is checked before anything is solved or written; raises `InputError` for a wrong one."""
 
     def __init__(self, config: dict) -> None:
         section = require_section("problem", config["problem"])
