@@ -19,7 +19,7 @@ from ocp_torch.studies.benchmark import measure
 from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender, RLContender, require_rl
 from ocp_torch.studies.benchmark.contest import Contest
 from ocp_torch.studies.benchmark.measure import Curve, Judge, Point, due, median_and_spread, relative, tabulated
-from ocp_torch.studies.benchmark.report import contest_table, load, reference, save
+from ocp_torch.studies.benchmark.report import contest_table, reference, save
 from ocp_torch.studies.paper import figures
 from ocp_torch.studies.paper.reproduce import check, report, reproduce
 from ocp_torch.studies.paper.runs import RECIPES, carry_out, circle, compare_with_exact
@@ -143,14 +143,14 @@ def test_looks_grow_by_a_factor_and_spreads_are_medians():
     assert median_and_spread([3.0, 1.0, 2.0]) == (2.0, 1.0, 3.0)
 
 
-def test_the_report_says_what_was_reached_and_comes_back_from_its_file(tmp_path):
+def test_the_report_says_what_was_reached_and_its_file_holds_the_curves(tmp_path):
     curves = [curve("slow", s, [1.5, 1.2, 1.1]) for s in (0, 1)] + [curve("fast", 0, [1.5, 1.005, 1.004], 0.003)]
     text = save(curves, 1.0, tmp_path)
     assert "not reached" in text
     assert "0.3 %" in text
     row = next(line for line in text.splitlines() if line.startswith("| fast"))
     assert "| 20 |" in row
-    assert load(tmp_path / "curves.json") == curves
+    assert json.loads((tmp_path / "curves.json").read_text()) == [dataclasses.asdict(c) for c in curves]
     assert "1 % on Perf in the fewest samples: fast, 20." in text
     assert "slow" not in text.rsplit("\n\n", 1)[1]
     assert reference(curves, None) == (0.9, "the best lower bound found")

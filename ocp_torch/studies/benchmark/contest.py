@@ -33,8 +33,8 @@ def contender(name: str, config: dict, problem: Problem, constants: Constants):
     kind, _, method = require_choice("contenders", name, EVERYONE).partition("_")
     if kind == "network":
         methods = require_section("methods", config["methods"])
-        training = {group: config[group] for group in TRAINING}
-        made = NetworkContender({"problem": config["problem"], "method": methods[method], **training})
+        groups = {"problem": config["problem"], "method": methods[method], **{g: config[g] for g in TRAINING}}
+        made = NetworkContender(groups)
         build_trainer({**made.config, "seed": 0})  # a wrong field is refused now, not after an hour
         return made
     if kind == "kernel":

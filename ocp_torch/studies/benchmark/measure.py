@@ -11,10 +11,9 @@ from itertools import count, groupby
 import torch
 from torch import Tensor, nn
 
-from ocp_torch.certificate import BOUNDS, LOWER, UPPER, CertificateSettings, Run, StageSettings, bounds
+from ocp_torch.certificate import BOUNDS, LOWER, UPPER, CertificateSettings, Run, StageSettings, Trained, bounds
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.simulated.performance import simulate_performance
-from ocp_torch.certificate.trained import Trained
 from ocp_torch.certificate.trained_context import TrainedContext
 from ocp_torch.certificate.upper.density import DensityBounds
 from ocp_torch.control.policies import Policy

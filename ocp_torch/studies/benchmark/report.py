@@ -11,7 +11,7 @@ import numpy as np
 
 from ocp_torch.certificate import LOWER, UPPER, bounds
 from ocp_torch.runs.canvas import blank_figure
-from ocp_torch.studies.benchmark.measure import Curve, Point, median_and_spread
+from ocp_torch.studies.benchmark.measure import Curve, median_and_spread
 
 # The certified gaps of all are held against that of the paper's primal-dual.
 BASELINE = "kernel pd"
@@ -133,8 +133,3 @@ def save(curves: list[Curve], exact: float | None, folder: Path) -> str:
     (folder / "benchmark.md").write_text(text + "\n")
     (folder / "curves.json").write_text(json.dumps([asdict(c) for c in curves], indent=1, default=float) + "\n")
     return text
-
-
-def load(path: Path) -> list[Curve]:
-    """The curves `save` wrote."""
-    return [Curve(**{**c, "points": [Point(**p) for p in c["points"]]}) for c in json.loads(path.read_text())]

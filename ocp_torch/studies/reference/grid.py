@@ -1,6 +1,6 @@
 """A periodic grid on the unit torus: nodes, interpolation stencils and differences; and what such grids can solve."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -26,7 +26,8 @@ TOLERANCE = 1e-6
 PROBED, CONTROLS = 256, 64
 
 
-class Stencil(NamedTuple):
+@dataclass(frozen=True)
+class Stencil:
     """Nodes around ``N`` points, and their multilinear (zero outside the cell) and cubic weights; each ``(N, 4^d)``."""
 
     index: Tensor
