@@ -35,7 +35,7 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.external import certify
 from ocp_torch.runs.finish import controller_of
 from ocp_torch.studies.kernel.rules import DualRule
-from ocp_torch.studies.reference import solve_reference
+from ocp_torch.studies.reference.reference import solve_reference
 from support import zoo
 from support.brute_force import BOUND, central_differences, columns, lowest, two_dimensional, value_and_gradients
 from support.exact import ROUNDING, exact_slack, lattice

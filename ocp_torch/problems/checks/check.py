@@ -80,7 +80,8 @@ def require_made(problem: Problem) -> None:
         bound = getattr(problem, name, None)
         infinite = name == "occupation_bound" and bound == math.inf
         if bound is not None and not infinite:
-            require_number(f"{name} of {named(problem)}", _number(bound))
+            number = bound.item() if isinstance(bound, Tensor) and bound.ndim == 0 else bound
+            require_number(f"{name} of {named(problem)}", number)
 
 
 def require_units(problem: Problem) -> None:
@@ -106,7 +107,3 @@ def _has(problem: Problem, name: str) -> bool:
         return getattr(problem, name, None) is not None
     except Exception:  # a property of a user's own that leans on what is missing
         return False
-
-
-def _number(value: object) -> object:
-    return value.item() if isinstance(value, Tensor) and value.ndim == 0 else value

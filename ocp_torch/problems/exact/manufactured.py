@@ -158,11 +158,10 @@ class Manufactured(Problem):
         direction = torch.nn.functional.normalize(p, dim=-1, eps=1e-30)
         scale = norm_power(p, power) if power > 0.0 else torch.ones_like(p[:, 0])
         radial = torch.full_like(scale, power)
-        limit = self.control_limit
-        if limit is not None and self.limited:
+        if self.control_limit is not None and self.limited:
             size = p.norm(dim=-1)
-            at_limit = size > limit ** (self.exponent - 1.0)
-            scale = torch.where(at_limit, limit / size.clamp_min(1e-30), scale)
+            at_limit = size > self.control_limit ** (self.exponent - 1.0)
+            scale = torch.where(at_limit, self.control_limit / size.clamp_min(1e-30), scale)
             radial = torch.where(at_limit, -1.0, radial)
         along = torch.einsum("nk,nkj->nj", direction, jacobian).unsqueeze(1)
         bent = jacobian + radial[:, None, None] * direction.unsqueeze(-1) * along

@@ -77,9 +77,7 @@ def dependence_notes(path: Path, samples: Samples) -> tuple[str, ...]:
     if spread <= 0.0:
         return ()
     correlation = float((centred[1:] * centred[:-1]).sum()) / spread
-    if correlation * len(centred) ** 0.5 <= SURE:
-        return ()
-    return (
-        f"consecutive samples of {path.name} are alike (correlation {correlation:.2g}): they are no independent draws, and "
-        "errors and intervals are too small.",
+    alike = (
+        f"consecutive samples of {path.name} are alike (correlation {correlation:.2g}): they are no independent draws, "
     )
+    return (f"{alike}and errors and intervals are too small.",) if correlation * len(centred) ** 0.5 > SURE else ()

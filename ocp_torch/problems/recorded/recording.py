@@ -61,14 +61,23 @@ def read(path: str | Path, wrap: bool = False) -> Recording:
     for name in arrays:
         if name not in KNOWN:
             raise InputError(f"{path} holds {name!r}, which is no array of a recording{nearest(name, KNOWN)}.")
-    numbers = {name: _number(path, name, arrays.pop(name)) for name in NUMBERS if name in arrays}
+    numbers = {}
+    for name in (name for name in NUMBERS if name in arrays):
+        number = arrays.pop(name)
+        if number.size != 1 or not np.isfinite(number).all():
+            raise InputError(f"{path}: {name} has shape {number.shape}, but must be one finite number.")
+        numbers[name] = float(number.reshape(()))
     _require_shapes(path, arrays)
     for name, array in arrays.items():
         bad = ~np.isfinite(array).reshape(len(array), -1).all(axis=1)
         if bad.any():
             raise InputError(f"{path}: {name} is not finite at {int(bad.sum())} samples, first at row {bad.argmax()}.")
     samples = samples_of(path, arrays, wrap)
-    return Recording(samples, numbers, _digest(arrays), dependence_notes(path, samples))
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(arrays[name]).data)
+    return Recording(samples, numbers, digest.hexdigest(), dependence_notes(path, samples))
 
 
 def write(path: str | Path, samples: Samples, numbers: dict[str, float | None], density: Tensor | None = None) -> None:
@@ -103,12 +112,6 @@ def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
     return {name: tensor.double().numpy() for name, tensor in tensors.items()}
 
 
-def _number(path: Path, name: str, array: np.ndarray) -> float:
-    if array.size != 1 or not np.isfinite(array).all():
-        raise InputError(f"{path}: {name} has shape {array.shape}, but must be one finite number.")
-    return float(array.reshape(()))
-
-
 def _require_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
     x, B = arrays["x"], arrays["B"]
     if x.ndim != 2 or x.shape[1] < 1 or B.ndim != 3 or B.shape[2] < 1:
@@ -121,11 +124,3 @@ def _require_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
             raise InputError(f"{path}: {name} has shape {arrays[name].shape}, but must have ({letters}) = {expected}.")
     if len(x) < FEWEST:
         raise InputError(f"{path} holds {len(x)} samples, but at least {FEWEST} are needed.")
-
-
-def _digest(arrays: dict[str, np.ndarray]) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(arrays):
-        digest.update(name.encode())
-        digest.update(np.ascontiguousarray(arrays[name]).data)
-    return digest.hexdigest()

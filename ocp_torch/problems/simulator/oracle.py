@@ -22,12 +22,10 @@ SEAM_JUMP, SIZED = 1e-3, 32
 
 
 class Oracle:
-    """``target``, by name or the function itself, as a function of states ``(N, dim)`` that gives `f`, `a`, `B` and maybe
-    `mu0`: made only if it keeps to that at a few states and across the seam, and asked with ``workers`` processes.
+    """The ``target`` of a `Simulator`, by name or the function itself, asked with ``workers`` processes: made only if it
+    keeps to what is said there at a few states and across the seam, and held to it whenever it is asked.
 
     ``driftless``: `None` stands for `a`; ``gives_mu0``: there is a fourth part; ``in_float32``: `f` is in single precision.
-    Raises `InputError`, when made and when asked, with the state, where the function fails, gives another shape or a number
-    that is not finite; when made, also where it is no function of the state alone or jumps from 1 to 0.
     """
 
     def __init__(self, target: str | Callable, dim: int, control_dim: int, workers: int = 1) -> None:

@@ -11,14 +11,11 @@ from ocp_torch.problems.systems.linkage import Linkage
 
 
 class Arm(Linkage):
-    r"""`dx/dt = speed u` and `f = target_weight |p(x) - target|^2 + obstacle_weight sum_o (1 - prod_s (1 - b_o(r_s(x))))`.
+    r"""A `Linkage` in the plane: `x_i` is the angle of joint `i` against the link before it, in turns.
 
-    `x_i` is the angle of joint `i` against the link before it, in turns; the state space is exactly the torus and there is
-    no drift. Joint `i` ends at `r_i = r_{i-1} + l_i (cos, sin)(2 pi (x_1 + ... + x_i))`, in metres from the base, and the
-    end effector is `p = r_n` (Murray, Li, Sastry: *A Mathematical Introduction to Robotic Manipulation*, chapter 3).
-    `u = 1` turns a joint by ``speed`` turns per second. `s` runs over points of all links; `b_o` is 1 at the centre of an
-    obstacle and falls to 0 at ``clearance`` metres from its rim, so that an obstacle costs about ``obstacle_weight`` where
-    any part of the arm is inside; everything is twice differentiable.
+    Joint `i` ends at `r_i = r_{i-1} + l_i (cos, sin)(2 pi (x_1 + ... + x_i))`, in metres from the base, and the tip is
+    `p = r_n` (Murray, Li, Sastry: *A Mathematical Introduction to Robotic Manipulation*, chapter 3). An obstacle costs
+    about ``obstacle_weight`` where any part of the arm is inside.
 
     ``lengths`` in metres, by default 1 / dim each; ``target`` `[x, y]`; ``obstacles`` a list of `[x, y, radius]`. The
     optimal flow contracts onto the configurations that reach the target: `mu*` is declared unbounded, and no `M` makes

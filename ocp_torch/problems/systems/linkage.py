@@ -13,9 +13,10 @@ from ocp_torch.problems.systems.reaching import Reaching, bump
 class Linkage(Reaching):
     r"""`dx/dt = speed u` and `f = target_weight |p(x) - target|^2 + obstacle_weight sum_o (1 - prod_s (1 - b_o(r_s(x))))`.
 
-    `x_i` is the angle of joint `i` in turns, `p` the tip, and `s` runs over ``points_per_link`` points of each link, where
-    the bump `b_o` of an obstacle is 1 at its centre and 0 from ``clearance`` metres outside its surface on. A subclass gives
-    `joints` and `jacobian` in metres, sets ``speed``, and calls `pursue` and, once it knows its links, `stretch`.
+    `x_i` is the angle of joint `i` in turns, so that the state space is exactly the torus and there is no drift; `u = 1`
+    turns a joint by ``speed`` turns per second. `p` is the tip, and `s` runs over ``points_per_link`` points of each link,
+    where the bump `b_o` of an obstacle is 1 at its centre and 0 from ``clearance`` metres outside its surface on; all is
+    twice differentiable. A subclass gives `joints` and `jacobian`, sets ``speed``, and calls `pursue` and `stretch`.
     """
 
     points_per_link = 8

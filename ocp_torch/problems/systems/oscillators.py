@@ -47,7 +47,6 @@ class Oscillators(Problem):
         return cosine.mean(dim=-1).square() + sine.mean(dim=-1).square()
 
     def state_cost(self, x: Tensor) -> Tensor:
-        """``weight`` times `1 - r^2` to synchronise, `r^2` to desynchronise, `mean_j (1 - cos theta_j) / 2` to entrain."""
         if self.goal == ENTRAIN:
             return self.weight * (0.5 * TURN * self.phases(x)).sin().square().mean(dim=-1)
         square = self.square_order(x)
