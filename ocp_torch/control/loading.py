@@ -14,10 +14,9 @@ from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE
 from ocp_torch.files.limits import require_held, require_modest_problem
 from ocp_torch.files.storage import finite, load_tensors
 from ocp_torch.problems import PROBLEMS, Problem
-from ocp_torch.problems.checks import check_once
-from ocp_torch.problems.commands import ForeignProblem, made_by, naming
+from ocp_torch.problems.checks.check import check_once
+from ocp_torch.problems.commands import ForeignProblem, current_name, current_section, made_by, naming
 from ocp_torch.problems.constants import Constants
-from ocp_torch.problems.renamed import current_name, current_section
 
 FIELDS = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION)
 

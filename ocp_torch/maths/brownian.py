@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -78,16 +79,17 @@ def discounted(rho: float) -> Weight:
 
 
 def at_random_times(rho: float) -> Weight:
-    """For horizons `T ~ Exp(rho)`: as for `rate_at`, each `s` in (0, 1] gives the discounted integral in the mean, and they are
-    averaged by `8 s^7`, mostly near 1."""
+    """For horizons `T ~ Exp(rho)`: as for `rate_at`, each `s` in (0, 1] gives the discounted integral in the mean, and they
+    are averaged by `8 s^7`, mostly near 1."""
     return lambda horizon, part: 8.0 * part**8 * torch.exp(rho * horizon * (1.0 - part))
 
 
 @torch.no_grad()
 def path_integral(
-    dynamics: Dynamics, noise: Callable[[Tensor], Tensor], x0: Tensor, grid: Grid, moves: Tensor, weight: Weight
+    dynamics: Dynamics, noise: Callable[[Tensor], Any], x0: Tensor, grid: Grid, moves: Tensor, weight: Weight
 ) -> tuple[Tensor, Tensor]:
-    """`int weight(s) rate(x_t) ds` for `t = horizon s` along each path ``(N,)`` from ``x0`` ``(N, d)``, and its end ``(N, d)``.
+    """`int weight(s) rate(x_t) ds` for `t = horizon s` along each path ``(N,)`` from ``x0`` ``(N, d)``, and its end ``(N,
+    d)``.
 
     ``noise`` gives `sigma` ``(N, d, k)``; ``moves`` ``(steps, N, k)`` are the increments. The rule is the trapezoidal one.
     """
@@ -102,19 +104,10 @@ def path_integral(
     return total, x
 
 
-@dataclass(frozen=True)
-class Expectation:
-    """The extrapolated result of each path, where it ends, and a bound on the error of the results' weighted mean."""
-
-    result: Tensor  # (N,)
-    end: Tensor  # (N, d)
-    bias: float
-
-
 @torch.no_grad()
 def expectation(
     dynamics: Dynamics,
-    noise: Callable[[Tensor], Tensor],
+    noise: Callable[[Tensor], Any],
     x0: Tensor,
     weights: Tensor,
     grid: Grid,
@@ -122,9 +115,10 @@ def expectation(
     tolerance: float,
     seed: int,
     standard_error: Callable[[Tensor], float],
-) -> Expectation:
-    """Means of `path_integral` by ``weights`` ``(N,)``, with steps halved until halving moves them by less than ``tolerance``
-    or little beside the ``standard_error`` of the results.
+) -> tuple[Tensor, Tensor, float]:
+    """`path_integral` of each path, extrapolated ``(N,)``, the ends ``(N, d)``, and a bound on the error of the results'
+    mean by ``weights`` ``(N,)``. Steps are halved until halving moves them by less than ``tolerance`` or little beside the
+    ``standard_error`` of the results.
 
     The bias is what the last halving moved the extrapolated mean by, twice its own standard error included.
     """
@@ -147,7 +141,7 @@ def expectation(
         bias = abs(float(moved.mean())) + 2.0 * float(moved.std()) / math.sqrt(len(moved))
         if bias <= max(tolerance, GOOD_PART * standard_error(result)):
             break
-    return Expectation(result, end, bias)
+    return result, end, bias
 
 
 def _rows(count: int) -> Iterator[slice]:

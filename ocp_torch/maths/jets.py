@@ -136,7 +136,7 @@ def divergence(vector_field: Field, x: Tensor) -> Tensor:
     return torch.diagonal(jacobian, dim1=0, dim2=2).sum(dim=-1)
 
 
-def diffusion_divergences(noise: Field, x: Tensor) -> tuple[Tensor, Tensor]:
+def diffusion_divergences(noise: Callable[[Tensor], Any], x: Tensor) -> tuple[Tensor, Tensor]:
     """`div D` ``(N, d)``, with components `sum_j d_j D_ij`, and `div div D` ``(N,)``, of `D = sigma sigma^T / 2` for the
     field ``noise``, `sigma`: ``(N, d) -> (N, d, k)``."""
 

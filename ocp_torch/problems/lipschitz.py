@@ -1,7 +1,5 @@
 """What a user can say of a problem's data without writing a proof: how fast they vary."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -11,11 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError, require_integer, require_number
+from ocp_torch.errors import InputError, require_integer, require_number, require_numbers
 from ocp_torch.maths import jets
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
-from ocp_torch.problems.arguments import require_numbers
 from ocp_torch.problems.control_limit import control_cost
 from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.reproducible import Reproducible

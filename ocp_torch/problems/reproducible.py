@@ -1,7 +1,5 @@
 """An object that can be made again: what a checkpoint or a saved controller keeps of a problem."""
 
-from __future__ import annotations
-
 import inspect
 
 
@@ -10,7 +8,7 @@ class Reproducible:
 
     _given: tuple[tuple, dict]  # what `__init__` was called with
 
-    def __new__(cls, *args, **kwargs) -> Reproducible:
+    def __new__(cls, *args, **kwargs) -> "Reproducible":
         made = super().__new__(cls)
         made._given = args, kwargs
         return made

@@ -29,10 +29,10 @@ from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives import METHODS, Objective
 from ocp_torch.problems import Dataset, Problem
 from ocp_torch.problems.blame import in_their_words, origin, words
-from ocp_torch.problems.checks import check_once
+from ocp_torch.problems.checks.check import check_once
+from ocp_torch.problems.commands import current_target
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.problem import MOST_COORDINATES
-from ocp_torch.problems.renamed import current_target
 from ocp_torch.runs.process import use_threads
 from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training.batches import Batches

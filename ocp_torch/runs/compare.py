@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from pathlib import Path
 
-from ocp_torch.certificate.run import LONGEST_NAME
+from ocp_torch.certificate.settings import LONGEST_NAME
 from ocp_torch.errors import InputError, visible
 from ocp_torch.files.reading import FOLDER, kind, read_json
 from ocp_torch.runs.comparison import Comparison

@@ -16,7 +16,7 @@ import yaml
 from ocp_torch.errors import InputError
 from ocp_torch.files.reading import FOLDER, kind, read_yaml
 from ocp_torch.files.storage import write_atomically
-from ocp_torch.problems.renamed import current_name, current_section
+from ocp_torch.problems.commands import current_name, current_section
 from ocp_torch.training.checkpoint import load_checkpoint, newest
 
 CONFIG, AUTO = "config.yaml", "auto"

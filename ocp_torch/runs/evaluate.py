@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields, table
-from ocp_torch.certificate.checks.possible import require_possible
+from ocp_torch.certificate.settings import require_possible
 from ocp_torch.certificate.trained import in_float64
 from ocp_torch.control.controller import Controller
 from ocp_torch.control.loading import load_controller

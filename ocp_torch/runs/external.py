@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, certify_policy, in_float64, table
-from ocp_torch.certificate.checks.possible import require_possible
 from ocp_torch.certificate.external.black_box import BlackBox, require_limit
+from ocp_torch.certificate.settings import require_possible
 from ocp_torch.control.controller import Controller, problem_name
 from ocp_torch.control.policies import Policy, trained_policies
 from ocp_torch.errors import InputError, require_flag, require_integer

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ocp_torch.certificate.run import LONGEST_NAME
+from ocp_torch.certificate.settings import LONGEST_NAME
 from ocp_torch.errors import visible
 from ocp_torch.runs.canvas import blank_figure
 

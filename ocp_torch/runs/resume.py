@@ -15,8 +15,7 @@ from ocp_torch.errors import InputError
 from ocp_torch.files.limits import require_modest_problem, require_modest_run
 from ocp_torch.files.reading import read_json
 from ocp_torch.problems import PROBLEMS
-from ocp_torch.problems.commands import UNKNOWN, ForeignProblem, naming
-from ocp_torch.problems.renamed import PACKAGE
+from ocp_torch.problems.commands import PACKAGE, UNKNOWN, ForeignProblem, naming
 from ocp_torch.runs.configuration import current, saved_configuration
 from ocp_torch.training.checkpoint import LAST
 

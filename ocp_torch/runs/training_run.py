@@ -8,7 +8,7 @@ from pathlib import Path
 from torch import Tensor
 
 from ocp_torch.certificate import CertificateSettings
-from ocp_torch.certificate.checks.possible import require_possible
+from ocp_torch.certificate.settings import require_possible
 from ocp_torch.errors import InputError, require_integer
 from ocp_torch.files.limits import require_held
 from ocp_torch.runs.build import build_certificate_settings, build_trainer

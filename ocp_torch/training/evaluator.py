@@ -10,7 +10,7 @@ from dataclasses import replace
 from torch import nn
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, StageSettings, Trained, certify_fields
-from ocp_torch.certificate.progress import Progress, silent
+from ocp_torch.certificate.settings import Progress, silent
 from ocp_torch.fields import Fields
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem

@@ -10,7 +10,7 @@ from pathlib import Path
 from torch import nn
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run
-from ocp_torch.certificate.progress import Progress, silent
+from ocp_torch.certificate.settings import Progress, silent
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.objectives import Objective, Phase

@@ -13,12 +13,11 @@ from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.external.black_box import BlackBox
 from ocp_torch.certificate.lower.penalised import penalised
 from ocp_torch.certificate.lower.sampled import SampledValue
-from ocp_torch.certificate.proof.box import Box
 from ocp_torch.certificate.proof.enclosures import conjugate_model
-from ocp_torch.certificate.proof.obstacle import obstacle
-from ocp_torch.certificate.proof.rigorous import rigorous_lower_bound
-from ocp_torch.certificate.upper.density import density_bounds
+from ocp_torch.certificate.proof.models import Box
+from ocp_torch.certificate.proof.rigorous import obstacle, rigorous_lower_bound
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
+from ocp_torch.certificate.upper.penalised import density_bounds
 from ocp_torch.control.loading import load_controller
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, admissible_density, occupation_density, trained_policies
 from ocp_torch.errors import InputError
@@ -36,7 +35,7 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.external import certify
 from ocp_torch.runs.finish import controller_of
 from ocp_torch.studies.kernel.rules import DualRule
-from ocp_torch.studies.reference import solve_reference
+from ocp_torch.studies.reference.reference import solve_reference
 from support import zoo
 from support.brute_force import BOUND, central_differences, columns, lowest, two_dimensional, value_and_gradients
 from support.exact import ROUNDING, exact_slack, lattice

@@ -7,13 +7,13 @@ from torch import Tensor
 
 from ocp_torch.certificate.lower.recombined import Program
 from ocp_torch.certificate.lower.shifted import SlackParts, slack_function
-from ocp_torch.certificate.proof.box import Box
 from ocp_torch.certificate.proof.cover import cell_models
+from ocp_torch.certificate.proof.models import Box
 from ocp_torch.errors import InputError
 from ocp_torch.maths.jets import Jet, jet
 from ocp_torch.problems.generator import Generator, hjb_slack
 from ocp_torch.problems.samples import Samples
-from ocp_torch.studies.kernel.stream import Datum
+from ocp_torch.studies.kernel.rules import Datum
 from support import zoo
 
 STEP, TOLERANCE = 1e-5, dict(rtol=1e-5, atol=1e-5)

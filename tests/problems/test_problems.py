@@ -8,7 +8,7 @@ import torch
 
 from ocp_torch.certificate.lower.penalised import penalised
 from ocp_torch.certificate.lower.sampled import SampledValue
-from ocp_torch.certificate.upper.density import density_bounds
+from ocp_torch.certificate.upper.penalised import density_bounds
 from ocp_torch.errors import InputError
 from ocp_torch.maths import jets
 from ocp_torch.maths.sampling import evaluation_points

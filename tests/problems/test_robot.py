@@ -115,7 +115,7 @@ def test_without_a_file_it_is_a_six_joint_arm_that_can_reach_its_target():
 
 def test_a_linkage_without_joints_is_no_problem():
     with pytest.raises(TypeError, match="abstract.*jacobian.*joints"):
-        Linkage(2, 2, [0.0, 0.0], [], 0.1, 1.0, 1.0, 1.0, 1.0, 2.0, None)
+        Linkage(2)
 
 
 def test_wrong_arguments_are_refused():

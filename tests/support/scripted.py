@@ -20,10 +20,10 @@ CHECKS = {
     "train": "training_run",
     "certify": "arguments",
     "evaluate": "recertification",
-    "reference": "reference_job",
+    "reference": "ReferenceJob",
     "record": "recorder",
-    "rollout": "rollout_job",
-    "benchmark": "build",
+    "rollout": "RolloutJob",
+    "benchmark": "Contest",
     "reproduce_paper": "check",
 }
 

@@ -7,18 +7,14 @@ around: averaged, they are gone, and hardly anything else changes. That a subsol
 is how the theory of viscosity solutions treats convex Hamiltonians (Barron and Jensen, 1990).
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.lower.shifted import Shift, SlackParts, slack_parts
+from ocp_torch.certificate.lower.shifted import Shift, SlackParts
 from ocp_torch.maths.jets import Field, Jet, jet
 from ocp_torch.maths.seeds import fixed_generator
-from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
 # Radii, and how many of them are tried on all states at most.
@@ -36,8 +32,7 @@ class Mollified:
     def __init__(self, value: Field, dim: int, radius: float) -> None:
         axes = torch.eye(dim, dtype=torch.float64)
         if dim > DIRECTIONS:
-            generator = fixed_generator()
-            mixed = torch.randn(dim, DIRECTIONS, generator=generator, dtype=torch.float64)
+            mixed = torch.randn(dim, DIRECTIONS, generator=fixed_generator(), dtype=torch.float64)
             axes = torch.linalg.qr(mixed).Q.T
         self.value, self.radius = value, radius
         self.offsets = radius * torch.cat([torch.zeros_like(axes[:1]), axes, -axes])  # (2 k + 1, d)
@@ -62,43 +57,30 @@ class Mollified:
         return [samples.take(slice(0, count)) for samples in sets]
 
 
-def mollified_shift(
-    problem: Problem,
-    value: Field,
-    sets: list[Samples],
-    parts: list[SlackParts],
-    ascents: int,
-    own: Shift,
-    beside: Sequence[Samples] = (),
-) -> Shift:
-    """The best shifted bound that was found of ``value`` averaged; ``own``, that of ``value`` itself, where none is better.
+def mollified_shift(own: Shift) -> Shift:
+    """The best shifted bound that was found of the value of ``own`` averaged; ``own`` itself where none is better.
 
     On few states a bound is too high, never too low: the radius that looks best on few is tried on all, until one tried on
-    all is better than the others look. ``parts`` are those of ``value``; suprema are sought ``beside`` too.
+    all is better than the others look.
     """
-    slack = SlackParts.join(parts).slack(own.theta)
-    worst = Samples.concatenate(sets).take(slack.topk(min(WORST, len(slack))).indices)
-    worst = Samples.concatenate([worst, *beside])
-    few = [samples.take(slice(0, max(1, FEW // len(sets)))) for samples in sets]
-    on_few = lambda radius: _shift(problem, value, radius, few, worst, min(ascents, FEW_ASCENTS)).bound
-    looks = {radius: on_few(radius) for radius in RADII}
-    best = own
+    slack = SlackParts.join(own.parts).slack(own.theta)
+    worst = Samples.concatenate(own.sets).take(slack.topk(min(WORST, len(slack))).indices)
+    worst = Samples.concatenate([worst, *own.beside])
+    few = [samples.take(slice(0, max(1, FEW // len(own.sets)))) for samples in own.sets]
+
+    def averaged(radius: float, sets: list[Samples], ascents: int) -> Shift:
+        W = Mollified(own.value, own.problem.dim, radius)
+        return replace(own, value=W, sets=W.fitting(sets), ascents=ascents, beside=[worst], radius=radius)
+
+    on_few = lambda radius: averaged(radius, few, min(own.ascents, FEW_ASCENTS)).bound
+    best, looks = own, {radius: on_few(radius) for radius in RADII}
     for _ in range(TRIALS):
-        radius = max(looks, key=looks.__getitem__)
-        if looks[radius] <= best.bound:
+        radius = max(looks, key=looks.__getitem__, default=0.0)
+        if radius == 0.0 or looks[radius] <= best.bound:
             break
-        tried = _shift(problem, value, radius, sets, worst, ascents)
-        best = max(best, replace(tried, name=own.name), key=lambda shift: shift.bound)
-        found = problem.samples(tried.largest.x.unsqueeze(0), divergences=False)
+        tried = averaged(radius, own.sets, own.ascents)
+        best = max(best, tried, key=lambda shift: shift.bound)
+        found = own.problem.samples(tried.largest.x.unsqueeze(0), divergences=False)
         worst = Samples.concatenate([worst, found])
         looks = {r: on_few(r) for r, look in looks.items() if r != radius and look > best.bound}
-        if not looks:
-            break
     return best
-
-
-def _shift(problem: Problem, value: Field, radius: float, sets: list[Samples], worst: Samples, ascents: int) -> Shift:
-    averaged = Mollified(value, problem.dim, radius)
-    sets = averaged.fitting(sets)
-    *parts, beside = slack_parts(problem, averaged, [*sets, worst])
-    return Shift.of(problem, averaged, sets, parts, ascents, radius, [beside])

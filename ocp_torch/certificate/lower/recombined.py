@@ -7,15 +7,13 @@ ascents end. The maximum is smoothed (`tau log E exp(Q / tau)`), ever less, and 
 one's ascents found. What the bound is in the end is measured on other states, as for any `W`.
 """
 
-from __future__ import annotations
-
 import math
-from typing import Protocol, TypeGuard
 
 import torch
 from torch import Tensor
 
 from ocp_torch.certificate.lower.shifted import SlackParts, slack_function
+from ocp_torch.fields.mlp import PeriodicMLP
 from ocp_torch.maths.jets import CHUNK, Field
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import Branch, derive_seed
@@ -33,36 +31,22 @@ ROUNDS, ITERATIONS, ASCENTS, SHARPER = 5, 60, 128, 0.4
 NEGLIGIBLE = 1e-6
 
 
-class Recombinable(Protocol):
-    """A `V` whose last layer combines features."""
-
-    def __call__(self, x: Tensor) -> Tensor: ...
-
-    def features(self, x: Tensor) -> Tensor: ...
-
-    def feature_curvature(self, x: Tensor, sigma: Tensor) -> Tensor: ...
-
-    def shifted_by(self, weights: Tensor) -> Field: ...
-
-
-def shows_features(value: Field) -> TypeGuard[Recombinable]:
-    return hasattr(value, "features")
-
-
 class Program:
     """`c -> Q_W` at a growing set of states, in an orthonormal basis of the directions in which it moves."""
 
-    def __init__(self, problem: Problem, value: Recombinable, x: Tensor) -> None:
+    def __init__(self, problem: Problem, value: PeriodicMLP, x: Tensor) -> None:
         self.problem, self.value = problem, value
-        samples, self.parts, moved, pushed, features = self._evaluated(x)
+        self.parts, moved, pushed, gain = self._evaluated(x)
         rows = torch.cat([moved - moved.mean(dim=0), *pushed.unbind(dim=1)]) / math.sqrt(len(x))
         _, sizes, directions = torch.linalg.svd(rows, full_matrices=False)
         kept = sizes > NEGLIGIBLE * sizes[0]
         self.basis = directions[kept].T / sizes[kept]  # (n, k)
         self.moved, self.pushed = moved @ self.basis, pushed @ self.basis
-        self.gain = (features * samples.mu0.unsqueeze(-1)).mean(dim=0) @ self.basis  # E[h mu0], per direction
+        self.gain = gain @ self.basis  # E[h mu0], per direction
 
-    def _evaluated(self, x: Tensor):
+    def _evaluated(self, x: Tensor) -> tuple[SlackParts, Tensor, Tensor, Tensor]:
+        """The parts of `Q_V` at ``x``; what each weight adds to their ``value`` ``(N, n)`` and ``push`` ``(N, m, n)``; and
+        `E[h mu0]` ``(n,)``."""
         problem, rho = self.problem, self.problem.discount
         samples = Samples.of(problem, x, divergences=False)
         generator = Generator.of(problem, samples)
@@ -78,7 +62,8 @@ class Program:
                 carried = carried + self.value.feature_curvature(part.x, part.noise)
             moved.append(features[-1] - carried / rho)
             pushed.append(-torch.einsum("ndm,ndk->nmk", part.B, gradients) / rho)
-        return samples, parts, *(torch.cat(columns) for columns in (moved, pushed, features))
+        gain = (torch.cat(features) * samples.mu0.unsqueeze(-1)).mean(dim=0)
+        return parts, torch.cat(moved), torch.cat(pushed), gain
 
     def slack(self, c: Tensor) -> Tensor:
         """`Q_W`, ``(N,)``, for ``c`` ``(k,)``."""
@@ -87,7 +72,7 @@ class Program:
 
     def add(self, x: Tensor) -> None:
         """More states."""
-        _, parts, moved, pushed, _ = self._evaluated(x)
+        parts, moved, pushed, _ = self._evaluated(x)
         self.parts = SlackParts.join([self.parts, parts])
         self.moved = torch.cat([self.moved, moved @ self.basis])
         self.pushed = torch.cat([self.pushed, pushed @ self.basis])
@@ -100,7 +85,7 @@ class Program:
 @torch.no_grad()
 def recombined(problem: Problem, value: Field, seed: int) -> Field | None:
     """`W` for ``value`` `V` in float64; `None` where its model does not show its features, or no weights were found."""
-    if not shows_features(value):
+    if not isinstance(value, PeriodicMLP):
         return None
     width = value.features(torch.zeros(1, problem.dim, dtype=torch.float64)).shape[1]
     count = min(STATES, NUMBERS // (width * (problem.control_dim + 2)))

@@ -1,17 +1,10 @@
 """The shifted bound of a multiple of `V`, proved over cells that cover the torus (`ocp_torch.certificate.proof`)."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from ocp_torch.certificate.bound import LOWER, Bound, once
+from ocp_torch.certificate.bound import LOWER, Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.problems.needs import Need
-
-if TYPE_CHECKING:
-    from ocp_torch.certificate.proof.rigorous import RigorousBound
 
 
 class Rigorous(Bound):
@@ -26,31 +19,34 @@ class Rigorous(Bound):
         return context.settings.rigorous and not context.external
 
     def evaluate(self, context: Context) -> Estimate | None:
-        bound, _ = proved(context)
-        return bound.estimate if bound else None
+        return proved(context)[0]
 
     def notes(self, context: Context, shown: Estimate | None) -> list[str]:
-        _, why = proved(context)
-        return [f"no rigorous lower bound: {why}."] if why else []
+        return proved(context)[1]
 
     def searches(self, context: Context) -> list[str]:
-        bound, _ = proved(context)
-        return [bound.sentence] if bound else []
+        return proved(context)[2]
 
 
-@once
-def proved(context: Context) -> tuple[RigorousBound | None, str | None]:
-    """The proved counterpart of `SampledValue.own`, or why there is none; neither where there is no `V` to speak of."""
+def proved(context: Context) -> tuple[Estimate | None, list[str], list[str]]:
+    """The proved counterpart of `SampledValue.own`, with a note where there is none, and what was proved in words."""
+    if "proved" not in context.results:
+        context.results["proved"] = _proved(context)
+    return context.results["proved"]
+
+
+def _proved(context: Context) -> tuple[Estimate | None, list[str], list[str]]:
     V = context.sampled_value
     if V is None:
-        return None, None
-    from ocp_torch.certificate.proof.obstacle import obstacle  # loaded only where a proof is asked for
-    from ocp_torch.certificate.proof.rigorous import rigorous_lower_bound
+        return None, [], []
+    # Loaded only where a proof is asked for.
+    from ocp_torch.certificate.proof.rigorous import obstacle, rigorous_lower_bound
 
     context.progress("proof")
-    why = obstacle(context.problem, V.value)
+    why, own = obstacle(context.problem, V.value), V.own
     if why is not None:
-        return None, why
-    own = V.own
+        return None, [f"no rigorous lower bound: {why}."], []
     bound = rigorous_lower_bound(context.problem, V.value, theta=own.theta, sampled_slack=own.largest.value)
-    return bound, None if bound else "nothing finite was proved within the budget of cells"
+    if bound is None:
+        return None, ["no rigorous lower bound: nothing finite was proved within the budget of cells."], []
+    return Estimate(bound.value, 0.0), [], [bound.sentence]  # nothing in it is random

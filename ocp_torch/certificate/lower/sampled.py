@@ -1,6 +1,4 @@
-"""`V` and its slack at sampled states: what the lower bounds of one `V` share."""
-
-from __future__ import annotations
+"""`V` at sampled states: what the lower bounds of one `V` share."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -9,7 +7,7 @@ from torch import Tensor
 
 from ocp_torch.certificate.lower.mollified import mollified_shift
 from ocp_torch.certificate.lower.recombined import recombined
-from ocp_torch.certificate.lower.shifted import Shift, SlackParts, initials, slack_parts
+from ocp_torch.certificate.lower.shifted import Shift
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
@@ -33,39 +31,23 @@ class SampledValue:
     odd: Tensor | None = None
 
     @cached_property
-    def parts(self) -> list[SlackParts]:
-        """What the slack of every multiple of `V` is made of, per set."""
-        return slack_parts(self.problem, self.value, self.sets)
-
-    @cached_property
-    def initial(self) -> list[float]:
-        """`E[V mu0]`, per set."""
-        return initials(self.sets, self.parts)
-
-    @cached_property
     def own(self) -> Shift:
         """The shifted bound of the best multiple of `V` itself."""
-        return self._shift(self.value, self.parts, self.initial)
+        odd = self.odd
+        beside = [] if odd is None or not len(odd) else [Samples.of(self.problem, odd, divergences=False)]
+        return Shift(self.problem, self.value, self.sets, self.ascents, beside)
+
+    @property
+    def initial(self) -> list[float]:
+        """`E[V mu0]`, per set."""
+        return self.own.initial
 
     @cached_property
     def best(self) -> Shift:
-        """That, or the one of a function made of `V` where it is higher."""
+        """That of `V` itself, or of a function made of it where it is higher."""
         if not self.search:
             return self.own
-        value, parts, best = self.value, self.parts, self.own
-        other = recombined(self.problem, value, self.seed)
+        best, other = self.own, recombined(self.problem, self.value, self.seed)
         if other is not None:
-            others = slack_parts(self.problem, other, self.sets)
-            tried = replace(self._shift(other, others), name="V recombined")
-            if tried.bound > best.bound:
-                value, parts, best = other, others, tried
-        return mollified_shift(self.problem, value, self.sets, parts, self.ascents, best, self._beside)
-
-    def _shift(self, value: Field, parts: list[SlackParts], initial: list[float] | None = None) -> Shift:
-        beside = slack_parts(self.problem, value, self._beside)
-        return Shift.of(self.problem, value, self.sets, parts, self.ascents, beside=beside, initial=initial)
-
-    @cached_property
-    def _beside(self) -> list[Samples]:
-        odd = self.odd
-        return [] if odd is None or not len(odd) else [Samples.of(self.problem, odd, divergences=False)]
+            best = max(best, replace(best, value=other, name="V recombined"), key=lambda shift: shift.bound)
+        return mollified_shift(best)

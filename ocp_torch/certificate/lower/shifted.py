@@ -6,10 +6,8 @@ every state, so the bound is concave in `theta`: its maximum is found by a searc
 changes nothing.) Where `V` has large slack, at kinks for instance, a `theta` below 1 trades a little of `E[V mu0]` for it.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
@@ -17,8 +15,7 @@ from torch import Tensor
 
 from ocp_torch.certificate.bound import LOWER, Bound, sentence_on
 from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
-from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.certificate.simulated.control_variate import integrals
+from ocp_torch.certificate.estimate import Estimate, integrals
 from ocp_torch.maths.jets import Field, Jet, jet
 from ocp_torch.maths.supremum import Extremum, minimiser, supremum
 from ocp_torch.problems.control_cost import PowerCost
@@ -38,69 +35,87 @@ TOP = 1.5
 class SlackParts:
     """What the slack of every `theta V` at sampled states is made of."""
 
+    cost: PowerCost
     x: Tensor  # (N, d)
     initial: Tensor  # (N,) V mu0
     value: Tensor  # (N,) V - L^0 V / rho
     f: Tensor  # (N,)
     push: Tensor  # (N, m) -B^T grad V / rho
-    cost: PowerCost
 
     @classmethod
-    def of(cls, generator: Generator, V: Jet) -> SlackParts:
-        samples = generator.data
-        value = V.value - generator.transport(V)
-        return cls(samples.x, V.value * samples.mu0, value, samples.f, generator.push(V), generator.cost)
+    def of(cls, generator: Generator, V: Jet) -> "SlackParts":
+        samples, value = generator.data, V.value - generator.transport(V)
+        return cls(generator.cost, samples.x, V.value * samples.mu0, value, samples.f, generator.push(V))
 
     @staticmethod
-    def join(parts: list[SlackParts]) -> SlackParts:
+    def join(parts: "list[SlackParts]") -> "SlackParts":
         names = ("x", "initial", "value", "f", "push")
-        x, initial, value, f, push = (torch.cat([getattr(p, n) for p in parts]) for n in names)
-        return SlackParts(x, initial, value, f, push, parts[0].cost)
+        return SlackParts(parts[0].cost, *(torch.cat([getattr(p, name) for p in parts]) for name in names))
 
     def slack(self, theta: float) -> Tensor:
         """`Q_{theta V}`, ``(N,)``."""
         return hjb_slack(theta * self.value, self.f, None, self.cost.conjugate(theta * self.push))
 
 
-def slack_parts(problem: Problem, value: Field, sets: list[Samples]) -> list[SlackParts]:
-    """The parts on each of ``sets``."""
-    return [SlackParts.of(L, L.chunked_jet(value)) for L in (Generator.of(problem, s) for s in sets)]
-
-
-def initials(sets: list[Samples], parts: list[SlackParts]) -> list[float]:
-    """`E[V mu0]`, per set."""
-    return integrals([s.x for s in sets], [p.initial for p in parts], [s.weight for s in sets])
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Shift:
-    """`E[theta W mu0] - sup Q_{theta W}`, for `W` the average of `V` at ``radius``, or `V` itself where that is 0."""
+    """The shifted bound of the best multiple of a ``value`` `W` on ``sets`` of samples of ``problem``.
 
-    theta: float
-    largest: Extremum
-    initial: list[float]  # E[W mu0] per set
-    radius: float = 0.0
+    The supremum of the slack is climbed from the ``ascents`` worst states, and sought ``beside`` too. `W` is what ``name``
+    says, averaged over neighbours at ``radius`` where that is not 0. All is computed when it is first asked for.
+    """
+
+    problem: Problem
+    value: Field
+    sets: list[Samples]
+    ascents: int
+    beside: list[Samples]
     name: str = "V"
+    radius: float = 0.0
 
-    @classmethod
-    def of(
-        cls,
-        problem: Problem,
-        value: Field,
-        sets: list[Samples],
-        parts: list[SlackParts],
-        ascents: int,
-        radius: float = 0.0,
-        beside: Sequence[SlackParts] = (),
-        initial: list[float] | None = None,
-    ) -> Shift:
-        """The best multiple of ``value``, whose ``parts`` on ``sets`` are known; the supremum is sought ``beside`` too.
+    @cached_property
+    def parts(self) -> list[SlackParts]:
+        """What the slack of every multiple is made of, per set."""
+        return self._parts_on(self.sets)
 
-        ``initial`` is `E[W mu0]` per set, if that is known."""
-        initial = initial or initials(sets, parts)
-        everywhere = SlackParts.join([*parts, *beside])
-        theta, largest = best_shift(problem, value, everywhere, sum(initial) / len(initial), ascents)
-        return cls(theta, largest, initial, radius)
+    def _parts_on(self, sets: list[Samples]) -> list[SlackParts]:
+        return [SlackParts.of(L, L.chunked_jet(self.value)) for L in (Generator.of(self.problem, s) for s in sets)]
+
+    @cached_property
+    def initial(self) -> list[float]:
+        """`E[W mu0]`, per set."""
+        return integrals([s.x for s in self.sets], [p.initial for p in self.parts], [s.weight for s in self.sets])
+
+    @cached_property
+    def _found(self) -> tuple[float, Extremum]:
+        """`theta`, which is 1 or the maximiser of the bound over the sampled states, and `sup Q_{theta W}`.
+
+        The supremum at the maximiser is searched for anew, and 1 stays where that shows no gain. Where `f < 0` is met the
+        problem breaks its promise, `0` is no subsolution to scale towards, and `theta` is 1.
+        """
+        everywhere = SlackParts.join([*self.parts, *self._parts_on(self.beside)])
+        mean = sum(self.initial) / len(self.initial)
+        largest = lambda theta: climbed(self.problem, self.value, everywhere, theta, self.ascents)
+        plain = largest(1.0)
+        if bool((everywhere.f < 0.0).any()):
+            return 1.0, plain
+        theta = scaled_by(everywhere, mean)
+        scaled = largest(theta)
+        return (theta, scaled) if theta * mean - scaled.value > mean - plain.value else (1.0, plain)
+
+    @property
+    def theta(self) -> float:
+        return self._found[0]
+
+    @property
+    def largest(self) -> Extremum:
+        """`sup Q_{theta W}`."""
+        return self._found[1]
+
+    @property
+    def bound(self) -> float:
+        """`E[theta W mu0] - sup Q_{theta W}`."""
+        return self.theta * sum(self.initial) / len(self.initial) - self.largest.value
 
     @property
     def estimate(self) -> Estimate:
@@ -108,15 +123,10 @@ class Shift:
         return Estimate.of([self.theta * e - self.largest.value for e in self.initial])
 
     @property
-    def bound(self) -> float:
-        return self.theta * sum(self.initial) / len(self.initial) - self.largest.value
-
-    @property
     def sentence(self) -> str:
         """What the slack is of."""
-        return f"sup Q of {self.theta:.4g} {self.name}" + (
-            f", averaged {self.radius:.2g} around," if self.radius else ""
-        )
+        averaged = f", averaged {self.radius:.2g} around," if self.radius else ""
+        return f"sup Q of {self.theta:.4g} {self.name}{averaged}"
 
 
 @dataclass(frozen=True)
@@ -137,43 +147,27 @@ def slack_function(problem: Problem, value: Field):
     """`x -> Q(x)` for the whole torus, differentiable in `x` where the problem is."""
 
     def slack(x: Tensor) -> Tensor:
-        samples = Samples.of(problem, x, divergences=False) if not x.requires_grad else _live(problem, x)
-        generator = Generator.of(problem, samples)
+        one = torch.ones_like(x[:, 0])
+        # `Samples.of` gives data without derivatives: only suprema over `x` want any.
+        with torch.set_grad_enabled(x.requires_grad and torch.is_grad_enabled()):
+            f, a, B, noise = problem.state_cost(x), problem.drift(x), problem.control_matrix(x), problem.noise(x)
+            generator = Generator.of(problem, Samples(x, f, a, B, one, one, noise=noise))
         return generator.hjb_slack(generator.jet(value))
 
     return slack
 
 
-def _live(problem: Problem, x: Tensor) -> Samples:
-    """Samples whose data carry derivatives in `x`; only suprema over `x` want that."""
-    one = torch.ones_like(x[:, 0])
-    f, a, B = problem.state_cost(x), problem.drift(x), problem.control_matrix(x)
-    return Samples(x, f, a, B, one, one, noise=problem.noise(x))
+def climbed_from(function: Field, values: Tensor, states: Tensor, ascents: int) -> Extremum:
+    """The supremum of a ``function`` whose ``values`` ``(N,)`` at ``states`` are known: the largest of those, then local
+    ascents from the largest; an estimate from below."""
+    start = states[values.topk(min(ascents, len(values))).indices]
+    return replace(supremum(function, start, ascents=ascents), points=len(states))
 
 
 def climbed(problem: Problem, value: Field, parts: SlackParts, theta: float, ascents: int) -> Extremum:
-    """`sup Q_{theta V}`: the largest of all sampled states, then local ascents from the worst; an estimate from below."""
-    start = parts.x[parts.slack(theta).topk(min(ascents, len(parts.x))).indices]
+    """`sup Q_{theta V}`."""
     scaled = value if theta == 1.0 else Scaled(value, theta)
-    found = supremum(slack_function(problem, scaled), start, ascents=ascents)
-    return Extremum(found.value, found.x, len(parts.x), found.ascents)
-
-
-def best_shift(
-    problem: Problem, value: Field, parts: SlackParts, initial: float, ascents: int
-) -> tuple[float, Extremum]:
-    r"""`theta` and `sup Q_{theta V}`: 1, or the maximiser of `theta initial - max Q_{theta V}` over the sampled states.
-
-    The supremum at the chosen `theta` is searched for anew, and 1 stays where that shows no gain. Where `f < 0` is met
-    the problem breaks its promise, `0` is no subsolution to scale towards, and `theta` is 1.
-    """
-    plain = climbed(problem, value, parts, 1.0, ascents)
-    if bool((parts.f < 0.0).any()):
-        return 1.0, plain
-    theta = scaled_by(parts, initial)
-    scaled = climbed(problem, value, parts, theta, ascents)
-    gains = theta * initial - scaled.value > initial - plain.value
-    return (theta, scaled) if gains else (1.0, plain)
+    return climbed_from(slack_function(problem, scaled), parts.slack(theta), parts.x, ascents)
 
 
 def scaled_by(parts: SlackParts, initial: float) -> float:
@@ -189,10 +183,10 @@ class Shifted(Bound):
     def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
         return (found_by_search("sup Q"),)
 
-    def evaluate(self, context: Context) -> Estimate | None:
+    def evaluate(self, context: "Context") -> Estimate | None:
         return None if context.sampled_value is None else context.sampled_value.best.estimate
 
-    def searches(self, context: Context) -> list[str]:
+    def searches(self, context: "Context") -> list[str]:
         if context.sampled_value is None:
             return []
         best = context.sampled_value.best

@@ -1,17 +1,15 @@
 """Cells that cover the torus, and what is proved on each of the HJB slack `Q` and of `W mu0`, for `W = theta V`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from ocp_torch.certificate.proof.box import Box, equal_cells
 from ocp_torch.certificate.proof.enclosures import conjugate_model, enclosure
+from ocp_torch.certificate.proof.models import Box
 from ocp_torch.certificate.proof.network_model import network_model
-from ocp_torch.certificate.proof.taylor import TaylorModel
+from ocp_torch.certificate.proof.taylor import ROUNDING, TaylorModel, upward
 from ocp_torch.fields.mlp import PeriodicMLP
 from ocp_torch.maths.jets import Jet
 from ocp_torch.problems.generator import Generator, hjb_slack
@@ -19,9 +17,6 @@ from ocp_torch.problems.problem import Problem
 
 # Degree of the models, by dimension: with a higher one fewer cells are needed, and each takes longer.
 DEGREE = {1: 4, 2: 5}
-# Cells a side to start with, by dimension, and cells evaluated at once, which bounds the memory.
-FIRST_CELLS = {1: 64, 2: 32}
-CHUNK = 256
 # A cell that is longer than so many times its shortest side is bisected along its longest, whatever its models say: without
 # it some would become slivers.
 LONGEST = 4.5
@@ -53,7 +48,7 @@ class Cover:
     axis: Tensor
 
     @classmethod
-    def of(cls, problem: Problem, value: PeriodicMLP, theta: float, centre: Tensor, half: Tensor) -> Cover:
+    def of(cls, problem: Problem, value: PeriodicMLP, theta: float, centre: Tensor, half: Tensor) -> "Cover":
         """The cells with ``centre`` and ``half``, evaluated."""
         box = Box(centre, half, DEGREE[problem.dim])
         Q, initial = cell_models(problem, value, theta, box)
@@ -65,20 +60,13 @@ class Cover:
         return cls(centre, half, upper, reached, mean * volume, radius * volume, _loosest(Q, box))
 
     @classmethod
-    def first(cls, problem: Problem, value: PeriodicMLP, theta: float) -> Cover:
-        """Equal cells that cover the torus."""
-        cells = equal_cells(problem.dim, FIRST_CELLS[problem.dim], DEGREE[problem.dim])
-        pieces = zip(cells.centre.split(CHUNK), cells.half.split(CHUNK), strict=True)
-        return cls.join([cls.of(problem, value, theta, centre, half) for centre, half in pieces])
-
-    @classmethod
-    def join(cls, parts: list[Cover]) -> Cover:
+    def join(cls, parts: list["Cover"]) -> "Cover":
         return cls(*(torch.cat(columns) for columns in zip(*(vars(p).values() for p in parts), strict=True)))
 
     def __len__(self) -> int:
         return len(self.upper)
 
-    def take(self, index: Tensor) -> Cover:
+    def take(self, index: Tensor) -> "Cover":
         """Those at ``index``, rows or flags."""
         return Cover(*(column[index] for column in vars(self).values()))
 
@@ -88,6 +76,14 @@ class Cover:
         half = self.half * (1.0 - 0.5 * hot)
         shift = half * hot
         return torch.cat([self.centre - shift, self.centre + shift]), half.repeat(2, 1)
+
+    def integral(self) -> tuple[float, float]:
+        """Below and above the integral of `W mu0` over all cells; `fsum` rounds once."""
+        means = self.mean.tolist()
+        middle = math.fsum(means)
+        rounded = math.fsum(self.radius.tolist()) + ROUNDING * math.fsum(map(abs, means))
+        radius = float(upward(torch.tensor(rounded, dtype=torch.float64)))
+        return math.nextafter(middle - radius, -math.inf), math.nextafter(middle + radius, math.inf)
 
 
 def _loosest(Q: TaylorModel, box: Box) -> Tensor:

@@ -1,40 +1,41 @@
 r"""A lower bound on `OPT` proved for the network as it stands, in one and two dimensions.
 
-For any smooth `W`, `W - sup_x Q_W(x)` is a subsolution of the HJB equation, so `E[W mu0] - sup_x Q_W(x) <= OPT` for a
-density `mu0` (mean 1). Here `W = theta V`, and both the supremum and the integral are enclosed over cells that cover the
-torus, bisected until the bound is tight: nothing is sampled, no `M` is used.
+It is the shifted bound `E[W mu0] - sup Q_W` of `W = theta V`, for a density `mu0` (mean 1). The supremum and the integral
+are enclosed over cells that cover the torus, bisected until the bound is tight: nothing is sampled, no `M` is used.
 
 What is proved: `value <= OPT`, for the `W` that the float64 weights define in real arithmetic. What is assumed: the
 problem's enclosure (or its Lipschitz constants) is true; float64 arithmetic rounds to nearest; matrix products add up
 their products in some order; library functions are accurate to 16 units in the last place. All rounding is accounted for.
 """
 
-from __future__ import annotations
-
 import math
-import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.lower.shifted import slack_function
-from ocp_torch.certificate.proof.cover import CHUNK, Cover
+from ocp_torch.certificate.proof.cover import DEGREE, Cover
+from ocp_torch.certificate.proof.enclosures import EVALUATION, Enclosure, conjugate_model, enclosure
+from ocp_torch.certificate.proof.models import Box, equal_cells
 from ocp_torch.certificate.proof.network_model import is_known
-from ocp_torch.certificate.proof.obstacle import obstacle
-from ocp_torch.certificate.proof.rounding import ROUNDING, upward
 from ocp_torch.errors import require_integer, require_number
-from ocp_torch.fields.mlp import PeriodicMLP
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.problem import Problem
 
+# The number of cells that a tolerance takes grows exponentially with the dimension.
+MOST_DIMENSIONS = 2
+# An enclosure is held against the data in so many cells per coordinate, whole and shrunk to 2^-8 of their size, where a wrong
+# value is not hidden by the radius.
+SPOT_CELLS, SPOT_SIZES = 16, (1.0, 2.0**-8)
+# Cells a side to start with, by dimension, and cells evaluated at once, which bounds the memory.
+FIRST_CELLS, CHUNK = {1: 64, 2: 32}, 256
 # How close to the sampled supremum, relative to the size of `theta V mu0`, by dimension; and the part of that which the
 # integral may take.
-TOLERANCE = {1: 1e-5, 2: 1e-3}
-INTEGRAL_PART = 0.1
+TOLERANCE, INTEGRAL_PART = {1: 1e-5, 2: 1e-3}, 0.1
 # States at which the supremum and that size are estimated beforehand, and the least size relative to that of the costs.
 SAMPLED, LEAST_SIZE = 2**14, 1e-3
 # Cells are not bisected below this half-width: all centres, and their multiples by wave numbers, are then exact.
@@ -43,59 +44,64 @@ SMALLEST_HALF = 2.0**-32
 
 @dataclass(frozen=True)
 class RigorousBound:
-    """``value <= OPT``: `E[theta V mu0]`, in ``integral``, less ``slack >= sup Q``; ``sampled_slack`` is met, not proved.
-
-    ``cells`` were evaluated; ``complete`` says whether the tolerance was reached before the budget.
-    """
+    """``value <= OPT``: `E[theta V mu0]`, in ``integral``, less ``slack >= sup Q``, from so many ``cells``; ``complete`` says
+    whether the tolerance was reached before the budget."""
 
     value: float
     slack: float
-    sampled_slack: float
     integral: tuple[float, float]
     cells: int
     theta: float
-    seconds: float
     complete: bool
-
-    @property
-    def estimate(self) -> Estimate:
-        """The bound as an entry of the certificate; there is nothing random in it."""
-        return Estimate(self.value, 0.0)
 
     @property
     def sentence(self) -> str:
         """What was proved, for the terminal."""
-        low, high = self.integral
-        return (
-            f"proved: sup Q of {self.theta:.4g} V <= {self.slack:.3e}, E[{self.theta:.4g} V mu0] in [{low:.8f}, {high:.8f}],"
-            f" over {self.cells:,} cells"
-        )
+        (low, high), W = self.integral, f"{self.theta:.4g} V"
+        within = f"sup Q of {W} <= {self.slack:.3e}, E[{W} mu0] in [{low:.8f}, {high:.8f}]"
+        return f"proved: {within}, over {self.cells:,} cells"
 
 
-@dataclass
-class _Finished:
-    """What is proved on the cells that are not bisected any more: ``slack`` of all, and the integral over each."""
+def obstacle(problem: Problem, value: Field) -> str | None:
+    """Why there can be no rigorous bound for ``value`` on ``problem``; `None` where there can."""
+    if problem.dim > MOST_DIMENSIONS:
+        return f"cells cover the torus in at most {MOST_DIMENSIONS} dimensions, and this problem has {problem.dim}"
+    if not is_known(value):
+        return "V is not one of the package's own scalar networks"
+    weights = [*value.parameters(), *value.buffers()]
+    if not all(bool(torch.isfinite(w).all()) for w in weights):
+        return "V has weights that are not finite"
+    if not all(w.dtype == torch.float64 and w.device.type == "cpu" for w in weights):
+        return "V is not in float64 on the CPU"
+    if not enclosure.holds_for(problem) or not conjugate_model.holds_for(problem.control_cost):
+        return "the problem's class changes its data, but not the enclosure it inherits"
+    generator = fixed_generator()
+    box = equal_cells(problem.dim, SPOT_CELLS, DEGREE[problem.dim])
+    if enclosure(problem, box) is None:
+        return "the problem gives neither an enclosure of its data nor their Lipschitz constants (lipschitz)"
+    for size in SPOT_SIZES:
+        small = Box(box.centre, size * box.half, box.degree)
+        t = 2.0 * torch.rand(box.centre.shape, generator=generator, dtype=torch.float64) - 1.0
+        wrong = contradiction(problem, small, enclosure(problem, small), t)
+        if wrong is not None:
+            return f"the problem's enclosure does not hold its own {wrong}"
+    return None
 
-    slack: float = -math.inf
-    means: list[float] = field(default_factory=list)
-    radii: list[float] = field(default_factory=list)
 
-    def add(self, cells: Cover) -> None:
-        if len(cells):
-            self.slack = max(self.slack, float(cells.upper.max()))
-            self.means += cells.mean.tolist()
-            self.radii += cells.radius.tolist()
-
-    @property
-    def finite(self) -> bool:
-        return all(map(math.isfinite, (self.slack, *self.means, *self.radii)))
-
-    def integral(self) -> tuple[float, float]:
-        """Below and above the integral over all cells; `fsum` rounds once."""
-        middle = math.fsum(self.means)
-        rounded = math.fsum(self.radii) + ROUNDING * math.fsum(map(abs, self.means))
-        radius = float(upward(torch.tensor(rounded, dtype=torch.float64)))
-        return math.nextafter(middle - radius, -math.inf), math.nextafter(middle + radius, math.inf)
+def contradiction(problem: Problem, box: Box, found: Enclosure, t: Tensor) -> str | None:
+    """The name of a part of the enclosure ``found`` that does not hold the problem's own data at `centre + half t`, if there
+    is one: what somebody wrote by hand may be wrong. ``t`` is ``(N, d)`` with entries in `[-1, 1]`."""
+    x = box.centre + box.half * t
+    powers = torch.stack([(t ** t.new_tensor(alpha)).prod(dim=-1) for alpha in box.basis.exponents])
+    models = {"state_cost": found.f, "control_matrix": found.B, "initial_density": found.mu0}
+    models["drift"] = found.a or box.constant(torch.zeros_like(x))
+    for name, model in models.items():
+        value = getattr(problem, name)(x)
+        shaped = powers.reshape(*powers.shape, *[1] * (value.dim() - 1))
+        error = ((shaped * model.coefficients).sum(dim=0) - value).abs()
+        if not bool((error <= model.radius + EVALUATION * (1.0 + value.abs())).all()):
+            return name
+    return None
 
 
 def rigorous_lower_bound(
@@ -106,63 +112,50 @@ def rigorous_lower_bound(
     sampled_slack: float | None = None,
     tolerance: float | None = None,
     cells: int = 2**18,
-    seconds: float | None = None,
 ) -> RigorousBound | None:
     r"""`E[theta V mu0] - sup Q <= OPT`, proved; `None` where `obstacle` says why there is none, or nothing finite was found.
 
     Cells are bisected, worst first, until `sup Q` is known within ``tolerance``, relative to `E|theta V mu0|`, of
-    ``sampled_slack`` (searched for when not given), or until ``cells`` have been evaluated or ``seconds`` have passed:
-    the bound stands then as well, only less tight. ``value`` must be in float64 on the CPU. Raises `InputError` for a
-    ``tolerance`` or a number of ``cells`` that is not positive.
+    ``sampled_slack`` (searched for when not given), or until ``cells`` have been evaluated: the bound stands then as well,
+    only less tight. ``value`` must be in float64 on the CPU. Raises `InputError` for a ``tolerance`` or a number of
+    ``cells`` that is not positive.
     """
     require_integer("certificate.rigorous cells", cells, 1)
     if not is_known(value) or obstacle(problem, value) is not None:
         return None
     tolerance = TOLERANCE[problem.dim] if tolerance is None else tolerance
     require_number("certificate.rigorous tolerance", tolerance, above=0.0)
-    started = time.monotonic()
     points = scrambled_sobol(SAMPLED, problem.dim, 0, torch.float64)
-    room = tolerance * _size(problem, value, theta, points)
+    with torch.no_grad():
+        initial, cost = theta * value(points) * problem.initial_density(points), problem.state_cost(points)
+    room = tolerance * max(float(initial.abs().mean()), LEAST_SIZE * float(cost.abs().mean()), 1e-300)
     if sampled_slack is None:
         sampled_slack = supremum(slack_function(problem, lambda x: theta * value(x)), points).value
-    finished, pending = _Finished(), Cover.first(problem, value, theta)
+    first = equal_cells(problem.dim, FIRST_CELLS[problem.dim], DEGREE[problem.dim])
+    pieces = zip(first.centre.split(CHUNK), first.half.split(CHUNK), strict=True)
+    pending, finished = Cover.join([Cover.of(problem, value, theta, *piece) for piece in pieces]), []
     count, goal = len(pending), sampled_slack + room
     while True:
         # Where Q is larger than was met by sampling, more cannot be proved.
         goal = max(goal, float(pending.reached.max()) + room)
-        done = _settled(pending, goal, room)
-        finished.add(pending.take(done))
+        # The radius of W mu0 is held per volume, so that all cells together keep theirs.
+        volume = (2.0 * pending.half).prod(dim=-1)
+        tight = (pending.upper <= goal) & (pending.radius <= INTEGRAL_PART * room * volume)
+        done = tight | (pending.half.amax(dim=-1) <= SMALLEST_HALF)
+        finished.append(pending.take(done))
         pending = pending.take(~done)
-        if not len(pending) or count >= cells or (seconds is not None and time.monotonic() - started > seconds):
+        if not len(pending) or count >= cells:
             break
         worst = pending.upper.topk(min(CHUNK // 2, len(pending))).indices
-        rest = torch.ones(len(pending), dtype=torch.bool)
-        rest[worst] = False
+        rest = ~torch.isin(torch.arange(len(pending)), worst)
         parents = pending.take(worst)
         halves = Cover.of(problem, value, theta, *parents.halves())
         halves.upper = torch.minimum(halves.upper, parents.upper.repeat(2))
         count += len(halves)
         pending = Cover.join([pending.take(rest), halves])
-    complete = len(pending) == 0
-    finished.add(pending)
-    if not finished.finite:
+    cover = Cover.join([*finished, pending])
+    if not all(bool(column.isfinite().all()) for column in (cover.upper, cover.mean, cover.radius)):
         return None
-    low, high = finished.integral()
-    bound = math.nextafter(low - finished.slack, -math.inf)
-    elapsed = time.monotonic() - started
-    return RigorousBound(bound, finished.slack, sampled_slack, (low, high), count, theta, elapsed, complete)
-
-
-def _settled(cells: Cover, goal: float, room: float) -> Tensor:
-    """Which cells ``(N,)`` need no bisection: `Q` is below ``goal`` and the integral is known, or they are too small."""
-    # The radius of W mu0 is held per volume, so that all cells together keep theirs.
-    volume = (2.0 * cells.half).prod(dim=-1)
-    settled = (cells.upper <= goal) & (cells.radius <= INTEGRAL_PART * room * volume)
-    return settled | (cells.half.amax(dim=-1) <= SMALLEST_HALF)
-
-
-@torch.no_grad()
-def _size(problem: Problem, value: PeriodicMLP, theta: float, x: Tensor) -> float:
-    """The size of `theta V mu0`, which tolerances are relative to; not much below that of the costs."""
-    initial, cost = theta * value(x) * problem.initial_density(x), problem.state_cost(x)
-    return max(float(initial.abs().mean()), LEAST_SIZE * float(cost.abs().mean()), 1e-300)
+    (low, high), slack = cover.integral(), float(cover.upper.max())
+    bound = math.nextafter(low - slack, -math.inf)
+    return RigorousBound(bound, slack, (low, high), count, theta, complete=not len(pending))

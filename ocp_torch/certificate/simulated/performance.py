@@ -1,38 +1,26 @@
 r"""`Perf(u) = E_{x0 ~ mu0} rho int e^{-rho t} (f + R(u)) dt` by simulation, with `V` as control variate where there is one.
 
-For any smooth `V`, `V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt` exactly along the closed loop, with the Bellman slack
-`Q_u = V - f - R(u) - grad V . (a + B u) / rho`. So `Perf(u) = E[V mu0] - E int rho e^{-rho t} Q_u`, and what is left to
-simulate, with all its errors, is as small as `Q_u`.
-
-With noise `Q_u` has `D : hess V` in it, and the identity a martingale of mean 0 (Ito's formula), which is left out: paths are
-those of the SDE, and what is averaged along them is `Q_u` alone (`ocp_torch.maths.brownian`).
-
-Where a controller slides along a kink of `V` that rate is not the one at which `V` changes (see `Sliding`).
-
 The infinite horizon is truncated, with the tail bounded; or each trajectory stops at a time `T ~ Exp(rho)` of its own,
 and `E[rate(x_T)]` is the discounted integral, without a tail.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ocp_torch.certificate.checks.tails import widened
-from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
-from ocp_torch.certificate.simulated.sliding import Sliding
-from ocp_torch.control.policies import Policy, ValuePolicy
+from ocp_torch.certificate.simulated.trajectories import Sliding, closed_loop_dynamics
+from ocp_torch.control.policies import Policy, zero_policy
 from ocp_torch.maths.brownian import Grid, at_random_times, discounted, expectation
 from ocp_torch.maths.jets import Field
-from ocp_torch.maths.runge_kutta import Dynamics, discounted_integral, rate_at, refined
+from ocp_torch.maths.runge_kutta import discounted_integral, rate_at, refined
 from ocp_torch.maths.seeds import Branch, derive_seed
-from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
-from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.starts import initial_points
 
 # A kink of V is met at the start of a trajectory or never, and what is late counts little: early steps are shorter.
@@ -42,15 +30,17 @@ GRADING = 2.0
 FEWEST_STEPS, DISCOUNTED, MOVED = 8, 0.4, 0.2
 # Simulation sets come after those of the bounds in the stream of evaluation points.
 SIMULATION_REPLICATE = 1000
-# What is left of the discount when simulation stops, times the rate's supremum, relative to the answer.
-TAIL = 2e-5
-# The answer is taken to be at least this part of the mean state cost at the starts.
-LEAST = 0.1
+# What is left of the discount when simulation stops, times the rate's supremum, relative to the answer; which is taken to be
+# at least the second part of the mean state cost at the starts.
+TAIL, LEAST = 2e-5, 0.1
 # States to which the starts' mean cost is compared, how many standard errors apart the two must be, and by how many times
 # that the interval is widened: trajectories may stay where no start was.
 COMPARED, UNLIKELY, UNSEEN_ROOM = 2**15, 2.5, 2.0
 # Head-room on the rate's supremum, met at starts and ends, for the states after the end.
 RATE_ROOM = 2.0
+# Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
+# a controller that another one clearly beats; but so few in all as the second number take hardly longer than a part of them.
+BASELINE_PART, CHEAP = 4, 256
 
 
 @dataclass(frozen=True)
@@ -60,45 +50,6 @@ class Simulated:
     perf: Estimate
     largest_value: float | None
     end_states: Tensor
-
-
-def _dynamics(problem: Problem, policy: Policy, value: Field | None) -> Dynamics:
-    """The closed loop and what it costs; with ``value`` its slack `-Q_u`, and as one more coordinate `z`, the sum of
-    `grad V . g` from `V` at the start on, with `z - V` as a second rate."""
-    cost = problem.control_cost
-
-    def dynamics(state: Tensor) -> tuple[Tensor, Tensor]:
-        if value is None:
-            u = policy(state)
-            return problem.velocity(state, u), problem.state_cost(state) + cost.cost(u)
-        x, summed = state[:, :-1], state[:, -1]
-        samples = Samples.of(problem, x, divergences=False)
-        generator = Generator.of(problem, samples)
-        V = generator.jet(value)
-        u = policy.control(samples.B, V) if isinstance(policy, ValuePolicy) and policy.value is value else policy(x)
-        velocity = samples.a + torch.einsum("ndm,nm->nd", samples.B, u)
-        slack = generator.bellman_slack(V, u)
-        change = (V.gradient * velocity).sum(dim=-1, keepdim=True)
-        return torch.cat([velocity, change], dim=-1), torch.stack([-slack, summed - V.value], dim=-1)
-
-    return dynamics
-
-
-def _drifting(problem: Problem, policy: Policy, value: Field | None) -> Dynamics:
-    """The drift of the closed loop with noise, and what it costs; with ``value`` its slack `-Q_u`."""
-    cost = problem.control_cost
-
-    def dynamics(x: Tensor) -> tuple[Tensor, Tensor]:
-        if value is None:
-            u = policy(x)
-            return problem.velocity(x, u), problem.state_cost(x) + cost.cost(u)
-        samples = Samples.of(problem, x, divergences=False)
-        generator = Generator.of(problem, samples)
-        V = generator.jet(value)
-        u = policy.control(samples.B, V) if isinstance(policy, ValuePolicy) and policy.value is value else policy(x)
-        return samples.a + torch.einsum("ndm,nm->nd", samples.B, u), -generator.bellman_slack(V, u)
-
-    return dynamics
 
 
 def starting_points(
@@ -136,19 +87,20 @@ def simulate_performance(
 ) -> Simulated:
     """Perf of ``policy`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts, near `mu0`.
 
-    With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is
-    added. Steps are halved until a trajectory changes by less than ``tolerance``, relative to the answer, or all of them by
-    little beside the standard error. ``bias`` is the error of integration (`refined`) plus, where the ``horizon`` is
-    truncated, the discount left there times the rate's supremum as met along the trajectories, with head-room.
+    With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is added.
+    Steps are halved until a trajectory changes by less than ``tolerance``, relative to the answer, or all of them by little
+    beside the standard error. ``bias`` is the error of integration (`refined`, with noise `expectation`) plus, where the
+    ``horizon`` is truncated, the discount left there times the rate's supremum as met along the trajectories, with
+    head-room.
     """
     dim, rho = problem.dim, problem.discount
     random = horizon == RANDOM
     points, mass = starting_points(problem, trajectories, replicates, seed, extra=int(random))
     x0 = points[:, :dim]
-    dynamics = _dynamics(problem, policy, value)
+    dynamics = closed_loop_dynamics(problem, policy, value)
     with torch.no_grad():
         base = value(x0) if value is not None else torch.zeros_like(x0[:, 0])
-        state = x0 if value is None else torch.cat([x0, base.unsqueeze(-1)], dim=-1)
+        state = x0 if value is None or problem.noisy else torch.cat([x0, base.unsqueeze(-1)], dim=-1)
         velocity, rate = dynamics(state)
         velocity, rate = velocity[:, :dim], rate.reshape(len(x0), -1)[:, 0]
     if not (torch.isfinite(velocity).all() and torch.isfinite(rate).all()):
@@ -156,8 +108,8 @@ def simulate_performance(
     # By the slack's definition `V - Q_u = f + R(u) + grad V . g / rho`: the answer's size also where `E[V mu0]` is far off.
     size = max(float((mass * (base + rate)).mean().abs()), LEAST * float((mass * problem.state_cost(x0)).mean()), 1e-12)
     largest_rate = RATE_ROOM * float(rate.abs().max())
-    times = -torch.log1p(-points[:, dim]) / rho if random else None
     if random:
+        times = -torch.log1p(-points[:, dim]) / rho
         longest = float(times.max())
         integrate = lambda rows, count: rate_at(dynamics, state[rows], rho, times[rows], count, wrap=False)
     else:
@@ -165,18 +117,16 @@ def simulate_performance(
         integrate = lambda rows, count: discounted_integral(
             dynamics, state[rows], rho, longest, count, wrap=False, grading=GRADING
         )
-    sliding = None if value is None else Sliding(integrate, len(x0), tolerance * size)
+    sliding = None if value is None or problem.noisy else Sliding(integrate, len(x0), tolerance * size)
     speed = float(velocity.norm(dim=-1).max())
     steps = max(FEWEST_STEPS, 2 * math.ceil(0.5 * longest * max(rho / DISCOUNTED, speed / MOVED)))
     generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT))
     means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
     noise = lambda results: Estimate.of(means(results).tolist()).se
     if problem.noisy:
-        dynamics, sliding = _drifting(problem, policy, value), None
-        grid = Grid(torch.full_like(mass, longest), steps, GRADING) if times is None else Grid(times, steps, 1.0)
+        grid = Grid(times, steps, 1.0) if random else Grid(torch.full_like(mass, longest), steps, GRADING)
         weight = at_random_times(rho) if random else discounted(rho)
-        found = expectation(dynamics, problem.noise, x0, mass, grid, weight, tolerance * size, seed, noise)
-        result, end, bias = found.result, found.end, found.bias
+        result, end, bias = expectation(dynamics, problem.noise, x0, mass, grid, weight, tolerance * size, seed, noise)
     else:
         result, end, bias = refined(sliding or integrate, mass, steps, tolerance * size, generator, noise)
     ended = end[:, :dim].remainder(1.0)
@@ -204,3 +154,31 @@ def stratum_error(results: Tensor, replicates: int) -> float:
     7 %.
     """
     return float(results.std()) / (len(results) // replicates * math.sqrt(replicates))
+
+
+class Candidate(NamedTuple):
+    """A controller to simulate, the control variate `V` of its simulation, and `E[V mu0]` per set."""
+
+    policy: Policy
+    value: Field | None
+    initial: list[float] | None
+
+
+def simulate_candidates(
+    problem: Problem, candidates: dict[str, Candidate], settings: CertificateSettings, seed: int, best_only: bool
+) -> tuple[dict[str, Simulated], Estimate]:
+    """Performance of each of ``candidates``, and of doing nothing. With ``best_only`` one that is clearly worse than another
+    on a quarter of the trajectories gets no more of them, where that saves time."""
+
+    def simulate(candidate: Candidate, trajectories: int) -> Simulated:
+        (policy, value, initial), how = candidate, (settings.horizon, settings.tolerance)
+        return simulate_performance(problem, policy, trajectories, settings.replicates, seed, value, initial, *how)
+
+    few = max(2, settings.trajectories // BASELINE_PART)
+    pays = best_only and len(candidates) > 1 and settings.trajectories * settings.replicates > CHEAP
+    found = {name: simulate(candidate, few) for name, candidate in candidates.items()} if pays else {}
+    best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
+    for name, candidate in candidates.items():
+        if name not in found or not found[name].perf.interval(CONFIDENCE)[0] > best:
+            found[name] = simulate(candidate, settings.trajectories)
+    return found, simulate(Candidate(zero_policy(problem), None, None), few).perf

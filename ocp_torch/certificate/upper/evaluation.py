@@ -1,7 +1,5 @@
 """What the Bellman slack of any `V` says of a given controller's performance, without divergences (1. in `lagrangian`)."""
 
-from __future__ import annotations
-
 from ocp_torch.certificate.bound import PERFORMANCE, UPPER, Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
 from ocp_torch.certificate.context import Context
@@ -14,6 +12,7 @@ class Evaluation(Bound):
     """`Perf(u) <= E[V mu0] + eps_hi`, also of a controller that jumps."""
 
     name, side, label = "evaluation", UPPER, "evaluation"
+    end = 1  # of the interval in which the performance lies
 
     def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
         return (found_by_search("sup |Q_u|"),)
@@ -22,7 +21,7 @@ class Evaluation(Bound):
         return context.external
 
     def evaluate(self, context: Context) -> Estimate | None:
-        return context.fitted.sandwich[1] if context.fitted else None
+        return context.fitted.sandwich[self.end] if context.fitted else None
 
     def searches(self, context: Context) -> list[str]:
         return slack_searches(context.fitted)
@@ -31,7 +30,4 @@ class Evaluation(Bound):
 class EvaluationBelow(Evaluation):
     """`E[V mu0] - eps_lo <= Perf(u)`."""
 
-    side = PERFORMANCE
-
-    def evaluate(self, context: Context) -> Estimate | None:
-        return context.fitted.sandwich[0] if context.fitted else None
+    side, end = PERFORMANCE, 0

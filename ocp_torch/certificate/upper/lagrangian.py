@@ -17,9 +17,7 @@ Write `Q_u` for the Bellman slack of `V` and `r = mu0 - mu - div(mu g_u) / rho` 
    of the sets is evaluated with the `s` that is best on the other half: the search does not flatter the bound.
 """
 
-from __future__ import annotations
-
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -27,13 +25,13 @@ from torch import Tensor
 
 from ocp_torch.certificate.bound import PERFORMANCE, UPPER, Bound, sentence_on
 from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
-from ocp_torch.certificate.checks.hidden import Flux, Hidden, hidden_divergence
+from ocp_torch.certificate.checks.hidden import Hidden, hidden_divergence
 from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate, integral
-from ocp_torch.certificate.lower.shifted import slack_function
-from ocp_torch.certificate.upper.multiples import Terms, best_multiples
-from ocp_torch.maths.jets import CHUNK, Field
-from ocp_torch.maths.supremum import Extremum, batched, supremum
+from ocp_torch.certificate.lower.shifted import climbed_from, slack_function
+from ocp_torch.certificate.upper.multiples import Integrand, best_multiples, terms_on
+from ocp_torch.maths.jets import Field
+from ocp_torch.maths.supremum import Extremum, batched
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.needs import Need
@@ -52,11 +50,10 @@ class ClosedLoopBounds:
     C_V: float
     eps_hi: Extremum
     eps_lo: Extremum
-    residual: float  # E[|r|]
     below: Estimate  # of Perf(u) from below: 2. with the signs turned
     sandwich: tuple[Estimate, Estimate]  # E[V mu0] - eps_lo <= Perf(u) <= E[V mu0] + eps_hi, by 1. alone
-    hidden: Hidden | None = None  # a divergence that the residual does not see: only the sandwich stands then
-    contributions: list[list[torch.Tensor]] = field(default_factory=list)  # of `lagrangian` and `J`, parts of each
+    hidden: Hidden | None  # a divergence that the residual does not see: only the sandwich stands then
+    contributions: list[list[Tensor]]  # of `lagrangian` and `J`, parts of each
 
 
 def closed_loop_bounds(
@@ -69,76 +66,39 @@ def closed_loop_bounds(
     initial: list[float] | None = None,
     odd: Tensor | None = None,
 ) -> ClosedLoopBounds:
-    """Evaluate both bounds on ``sets`` of samples of ``loop``; the suprema are sampled on them, and at the states ``odd``
-    ``(K, d)`` too, and climbed.
-
-    ``initial``, if given, is `E[V mu0]` per set from more states: it carries nearly all of the variance.
-    """
-    values = [_integrands(loop, value, log_occupation, samples) for samples in sets]
-    states = torch.cat([samples.x for samples in sets])
-    slack_all = torch.cat([slack for *_, slack, _ in values])
-    tops = torch.cat([v for v, *_ in values])
-    slack = slack_function(loop, value)
+    """All bounds on ``sets`` of samples of ``loop``; suprema are climbed from the worst of them and of the states ``odd``
+    ``(K, d)``. ``initial``, if given, is `E[V mu0]` per set from more states: it carries nearly all of the variance."""
+    found = [terms_on(Generator.of(loop, samples), value, log_occupation) for samples in sets]
+    terms, slacks, _, fluxes = zip(*found, strict=True)
+    states, slack_of = torch.cat([samples.x for samples in sets]), slack_function(loop, value)
+    values, slack = torch.cat([t.v for t in terms]), torch.cat(slacks)
     if odd is not None and len(odd):
         states = torch.cat([states, odd])
-        tops, slack_all = torch.cat([tops, batched(value, odd)]), torch.cat([slack_all, batched(slack, odd)])
-    top = _climbed(value, tops, states, ascents)
-    eps_lo = _climbed(slack, slack_all, states, ascents)
-    eps_hi = _climbed(lambda x: -slack(x), -slack_all, states, ascents)
-    C_V = top.value + eps_hi.value
-    terms = [Terms(samples, *parts[:3]) for samples, parts in zip(sets, values, strict=True)]
-    lagrangian, below, J, residual, low, high = [], [], [], [], [], []
-    hi, lo = eps_hi.value, eps_lo.value
-    excess = best_multiples(terms, lambda t, s: t.lagrangian(s, hi, lo))
-    shortfall = best_multiples(terms, lambda t, s: -t.lagrangian(s, -lo, -hi))
-    penalised = best_multiples(terms, lambda t, s: t.J(s, C_V))
-    for i, own in enumerate(terms):
-        started = integral(own.samples, own.v * own.samples.mu0) if initial is None else initial[i]
-        lagrangian.append(started + excess[i])
-        below.append(started - shortfall[i])
-        J.append(started + penalised[i])
-        mass = integral(own.samples, own.samples.mu0)
-        low.append(started - lo * mass)
-        high.append(started + hi * mass)
-        residual.append(integral(own.samples, own.r.abs()))
-    mean_residual = sum(residual) / len(residual)
-    weighted = lambda integrand: [t.samples.weight * integrand(t) for t in terms]
-    of_lagrangian, of_below = (weighted(lambda t, s=s: t.lagrangian_integrand(1.0, *s)) for s in ((hi, lo), (-lo, -hi)))
-    of_J = weighted(lambda t: t.J_integrand(1.0, C_V))
-    found = widened(Estimate.of(lagrangian, controller=controller), of_lagrangian)
-    penalised_by = widened(Estimate.of(J), of_J)
-    parts_of = lambda estimate, values: [v / (abs(estimate.value) or 1.0) for v in values]
-    return ClosedLoopBounds(
-        found,
-        penalised_by,
-        C_V,
-        eps_hi,
-        eps_lo,
-        mean_residual,
-        widened(Estimate.of(below), of_below),
-        (Estimate.of(low), Estimate.of(high)),
-        hidden_divergence([flux for *_, flux in values]),
-        [parts_of(found, of_lagrangian), parts_of(penalised_by, of_J)],
-    )
+        values = torch.cat([values, batched(value, odd)])
+        slack = torch.cat([slack, batched(slack_of, odd)])
+    suprema = [(value, values), (slack_of, slack), (lambda x: -slack_of(x), -slack)]
+    climbed = (climbed_from(function, met, states, ascents) for function, met in suprema)
+    top, eps_lo, eps_hi = (replace(e, value=max(e.value, 0.0)) for e in climbed)
+    hi, lo, C_V = eps_hi.value, eps_lo.value, top.value + eps_hi.value
+    started = initial or [integral(t.samples, t.v * t.samples.mu0) for t in terms]
 
+    def bound(integrand: Integrand, sign: float = 1.0) -> tuple[Estimate, list[Tensor]]:
+        """`E[V mu0]` and ``sign`` times the mean of ``integrand``; and the weighted integrand for `mu` itself."""
+        excess = best_multiples(terms, integrand)
+        found = Estimate.of([e + sign * x for e, x in zip(started, excess, strict=True)])
+        weighted = [t.samples.weight * integrand(t, 1.0) for t in terms]
+        return widened(found, weighted), weighted
 
-@torch.no_grad()
-def _integrands(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples):
-    """`V`, `mu Q_u`, `r` and `Q_u` at the states of ``samples``, and the flux `mu g_u`."""
-    generator = Generator.of(loop, samples)
-    V = generator.chunked_jet(value)
-    slack = generator.hjb_slack(V)
-    parts = [Generator.of(loop, part).occupation_flux(log_occupation) for part in samples.split(CHUNK)]
-    mu, outflow, moved = (torch.cat(columns) for columns in zip(*parts, strict=True))
-    flux = Flux(samples.x, samples.weight, outflow - mu, moved / loop.discount)
-    return V.value, mu * slack, samples.mu0 - outflow, slack, flux
-
-
-def _climbed(function, values: torch.Tensor, states: torch.Tensor, ascents: int) -> Extremum:
-    """`sup max(function, 0)`: from the largest of the sampled ``values``, upwards."""
-    start = states[values.topk(min(ascents, len(values))).indices]
-    found = supremum(function, start, ascents=ascents)
-    return Extremum(max(found.value, 0.0), found.x, len(states), found.ascents)
+    lagrangian, of_lagrangian = bound(lambda t, s: t.lagrangian(s, hi, lo))
+    below, _ = bound(lambda t, s: -t.lagrangian(s, -lo, -hi), sign=-1.0)
+    J, of_J = bound(lambda t, s: t.J(s, C_V))
+    masses = [integral(samples, samples.mu0) for samples in sets]
+    shifted = lambda by: Estimate.of([e + by * mass for e, mass in zip(started, masses, strict=True)])
+    sandwich, hidden = (shifted(-lo), shifted(hi)), hidden_divergence(list(fluxes))
+    pairs = (lagrangian, of_lagrangian), (J, of_J)
+    contributions = [[v / (abs(estimate.value) or 1.0) for v in weighted] for estimate, weighted in pairs]
+    lagrangian = replace(lagrangian, controller=controller)
+    return ClosedLoopBounds(lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions)
 
 
 class Lagrangian(Bound):
@@ -149,10 +109,10 @@ class Lagrangian(Bound):
     def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
         return found_by_search("sup |Q_u|"), assumptions.regular
 
-    def evaluate(self, context: Context) -> Estimate | None:
+    def evaluate(self, context: "Context") -> Estimate | None:
         return context.closed_loop.lagrangian if context.closed_loop else None
 
-    def searches(self, context: Context) -> list[str]:
+    def searches(self, context: "Context") -> list[str]:
         return slack_searches(context.closed_loop)
 
 
@@ -161,10 +121,10 @@ class LagrangianBelow(Lagrangian):
 
     side = PERFORMANCE
 
-    def applies(self, context: Context) -> bool:
+    def applies(self, context: "Context") -> bool:
         return context.external
 
-    def evaluate(self, context: Context) -> Estimate | None:
+    def evaluate(self, context: "Context") -> Estimate | None:
         return context.closed_loop.below if context.closed_loop else None
 
 

@@ -1,7 +1,5 @@
 r"""`G(w) = min_mu J(w, mu)`, pointwise and in closed form where there is no drift (Lemma 2 of the paper)."""
 
-from __future__ import annotations
-
 from ocp_torch.certificate.bound import UPPER, Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.context import Context

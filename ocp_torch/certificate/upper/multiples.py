@@ -1,16 +1,16 @@
-"""The best multiple of a density `mu`: every bound from its residual holds for each, and is convex in it."""
+"""What bounds of a closed loop are made of, and the best multiple of `mu`: they hold for each, and are convex in it."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from ocp_torch.certificate.checks.hidden import Flux
 from ocp_torch.certificate.estimate import integral
+from ocp_torch.maths.jets import CHUNK, Field
 from ocp_torch.maths.supremum import minimiser
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 
 # The interval in which the multiple is sought: from no mass at all to twice what was fitted.
@@ -19,7 +19,8 @@ MULTIPLES = (0.0, 2.0)
 
 @dataclass(frozen=True)
 class Terms:
-    """What the bounds on one set of states are made of: `V`, `mu Q_u` and `r`, each ``(N,)``."""
+    """What the bounds on one set of states are made of: `V`, `mu Q_u` and `r`, each ``(N,)``. By the numbers of `lagrangian`,
+    its methods are the integrands, ``(N,)``, of the bounds of ``scale`` times `mu`, without `E[V mu0]`."""
 
     samples: Samples
     v: Tensor
@@ -30,33 +31,44 @@ class Terms:
         """The residual of ``scale`` times `mu`."""
         return self.samples.mu0 - scale * (self.samples.mu0 - self.r)
 
-    def lagrangian(self, scale: float, hi: float, lo: float) -> float:
-        """`E[hi max(r, 0) + lo max(-r, 0) - mu Q_u]` of ``scale`` times `mu`: the bound of 2. without `E[V mu0]`."""
-        return integral(self.samples, self.lagrangian_integrand(scale, hi, lo))
-
-    def lagrangian_integrand(self, scale: float, hi: float, lo: float) -> torch.Tensor:
-        """What `lagrangian` is the mean of, ``(N,)``."""
+    def lagrangian(self, scale: float, hi: float, lo: float) -> Tensor:
+        """Of 2.: `hi max(r, 0) + lo max(-r, 0) - mu Q_u`."""
         r = self.residual(scale)
         return hi * r.clamp_min(0.0) + lo * (-r).clamp_min(0.0) - scale * self.spent
 
-    def J(self, scale: float, C_V: float) -> float:
-        """The bound of 4., without `E[V mu0]`."""
-        return integral(self.samples, self.J_integrand(scale, C_V))
-
-    def J_integrand(self, scale: float, C_V: float) -> torch.Tensor:
-        """What `J` is the mean of, ``(N,)``."""
+    def J(self, scale: float, C_V: float) -> Tensor:
+        """Of 4.: `C_V max(r, 0) - V r - mu Q_u`."""
         r = self.residual(scale)
         return C_V * r.clamp_min(0.0) - self.v * r - scale * self.spent
 
     @staticmethod
-    def join(terms: list[Terms]) -> Terms:
+    def join(terms: "Sequence[Terms]") -> "Terms":
         """All states of ``terms`` in one."""
         columns = (torch.cat([getattr(t, name) for t in terms]) for name in ("v", "spent", "r"))
         return Terms(Samples.concatenate([t.samples for t in terms]), *columns)
 
 
-def best_multiples(terms: list[Terms], bound: Callable[[Terms, float], float]) -> list[float]:
-    """``bound`` of each of ``terms`` with the multiple of `mu` that makes it smallest on the other half of them."""
-    halves = [Terms.join(terms[k::2]) for k in (0, 1)]
-    scales = [minimiser(partial(bound, half), *MULTIPLES) for half in halves]
-    return [bound(t, scales[1 - i % 2]) for i, t in enumerate(terms)]
+@torch.no_grad()
+def terms_on(loop: Generator, value: Field, log_occupation: Field) -> tuple[Terms, Tensor, Tensor, Flux]:
+    """The terms of any ``value`` and ``log_occupation`` on the samples of a closed loop; `Q_u` and `mu` ``(N,)`` there, and
+    the flux `mu g_u - div(D mu)`."""
+    samples, V = loop.data, loop.chunked_jet(value)
+    slack = loop.hjb_slack(V)
+    parts = [replace(loop, data=part).occupation_flux(log_occupation) for part in samples.split(CHUNK)]
+    mu, outflow, moved = (torch.cat(columns) for columns in zip(*parts, strict=True))
+    flux = Flux(samples.x, samples.weight, outflow - mu, moved / loop.rho)
+    return Terms(samples, V.value, mu * slack, samples.mu0 - outflow), slack, mu, flux
+
+
+Integrand = Callable[[Terms, float], Tensor]
+
+
+def best_multiple(terms: Terms, integrand: Integrand) -> float:
+    """The multiple of `mu` for which the mean of ``integrand`` is smallest."""
+    return minimiser(lambda scale: integral(terms.samples, integrand(terms, scale)), *MULTIPLES)
+
+
+def best_multiples(terms: Sequence[Terms], integrand: Integrand) -> list[float]:
+    """The mean of ``integrand`` on each of ``terms``, with the multiple of `mu` that is best on the other half of them."""
+    scales = [best_multiple(Terms.join(terms[k::2]), integrand) for k in (0, 1)]
+    return [integral(t.samples, integrand(t, scales[1 - i % 2])) for i, t in enumerate(terms)]

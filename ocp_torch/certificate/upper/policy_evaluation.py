@@ -1,22 +1,19 @@
 """Policy evaluation: fit `mu` (and `V`, where there is none) to the closed loop of the controller handed out."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 
-from ocp_torch.certificate.upper.multiples import MULTIPLES, Terms
+from ocp_torch.certificate.estimate import integral
+from ocp_torch.certificate.upper.multiples import best_multiple, terms_on
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
 from ocp_torch.maths.jets import CHUNK, Field
 from ocp_torch.maths.sampling import SobolSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
-from ocp_torch.maths.supremum import minimiser
 from ocp_torch.objectives.phase import Phase
 from ocp_torch.objectives.policy_evaluation import PolicyEvaluation
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -40,12 +37,8 @@ class StageSettings:
     """Budget of policy evaluation, `certificate.stage` of a configuration. Raises `InputError` on a wrong value."""
 
     steps: int = 600  # least-squares steps in the first round; 0 for none at all
-    rounds: int = (
-        2  # rounds at most, each twice as long as the one before; the next starts only while `good_excess` is not met
-    )
-    good_excess: float = (
-        1e-3  # part of the Lagrangian bound that comes from the residual, where no further round is needed
-    )
+    rounds: int = 2  # at most, each twice as long as the one before
+    good_excess: float = 1e-3  # part of the Lagrangian bound that comes from the residual, below which rounds end
     batch: int = 256  # states per step
     lr: float = 1.0e-2  # learning rate, with cosine decay in each round
 
@@ -65,7 +58,7 @@ def fit_closed_loop(
     constants: Constants,
     settings: StageSettings,
     seed: int,
-    pool: Source | None = None,
+    pool: "Pool | Drawn | None" = None,
 ) -> Fields:
     """Fields with `log mu^u`, and with `V^u` where ``fields`` hold no `V`, of the closed loop of ``policy``.
 
@@ -98,16 +91,6 @@ def fit_closed_loop(
     return average.module
 
 
-class Source(Protocol):
-    """Samples of a closed loop that are drawn from again and again."""
-
-    samples: Samples
-
-    def grow(self, count: int) -> None: ...
-
-    def draw(self, count: int) -> Samples: ...
-
-
 class Pool:
     """``count`` samples of a closed loop that are drawn from again and again, and grow when more are wanted.
 
@@ -115,10 +98,9 @@ class Pool:
     """
 
     def __init__(self, loop: ClosedLoop, seed: int, like: torch.Tensor, count: int, double: bool = False) -> None:
-        self.loop, self.like = loop, like
+        self.loop, self.like, self.drawn = loop, like, 0
         self.states = SobolSampler(loop.dim, seed, torch.float64 if double else like.dtype)
         self.samples = self._fresh(count)
-        self.drawn = 0
 
     def _fresh(self, count: int) -> Samples:
         states = self.states.draw(count).to(self.like.device).split(CHUNK)
@@ -137,6 +119,22 @@ class Pool:
         return self.samples.take(index)
 
 
+class Drawn:
+    """A fixed set of samples that is drawn from with replacement: the `Pool` of a closed loop that cannot be sampled anew."""
+
+    def __init__(self, samples: Samples, seed: int) -> None:
+        self.samples = samples
+        self.picker = torch.Generator().manual_seed(seed)
+
+    def grow(self, count: int) -> None:
+        """There are no more."""
+
+    def draw(self, count: int) -> Samples:
+        """``count`` of them."""
+        index = torch.randint(len(self.samples), (count,), generator=self.picker)
+        return self.samples.take(index.to(self.samples.x.device))
+
+
 @torch.no_grad()
 def positive_weight(loop: ClosedLoop, value: Field, samples: Samples) -> float:
     """What a positive residual should weigh where a negative one weighs 1: the root of `eps_hi / eps_lo`, within limits."""
@@ -150,11 +148,8 @@ def positive_weight(loop: ClosedLoop, value: Field, samples: Samples) -> float:
 def relative_excess(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples) -> float:
     """What the residual costs the Lagrangian bound on ``samples``, relative to `|E[V mu0]|`: the bound's part above
     `E[V mu0 - mu Q_u]`, for the best multiple of `mu`."""
-    generator = Generator.of(loop, samples)
-    V = generator.jet(value)
-    slack = generator.hjb_slack(V)
-    mu, outflow = generator.occupation_outflow(log_occupation)
-    terms = Terms(samples, V.value, mu * slack, samples.mu0 - outflow)
+    terms, slack, *_ = terms_on(Generator.of(loop, samples), value, log_occupation)
     hi, lo = float((-slack).max().clamp_min(0.0)), float(slack.max().clamp_min(0.0))
-    least = terms.lagrangian(minimiser(lambda s: terms.lagrangian(s, hi, lo), *MULTIPLES), hi, lo)
-    return (least + float(samples.mean(terms.spent))) / max(abs(float(samples.mean(V.value * samples.mu0))), 1e-30)
+    added = lambda t, scale: t.lagrangian(scale, hi, lo)
+    least = integral(samples, added(terms, best_multiple(terms, added)))
+    return (least + integral(samples, terms.spent)) / max(abs(integral(samples, terms.v * samples.mu0)), 1e-30)
