@@ -62,12 +62,14 @@ def _extremes(problem: Problem, states: Tensor, sign: float) -> Tensor:
 
 
 def _columns(problem: Problem, x: Tensor) -> Tensor:
-    """`f`, `a` and `B` as columns ``(N, 1 + d + d m)``; without those that are the same everywhere by definition."""
+    """`f`, `a`, `B` and the noise as columns ``(N, C)``; without those that are the same everywhere by definition."""
     columns = [problem.state_cost(x).unsqueeze(-1)]
     if not problem.driftless:
         columns.append(problem.drift(x))
     if type(problem).control_matrix is not Problem.control_matrix:
         columns.append(problem.control_matrix(x).flatten(1))
+    if type(problem).noise is not Problem.noise and (sigma := problem.noise(x)) is not None:
+        columns.append(sigma.flatten(1))
     return torch.cat(columns, dim=1)
 
 

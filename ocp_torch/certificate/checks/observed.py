@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -34,7 +35,7 @@ NOTICEABLE = 1e-5
 # A layer across which so much of the largest value changes within that length is to sampled states the same as a jump.
 LAYER, STEEP = 1e-4, 0.5
 
-CONTROLLER, DRIFT, MATRIX, LOOP = "controller", "drift", "control matrix", "closed loop"
+CONTROLLER, DRIFT, MATRIX, NOISE, LOOP = "controller", "drift", "control matrix", "noise", "closed loop"
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Jump:
 
     @property
     def in_problem(self) -> bool:
-        return self.what in (DRIFT, MATRIX)
+        return self.what in (DRIFT, MATRIX, NOISE)
 
     @property
     def verb(self) -> str:
@@ -101,6 +102,8 @@ def largest_jump(policy: Policy, dim: int, problem: Problem | None = None, near:
         functions[MATRIX] = lambda x: problem.control_matrix(x).flatten(1)
         if not problem.driftless:
             functions[DRIFT] = problem.drift
+        if problem.noisy:
+            functions[NOISE] = lambda x: cast(Tensor, problem.noise(x)).flatten(1)
     generator = fixed_generator()
     draw = partial(torch.rand, dtype=torch.float64, generator=generator)
     left = draw(SEGMENTS, dim)
@@ -136,7 +139,7 @@ def _largest(functions, sizes: dict[str, float], left: Tensor, right: Tensor, le
     """Of which function the change from ``left`` to ``right`` is largest for its size, if above ``least`` of it."""
     best, relative = Jump(0.0, left[0].remainder(1.0)), least
     # The data come first: what jumps in them jumps in the closed loop too.
-    for name in (n for n in (DRIFT, MATRIX, CONTROLLER, LOOP) if n in functions):
+    for name in (n for n in (DRIFT, MATRIX, NOISE, CONTROLLER, LOOP) if n in functions):
         change = (functions[name](right) - functions[name](left)).norm(dim=-1).nan_to_num(nan=0.0)
         worst = int(change.argmax())
         if float(change[worst]) > relative * sizes[name]:

@@ -38,6 +38,7 @@ class Enclosure:
     a: TaylorModel | None  # (N, d)
     B: TaylorModel  # (N, d, m)
     mu0: TaylorModel  # (N,)
+    noise: None = None
 
 
 def lipschitz_enclosure(problem: Problem, box: Box) -> Enclosure | None:

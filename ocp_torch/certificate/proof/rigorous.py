@@ -66,6 +66,8 @@ def obstacle(problem: Problem, value: Field) -> str | None:
     """Why there can be no rigorous bound for ``value`` on ``problem``; `None` where there can."""
     if problem.dim > MOST_DIMENSIONS:
         return f"cells cover the torus in at most {MOST_DIMENSIONS} dimensions, and this problem has {problem.dim}"
+    if problem.noisy:
+        return "there is noise, and the models of V have no second derivatives"
     if not is_known(value):
         return "V is not one of the package's own scalar networks"
     weights = [*value.parameters(), *value.buffers()]

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.control.policies import Policy, ValuePolicy
+from ocp_torch.maths.brownian import Grid, discounted, increments, path_integral
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.runge_kutta import Dynamics, Integrate, discounted_integral
 from ocp_torch.maths.seeds import fixed_generator
@@ -40,6 +41,8 @@ PIECE, PIECES, SETTLED = 5.0, 8, 1e-2
 DISCOUNTED, MOVED, FEWEST_STEPS, MOST_STEPS = 0.25, 0.1, 20, 150
 # The logarithm at which the growth of a density is cut off, so that it stays a number: e^60 is unbounded to any check.
 LARGEST_GROWTH = 60.0
+# Paths from each state where there is noise: more show a density that is too large for M more surely, and take longer.
+PATHS = 64
 # Of the states looked at, the highest are looked at again from close by.
 TOP, NEARBY = 6, 48
 # Ascents to the suprema of the a-priori bound, which is shown beside the density itself and decides nothing.
@@ -99,6 +102,9 @@ def backward_flow(problem: Problem, policy: Policy) -> Dynamics:
     Its discounted integral is `mu^u(x) = rho int e^{-rho t} mu0(y_t) exp(-int_0^t div g(y_s) ds) dt`, `y_0 = x`: the density
     of a flow changes by its divergence (the representation behind Proposition 8 of the paper). Valid for a Lipschitz loop.
     Differences of `g`, all in one call, are cheaper than derivatives of a controller that is a derivative itself.
+
+    With noise `dy = (2 div D - g) dt + sigma dW`, the density grows by `div div D - div g`, and `mu^u(x)` is the mean over
+    paths (Feynman and Kac, for the adjoint equation written out).
     """
 
     def backward(state: Tensor) -> tuple[Tensor, Tensor]:
@@ -108,13 +114,17 @@ def backward_flow(problem: Problem, policy: Policy) -> Dynamics:
         here, *moved = problem.velocity(around, policy(around)).chunk(len(moves) + 1)
         divergence = summed((g[:, i] - here[:, i]) / DIFFERENCE for i, g in enumerate(moved))
         motion = torch.cat([-here, -divergence.unsqueeze(-1)], dim=-1)
+        if problem.noisy:
+            div_D, div_div_D = problem.noise_divergences(y)
+            motion = motion + torch.cat([2.0 * div_D, div_div_D.unsqueeze(-1)], dim=-1)
         return motion, problem.initial_density(y) * log_factor.clamp_max(LARGEST_GROWTH).exp()
 
     return backward
 
 
 def settled_occupation(problem: Problem, policy: Policy, x: Tensor) -> Tensor:
-    """`mu^u` ``(N,)`` along the `backward_flow`, as far back as it takes; infinite where the past adds ever more.
+    """`mu^u` ``(N,)`` along the `backward_flow`, as far back as it takes; infinite where the past adds ever more. With
+    noise the mean over `PATHS` paths, less twice its standard error.
 
     Where the flow contracts nearly as fast as the discount forgets, the integral settles slowly, and geometrically: what
     is left is extrapolated from the last pieces.
@@ -125,11 +135,15 @@ def settled_occupation(problem: Problem, policy: Policy, x: Tensor) -> Tensor:
         speed = float(problem.velocity(x, policy(x)).norm(dim=-1).max())
     wanted = math.ceil(horizon * max(rho / DISCOUNTED, speed / MOVED))
     steps = int(min(MOST_STEPS, max(FEWEST_STEPS, wanted)))
-    state = torch.cat([x, x.new_zeros(len(x), 1)], dim=-1)
-    pieces: list[Tensor] = []
-    for _ in range(PIECES):
-        piece, state = discounted_integral(dynamics, state, rho, horizon, steps, wrap=False)
-        pieces.append(piece)
+    state, paths = torch.cat([x, x.new_zeros(len(x), 1)], dim=-1), PATHS if problem.noisy else 1
+    state, pieces = state.repeat_interleave(paths, dim=0), []
+    for k in range(PIECES):
+        if problem.noisy:
+            piece, state = _noisy_piece(problem, dynamics, state, horizon, steps, k)
+        else:
+            piece, state = discounted_integral(dynamics, state, rho, horizon, steps, wrap=False)
+        means = piece.unflatten(0, (len(x), paths))
+        pieces.append(means.mean(dim=1) - (2.0 / math.sqrt(paths) * means.std(dim=1) if problem.noisy else 0.0))
         # From here on the discount of the time that has passed is part of the factor.
         state = torch.cat([state[:, :-1].remainder(1.0), state[:, -1:] - PIECE], dim=-1)
         if bool((piece <= SETTLED * summed(pieces)).all()):
@@ -138,6 +152,16 @@ def settled_occupation(problem: Problem, policy: Policy, x: Tensor) -> Tensor:
     ratio = last / before.clamp_min(1e-300)
     rest = torch.where(ratio < 1.0, last * ratio / (1.0 - ratio), math.inf)
     return summed(pieces) + torch.where(last > SETTLED * summed(pieces), rest, 0.0)
+
+
+def _noisy_piece(
+    problem: Problem, dynamics: Dynamics, state: Tensor, horizon: float, steps: int, piece: int
+) -> tuple[Tensor, Tensor]:
+    """One piece of the integral along each path, and its end; noise moves all but the logarithm."""
+    sigma = lambda at: torch.nn.functional.pad(cast(Tensor, problem.noise(at[:, :-1])), (0, 0, 0, 1))
+    grid = Grid(torch.full_like(state[:, 0], horizon), steps, 1.0)
+    moves = increments(grid, sigma(state[:1]).shape[-1], 0, 0, piece)
+    return path_integral(dynamics, sigma, state, grid, moves, discounted(problem.discount))
 
 
 def estimated_sup_occupation(problem: Problem, policy: Policy, end_states: Tensor, states: int) -> float:
@@ -160,12 +184,13 @@ def estimated_sup_occupation(problem: Problem, policy: Policy, end_states: Tenso
 
 
 def a_priori_sup_occupation(problem: Problem, policy: Policy, points: Tensor) -> float | None:
-    r"""`sup mu^u <= rho sup mu0 / (rho - sup(-div g))` where that is positive, else `None`; both suprema as met at
+    r"""`sup mu^u <= rho sup mu0 / (rho - sup(div div D - div g))` where that is positive, else `None`; both suprema as met at
     ``points`` and climbed. For a Lipschitz closed loop only: contraction on a jump has no divergence to show it."""
     if not problem.gives_divergences:
         return None
     loop = ClosedLoop(problem, policy)
     largest = lambda function: supremum(function, points, ASCENTS, ASCENT_STEPS, differentiable=False).value
-    contraction = lambda x: -cast(Tensor, loop.drift_divergence(x))  # there is one: the problem gives divergences
+    spread = lambda x: problem.noise_divergences(x)[1] if problem.noisy else 0.0
+    contraction = lambda x: spread(x) - cast(Tensor, loop.drift_divergence(x))  # there is one: see above
     excess = problem.discount - max(0.0, largest(contraction))
     return problem.discount * largest(problem.initial_density) / excess if excess > 0.0 else None

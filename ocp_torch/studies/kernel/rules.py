@@ -31,6 +31,7 @@ class Datum(NamedTuple):
     mu0: np.ndarray  # (R,)
     div_B: Any  # (R, m); None where no rule reads them
     jets: Any  # (R, 1 + d, F); None without features
+    noise: Any = None
 
 
 def _scalar(jet: np.ndarray) -> Jet:
