@@ -1,7 +1,5 @@
 """Extragradient (stochastic mirror-prox, equations 18 and 19 of the paper) around any optimiser."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

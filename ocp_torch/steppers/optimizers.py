@@ -1,7 +1,5 @@
 """Optimisers and schedules by name: `torch.optim`'s, and SOAP from `pytorch_optimizer`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -75,10 +73,9 @@ def schedule_maker(
         if name == "decay":
             return StepLR(optimizer, step_size=period, gamma=factor)
         factors = {
-            "constant": lambda moved: 1.0,
             "power": lambda moved: (moved + 1.0) ** -exponent,
             "horizon": lambda moved: float(moves) ** -exponent,
         }
-        return LambdaLR(optimizer, factors[name])
+        return LambdaLR(optimizer, factors.get(name, lambda moved: 1.0))
 
     return make

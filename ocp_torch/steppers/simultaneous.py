@@ -1,7 +1,5 @@
 """Simultaneous gradient steps: every player moves at once, from the same point and the same samples."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from ocp_torch.objectives.phase import Phase
