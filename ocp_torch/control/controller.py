@@ -1,10 +1,8 @@
 """A trained controller as a function of the state, and as a file."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import overload
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +17,11 @@ from ocp_torch.problems.constants import Constants
 
 # Of `controller.safetensors`; raised when an older version could not read what is written.
 SCHEMA = 1
+# What the file holds of a controller just as it is.
+PLAIN = ("model", "occupation", "kind", "certificate", "config")
+
+# What controls are given as: as what the states were.
+States = TypeVar("States", Tensor, np.ndarray)
 
 
 @dataclass
@@ -42,11 +45,7 @@ class Controller:
         self._policy = trained_policies(self.occupation, self.problem, self.fields, self.constants)[self.kind]
         self._like = next(self.fields.parameters())
 
-    @overload
-    def __call__(self, x: Tensor) -> Tensor: ...
-    @overload
-    def __call__(self, x: np.ndarray) -> np.ndarray: ...
-    def __call__(self, x: Tensor | np.ndarray) -> Tensor | np.ndarray:
+    def __call__(self, x: States) -> States:
         """Controls ``(N, m)`` at states ``(N, d)``: any reals, wrapped to the torus; NumPy in gives NumPy out.
 
         Raises `InputError` for another shape.
@@ -68,12 +67,8 @@ class Controller:
             "problem": {"name": problem_name(self.problem), "parameters": plain_parameters(self.problem.parameters)},
             "dtype": str(self._like.dtype).removeprefix("torch."),
             "fields": list(self.fields.networks),
-            "model": self.model,
             "bounds": asdict(self.constants),
-            "occupation": self.occupation,
-            "kind": self.kind,
-            "certificate": self.certificate,
-            "config": self.config,
+            **{name: getattr(self, name) for name in PLAIN},
         }
         save_tensors(Path(path), dict(self.fields.state_dict()), metadata)
 

@@ -1,12 +1,10 @@
 """A saved controller, made again from its file, of which nothing is run and nothing is believed that it does not hold."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch
 
-from ocp_torch.control.controller import SCHEMA, Controller, plain_parameters, problem_name
+from ocp_torch.control.controller import PLAIN, SCHEMA, Controller, plain_parameters, problem_name
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE
 from ocp_torch.errors import InputError, notes
 from ocp_torch.fields import MODELS, Fields
@@ -67,10 +65,11 @@ def _rebuilt(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
             f"{path} names the fields {names!r:.80}, but must name some of {', '.join(FIELDS)}, each once."
         )
     require_held(path, model, sum(t.numel() for t in tensors.values()))
-    options = {k: v for k, v in model.items() if k != "name"}
     if model["name"] not in MODELS:
         raise InputError(f"{path} names the unknown model {model['name']!r}; known are {', '.join(MODELS)}.")
-    build = lambda: _blank(problem, names, MODELS[model["name"]], options)
+    network, options = MODELS[model["name"]], {k: v for k, v in model.items() if k != "name"}
+    outputs = {CONTROL_DENSITY: problem.control_dim}  # the other fields are scalar
+    build = lambda: Fields({n: network(dim=problem.dim, outputs=outputs.get(n), **options) for n in names})
     with torch.device("meta"):
         # Shapes first, without memory: a crafted size must not be allocated before it is refused.
         shapes = {name: tuple(t.shape) for name, t in build().state_dict().items()}
@@ -94,16 +93,7 @@ def _rebuilt(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
     fields.load_state_dict(tensors)
     fields = fields.to(device).requires_grad_(False)
     constants = Constants(**{**metadata["bounds"], "warnings": notes(metadata["bounds"]["warnings"])})
-    return Controller(
-        problem=problem,
-        fields=fields,
-        constants=constants,
-        occupation=metadata["occupation"],
-        kind=metadata["kind"],
-        model=model,
-        certificate=metadata["certificate"],
-        config=metadata["config"],
-    )
+    return Controller(problem, fields, constants, **{name: metadata[name] for name in PLAIN})
 
 
 def _section(saved: dict, config: dict) -> dict:
@@ -111,9 +101,8 @@ def _section(saved: dict, config: dict) -> dict:
     section = current_section(config.get("problem"))
     target = str(section.get("_target_")) if isinstance(section, dict) else ""
     name = str(current_name(saved["name"], config.get("problem")))
-    if target.rpartition(".")[2].lower() == name.rpartition(".")[2]:
-        return section
-    return saved["parameters"]
+    same = target.rpartition(".")[2].lower() == name.rpartition(".")[2]
+    return section if same else saved["parameters"]
 
 
 def _require_same_arguments(path: Path, problem: Problem, saved: dict) -> None:
@@ -125,12 +114,6 @@ def _require_same_arguments(path: Path, problem: Problem, saved: dict) -> None:
                 f"problem.{name} is {given[name]!r}, but the run of {path} has {repr(saved[name])[:80]}; a controller is "
                 "loaded with the problem it was trained for."
             )
-
-
-def _blank(problem: Problem, names: list[str], network: type, options: dict) -> Fields:
-    """Fields to load a state into, on whatever device is the default."""
-    outputs = {"value": None, "control_density": problem.control_dim, "log_occupation": None}
-    return Fields({n: network(dim=problem.dim, outputs=outputs[n], **options) for n in names})
 
 
 def _require_run(path: Path, certificate: object, config: object) -> None:
