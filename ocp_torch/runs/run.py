@@ -19,9 +19,9 @@ from ocp_torch.runs.metrics import write_metrics
 from ocp_torch.runs.resume import result_of
 from ocp_torch.runs.training_run import TrainingRun
 from ocp_torch.training.checkpoint import LAST
-from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.monitor import Monitor
 from ocp_torch.training.signals import Signals
+from ocp_torch.training.state import seed_generators
 from ocp_torch.training.stopping import TARGET_GAP, postpone
 from ocp_torch.training.trainer import Trainer
 

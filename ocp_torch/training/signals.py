@@ -1,7 +1,5 @@
 """SIGTERM and Ctrl-C: the first lets the step in hand finish and the state be saved, the second stops at once."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading
@@ -32,7 +30,7 @@ class Signals:
         self.saved = False
         self._before: dict = {}
 
-    def __enter__(self) -> Signals:
+    def __enter__(self) -> "Signals":
         # Only the main thread may; elsewhere whoever runs this decides what a signal does.
         if threading.current_thread() is threading.main_thread():
             self._before = {number: signal.signal(number, self._caught) for number in CAUGHT}

@@ -1,10 +1,7 @@
 """Why a run stops, and what a user is told of it."""
 
-from __future__ import annotations
-
 from ocp_torch.certificate import Certificate
-from ocp_torch.training.rounds import Rounds
-from ocp_torch.training.settings import TrainerSettings
+from ocp_torch.training.settings import Rounds, TrainerSettings
 from ocp_torch.training.state import TrainState
 
 STEPS, TARGET_GAP, MAX_SECONDS = "steps", "target_gap", "max_seconds"
@@ -29,10 +26,8 @@ def in_words(reason: str, settings: TrainerSettings, rounds: Rounds, state: Trai
         return f"trainer.max_seconds = {settings.max_seconds:g} are over, at {at} of {rounds.end(state.round):,}"
     if reason == TARGET_GAP:
         return f"a quick evaluation at {at} finds trainer.target_gap = {settings.target_gap:g} reached"
-    more = state.round + 1 < rounds.most
-    return f"all {state.step:,} steps are done" + (
-        f", and trainer.good_gap = {settings.good_gap:g} is met" if more else ""
-    )
+    met = f", and trainer.good_gap = {settings.good_gap:g} is met" if state.round + 1 < rounds.most else ""
+    return f"all {state.step:,} steps are done{met}"
 
 
 def may_be_reached(settings: TrainerSettings, state: TrainState, certificate: Certificate) -> bool:

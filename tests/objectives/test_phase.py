@@ -9,7 +9,7 @@ import torch
 from ocp_torch.objectives import Phase
 from ocp_torch.problems.samples import Samples
 from ocp_torch.training.monitor import Silent
-from ocp_torch.training.rounds import Rounds
+from ocp_torch.training.settings import Rounds
 from support.bits import differences
 from support.small import METHODS, small
 
