@@ -2,9 +2,8 @@
 
 import torch
 
-from ocp_torch.fields.fields import Fields
-from ocp_torch.objectives.objective import Objective
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.fields import Fields
+from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems.samples import Samples
 
 DATA = {"f": "the state cost", "a": "the drift", "B": "the control matrix", "mu0": "the initial density"}

@@ -15,5 +15,4 @@ class Simultaneous(Stepper):
         losses, norms = self._differentiate(samples, phase)
         counted = self._parameters()
         self._update(losses)
-        self._advance_schedules(losses)
         return StepReport(losses, norms, batches, counted)

@@ -13,9 +13,8 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from ocp_torch.errors import InputError
-from ocp_torch.fields.fields import Fields
-from ocp_torch.objectives.objective import Objective
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.fields import Fields
+from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM, NonFiniteError, first_nonfinite
 
@@ -63,8 +62,8 @@ class Stepper(ABC):
         self.fields, self.objective, self.radius, self.clip, self.unit = fields, objective, radius, clip, unit
         self.parameters: dict[str, list[Any]] = {p: fields.parameters_of(n) for p, n in objective.players.items()}
         self.optimizers = {player: optimizers[player](own) for player, own in self.parameters.items()}
-        delays = objective.delays
-        self.schedules = {p: schedule(optimizer, delays.get(p, 0.0)) for p, optimizer in self.optimizers.items()}
+        self.delays = {player: objective.delays.get(player, 0.0) for player in objective.players}
+        self.schedules = {player: schedule(o, self.delays[player]) for player, o in self.optimizers.items()}
         self._start = copy.deepcopy(self.state_dict())
 
     @abstractmethod
@@ -129,17 +128,15 @@ class Stepper(ABC):
                 torch.nn.utils.clip_grads_with_norm_(self.parameters[player], self.clip, norm)
         return {player: loss.detach() for player, loss in losses.items()}, norms
 
-    def _update(self, players: Iterable[str]) -> None:
-        """One update of ``players`` with the gradients in place, then the projection."""
+    def _update(self, players: Iterable[str], ahead: bool = False) -> None:
+        """One update of ``players`` with the gradients in place, then the projection. A player's schedule counts its own
+        moves, but not those that only look ``ahead``."""
         for player in players:
             self.optimizers[player].step()
             if self.radius is not None:
                 project_on_ball(self.parameters[player], self.radius)
-
-    def _advance_schedules(self, players: Iterable[str]) -> None:
-        """A player's schedule counts its own moves."""
-        for player in players:
-            self.schedules[player].step()
+            if not ahead:
+                self.schedules[player].step()
 
 
 @torch.no_grad()

@@ -78,12 +78,8 @@ class Monitor(Silent):
         violation = trainer.objective.diagnostics(trainer.fields, batch)
         if "residual_mean_absolute" not in violation and trainer.fields.control_density is not None:
             violation |= liouville_residual(trainer, batch)
-        moves: dict[str, dict] = {
-            "loss": report.losses,
-            "gradient_norm": report.gradient_norms,
-            "lr": trainer.stepper.learning_rates(),
-        }
-        for group, values in {**moves, "violation": violation}.items():
+        shown: dict[str, dict] = {"loss": report.losses, "gradient_norm": report.gradient_norms, "violation": violation}
+        for group, values in {**shown, "lr": trainer.stepper.learning_rates()}.items():
             for name, value in values.items():
                 self.writer.add_scalar(f"{group}/{name}", float(value), step)
         now, (then, before) = time.perf_counter(), self._mark
@@ -119,10 +115,6 @@ class Monitor(Silent):
         log.info("%s; the certificate is next%s", why.rstrip("."), rest)
         self.bar.refresh()
         self.stages.begin(seconds)
-
-    def certifying(self, stage: str) -> None:
-        """A stage of the certificate begins."""
-        self.stages(f"certifying: {stage}")
 
     def finish(self, certificate: Certificate, figures: dict, settings: dict, step: int) -> None:
         """The last points: all numbers of ``certificate``, the Matplotlib ``figures`` by name, and the run's ``settings``,
@@ -169,7 +161,7 @@ class Stages:
 
     def __init__(self, hidden: bool | None) -> None:
         self._hidden = hidden
-        self._clock: Any = None  # the bar, once something has begun
+        self._clock: Any = None  # the bar, once the first has begun
         self._over = threading.Event()
 
     def begin(self, seconds: float | None) -> None:
@@ -181,8 +173,6 @@ class Stages:
         self._clock.set_postfix_str(f"about {in_words(seconds)} in all" if seconds else "", refresh=False)
 
     def __call__(self, stage: str) -> None:
-        if self._clock is None:
-            self.begin(None)
         self._clock.set_description_str(stage)
         log.log(logging.INFO if self._clock.disable else logging.DEBUG, "%s ...", stage)
 

@@ -87,9 +87,8 @@ class TrainState:
             _require_weights(self.fields, saved["watch"]["fields"])
         moves = None
         if rates_of(saved["config"]) != rates_of(self.config):
-            self.round, objective = rounds.at(self.step), self.stepper.objective
-            delays = {player: objective.delays.get(player, 0.0) for player in objective.players}
-            moves = {player: rounds.moves(self.step, self.round, delay) for player, delay in delays.items()}
+            self.round = rounds.at(self.step)
+            moves = {player: rounds.moves(self.step, self.round, d) for player, d in self.stepper.delays.items()}
         self.stepper.load_state_dict(saved["stepper"], moves=moves)
         self.batches.load_state_dict(saved["batches"])
         self.health.load_state_dict(saved["watch"])

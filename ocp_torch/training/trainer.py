@@ -22,9 +22,8 @@ from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.health import Evaluation, sanity_warnings
 from ocp_torch.training.observer import Silent
 from ocp_torch.training.settings import Rounds, TrainerSettings
-from ocp_torch.training.signals import Signals
 from ocp_torch.training.state import TrainState
-from ocp_torch.training.stopping import STEPS, in_words, may_be_reached, reason_to_stop
+from ocp_torch.training.stopping import STEPS, Signals, in_words, may_be_reached, reason_to_stop
 
 
 @dataclass(eq=False)
@@ -72,7 +71,7 @@ class Trainer:
 
     @property
     def end(self) -> int:
-        """The number of steps after which the present round is over."""
+        """Of the present round."""
         return self.rounds.end(self.state.round)
 
     @property
