@@ -1,4 +1,4 @@
-"""The trainer's own settings, validated where they are made, and the rounds of steps that they allow."""
+"""The trainer's own settings, validated where they are made, and the rounds of steps that follow from them."""
 
 import math
 from dataclasses import dataclass
@@ -61,30 +61,22 @@ class TrainerSettings:
         available = "cuda" if torch.cuda.is_available() else "cpu"
         return torch.device(available if self.device == "auto" else self.device)
 
-
-@dataclass(frozen=True)
-class Rounds:
-    """Round `k` (from 0) has `2^k` times as many steps as the first, which has ``length``; there are ``most`` at most."""
-
-    length: int
-    most: int
-
     def end(self, k: int) -> int:
-        """The number of steps after which round ``k`` is over."""
-        return self.length * (2 ** (k + 1) - 1)
+        """The number of steps after which round ``k`` (from 0), which has `2^k` times as many as the first, is over."""
+        return self.steps * (2 ** (k + 1) - 1)
 
-    def progress(self, step: int, k: int) -> float:
+    def part_done(self, step: int, k: int) -> float:
         """The part of round ``k`` that is done after ``step`` steps."""
-        return 1.0 - (self.end(k) - step) / (self.length * 2**k)
+        return 1.0 - (self.end(k) - step) / (self.steps * 2**k)
 
-    def at(self, step: int) -> int:
+    def round_at(self, step: int) -> int:
         """The round that a run is in after ``step`` steps."""
-        return next((k for k in range(self.most - 1) if step < self.end(k)), self.most - 1)
+        return next((k for k in range(self.rounds - 1) if step < self.end(k)), self.rounds - 1)
 
     def moves(self, step: int, k: int, delay: float) -> int:
         """How often a player has moved after ``step`` steps, in round ``k``, that waits for the part ``delay`` of each."""
         count = 0
         for j in range(k + 1):
-            length = self.length * 2**j
+            length = self.steps * 2**j
             count += max(0, min(length, step - self.end(j - 1)) - math.ceil(delay * length))
         return count

@@ -15,7 +15,7 @@ from ocp_torch.problems.constants import Constants
 from ocp_torch.steppers import Average, NonFiniteError, Stepper
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.health import Health
-from ocp_torch.training.settings import Rounds
+from ocp_torch.training.settings import TrainerSettings
 
 # What decides the learning rates: where one of these differs at a resume, they are those of the new configuration.
 rates_of = lambda config: (config["optimizer"], config["schedule"], config["trainer"]["steps"])
@@ -59,10 +59,10 @@ class TrainState:
             "generators": generator_states(),
         }
 
-    def load_state_dict(self, saved: dict, rounds: Rounds) -> None:
+    def load_state_dict(self, saved: dict, settings: TrainerSettings) -> None:
         """The way back from `state_dict`: with the same configuration the run goes on to the same bits.
 
-        With another `optimizer`, `schedule` or `trainer.steps` the run is taken as one of these ``rounds``: its round, warm
+        With another `optimizer`, `schedule` or `trainer.steps` the run is taken as one of these ``settings``: its round, warm
         start and learning rates are those such a run would have at this step. Raises `InputError` for a state of another
         problem or method, or weights that are none; a state that does not fit raises whatever its odd part leads to.
         """
@@ -87,8 +87,8 @@ class TrainState:
             _require_weights(self.fields, saved["watch"]["fields"])
         moves = None
         if rates_of(saved["config"]) != rates_of(self.config):
-            self.round = rounds.at(self.step)
-            moves = {player: rounds.moves(self.step, self.round, d) for player, d in self.stepper.delays.items()}
+            self.round = settings.round_at(self.step)
+            moves = {player: settings.moves(self.step, self.round, d) for player, d in self.stepper.delays.items()}
         self.stepper.load_state_dict(saved["stepper"], moves=moves)
         self.batches.load_state_dict(saved["batches"])
         self.health.load_state_dict(saved["watch"])

@@ -6,8 +6,7 @@ import signal
 import threading
 from types import FrameType
 
-from ocp_torch.certificate import Certificate
-from ocp_torch.training.settings import Rounds, TrainerSettings
+from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.state import TrainState
 
 STEPS, TARGET_GAP, MAX_SECONDS = "steps", "target_gap", "max_seconds"
@@ -26,21 +25,15 @@ def reason_to_stop(settings: TrainerSettings, state: TrainState) -> str | None:
     return MAX_SECONDS if limit is not None and state.elapsed >= limit else None
 
 
-def in_words(reason: str, settings: TrainerSettings, rounds: Rounds, state: TrainState) -> str:
+def in_words(reason: str, settings: TrainerSettings, state: TrainState) -> str:
     """``reason`` as a user is told."""
     at = f"step {state.step:,}"
     if reason == MAX_SECONDS:
-        return f"trainer.max_seconds = {settings.max_seconds:g} are over, at {at} of {rounds.end(state.round):,}"
+        return f"trainer.max_seconds = {settings.max_seconds:g} are over, at {at} of {settings.end(state.round):,}"
     if reason == TARGET_GAP:
         return f"a quick evaluation at {at} finds trainer.target_gap = {settings.target_gap:g} reached"
-    met = f", and trainer.good_gap = {settings.good_gap:g} is met" if state.round + 1 < rounds.most else ""
+    met = f", and trainer.good_gap = {settings.good_gap:g} is met" if state.round + 1 < settings.rounds else ""
     return f"all {state.step:,} steps are done{met}"
-
-
-def may_be_reached(settings: TrainerSettings, state: TrainState, certificate: Certificate) -> bool:
-    """Whether the quick ``certificate`` has the target gap, and enough steps were taken since the last try."""
-    target, gap = settings.target_gap, certificate.plain_gap
-    return target is not None and gap is not None and gap <= target and state.step >= state.retry
 
 
 def postpone(state: TrainState) -> None:

@@ -21,9 +21,9 @@ from ocp_torch.training.checkpoint import BEST, load_checkpoint, save_checkpoint
 from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.health import Evaluation, sanity_warnings
 from ocp_torch.training.observer import Silent
-from ocp_torch.training.settings import Rounds, TrainerSettings
+from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.state import TrainState
-from ocp_torch.training.stopping import STEPS, Signals, in_words, may_be_reached, reason_to_stop
+from ocp_torch.training.stopping import STEPS, Signals, in_words, reason_to_stop
 
 
 @dataclass(eq=False)
@@ -40,10 +40,9 @@ class Trainer:
     stopped: str = STEPS  # why
 
     def __post_init__(self) -> None:
-        state, settings = self.state, self.settings
+        state = self.state
         self.fields, self.stepper, self.batches = state.fields, state.stepper, state.batches
         self.health, self.names, self.config = state.health, state.names, state.config
-        self.rounds = Rounds(settings.steps, settings.rounds)
         self.trained = Trained(state.average.module, self.objective.occupation, self.network)
         self.evaluator = Evaluator(self.problem, self.trained, state)
 
@@ -72,12 +71,12 @@ class Trainer:
     @property
     def end(self) -> int:
         """Of the present round."""
-        return self.rounds.end(self.state.round)
+        return self.settings.end(self.state.round)
 
     @property
     def phase(self) -> Phase:
         """What the next step's losses may know of time."""
-        return Phase(self.constants, self.rounds.progress(self.step, self.state.round))
+        return Phase(self.constants, self.settings.part_done(self.step, self.state.round))
 
     def fit(self, monitor: Silent, checkpoint: Path | None = None, signals: Signals | None = None) -> str:
         """Train until there is a reason to stop, and return it; save to ``checkpoint`` on the way and at the end.
@@ -106,7 +105,7 @@ class Trainer:
     @property
     def why_stopped(self) -> str:
         """The reason for which `fit` stopped, in words."""
-        return in_words(self.stopped, self.settings, self.rounds, self.state)
+        return in_words(self.stopped, self.settings, self.state)
 
     def _advance(self, monitor: Silent, checkpoint: Path | None) -> None:
         """One step, and what is due after it."""
@@ -140,13 +139,15 @@ class Trainer:
         found = sanity_warnings(self.problem, self.constants, certificate, self.seed) if tell else []
         for sentence in self.health.doubts(self.step, certificate.contradiction, found):
             monitor.noticed(sentence)
-        self.state.pending = may_be_reached(self.settings, self.state, certificate)
+        target, gap = self.settings.target_gap, certificate.plain_gap
+        tried = self.step < self.state.retry  # too short a time ago
+        self.state.pending = target is not None and gap is not None and gap <= target and not tried
         if best and checkpoint is not None:
             save_checkpoint(checkpoint.with_name(BEST), self.state_dict())
 
     def _wants_another_round(self) -> bool:
         """Whether rounds are left and the gap is not good yet; never without both bounds to measure it by."""
-        more = self.state.round + 1 < self.rounds.most
+        more = self.state.round + 1 < self.settings.rounds
         if not more or self.fields.value is None or not self.problem.has_simulator:
             return False
         gap = self.evaluator.evaluate(self.run).plain_gap
@@ -174,11 +175,11 @@ class Trainer:
         """
         try:
             state = load_checkpoint(checkpoint) if state is None else state
-            self.state.load_state_dict(state, self.rounds)
+            self.state.load_state_dict(state, self.settings)
             with suppress(NonFiniteError):  # the run itself will say so
                 # One step of all players for nothing shows whether their optimisers can work with what they were given.
                 advance(self.stepper, self.state.average, self.batches.draw, replace(self.phase, progress=1.0))
-            self.state.load_state_dict(state, self.rounds)
+            self.state.load_state_dict(state, self.settings)
             self.evaluator.latest = None  # what was seen of another state at the same step says nothing
         except Exception as error:  # a crafted state raises whatever its odd part leads to
             if isinstance(error, InputError):
