@@ -10,7 +10,7 @@ from torch import Tensor
 from ocp_torch.certificate import Certificate
 from ocp_torch.certificate.estimate import known
 from ocp_torch.errors import notes
-from ocp_torch.fields.fields import typical_sizes
+from ocp_torch.fields.fields import Fields, typical_sizes
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
@@ -84,9 +84,7 @@ class Health:
         (mean, spread), _ = typical_sizes(problem)
         return cls(unit=abs(mean) + spread)
 
-    def evaluated(
-        self, evaluation: Evaluation, fields: torch.nn.Module, certificate: Certificate | None = None
-    ) -> bool:
+    def evaluated(self, evaluation: Evaluation, fields: Fields, certificate: Certificate | None = None) -> bool:
         """Take note of an evaluation of ``fields``; whether it is the best so far."""
         if not evaluation.better_than(self.best):
             return False

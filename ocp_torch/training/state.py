@@ -97,11 +97,9 @@ class TrainState:
 
     def require_finite(self) -> None:
         """Raise `NonFiniteError` where a weight is not finite: such a state is neither evaluated nor saved."""
-        bad = [name for name, parameter in self.fields.named_parameters() if not parameter.isfinite().all()]
-        if bad:
-            raise NonFiniteError(
-                f"the weights of {bad[0]} are not finite; try a smaller optimizer.lr, or stepper.clip."
-            )
+        name = next((n for n, parameter in self.fields.named_parameters() if not parameter.isfinite().all()), None)
+        if name is not None:
+            raise NonFiniteError(f"the weights of {name} are not finite; try a smaller optimizer.lr, or stepper.clip.")
 
 
 def _require_weights(module: torch.nn.Module, weights: dict) -> None:
