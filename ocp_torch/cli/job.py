@@ -28,7 +28,7 @@ from ocp_torch.cli.outcome import Record, fail, failed
 from ocp_torch.errors import InputError
 from ocp_torch.problems.blame import blamed
 from ocp_torch.problems.commands import quoted
-from ocp_torch.training.signals import Preempted
+from ocp_torch.training.stopping import Preempted
 
 log = logging.getLogger(__name__)
 

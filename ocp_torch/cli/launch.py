@@ -19,7 +19,7 @@ from ocp_torch.cli.sweeps import check_sweep
 from ocp_torch.errors import InputError
 from ocp_torch.files.reading import require_unlinked
 from ocp_torch.problems.commands import ForeignProblem
-from ocp_torch.training.signals import Preempted
+from ocp_torch.training.stopping import Preempted
 
 __all__ = ["CHECKOUT", "CONFIGS", "composed", "fail", "isolated", "job", "known_fields", "launch", "register_resolvers"]
 

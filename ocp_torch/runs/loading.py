@@ -10,8 +10,7 @@ from pathlib import Path
 
 import torch
 
-from ocp_torch.control.controller import Controller, problem_name
-from ocp_torch.control.loading import load_controller
+from ocp_torch.control.controller import Controller, load_controller, problem_name
 from ocp_torch.errors import InputError, nearest
 from ocp_torch.files.reading import FOLDER, kind, require_file
 from ocp_torch.problems import PROBLEMS, Problem

@@ -19,10 +19,9 @@ from ocp_torch.runs.metrics import write_metrics
 from ocp_torch.runs.resume import result_of
 from ocp_torch.runs.training_run import TrainingRun
 from ocp_torch.training.checkpoint import LAST
-from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.monitor import Monitor
-from ocp_torch.training.signals import Signals
-from ocp_torch.training.stopping import TARGET_GAP, postpone
+from ocp_torch.training.state import seed_generators
+from ocp_torch.training.stopping import TARGET_GAP, Signals, postpone
 from ocp_torch.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -64,7 +63,7 @@ def run_to_end(trainer: Trainer, certificate_settings: CertificateSettings, fold
     log.info(summary(trainer))
     try:
         with Signals() as signals, Monitor(folder, trainer) as monitor:
-            trainer.tell, failure = monitor.certifying, None
+            trainer.tell, failure = lambda stage: monitor.stages(f"certifying: {stage}"), None
             try:
                 certificate, fields = _trained(trainer, certificate_settings, monitor, last, signals)
             except (Exception, SystemExit) as error:

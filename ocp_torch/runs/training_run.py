@@ -14,7 +14,7 @@ from ocp_torch.files.limits import require_held
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.runs.configuration import load_state
 from ocp_torch.runs.resume import filled_from, require_same_run
-from ocp_torch.training.generators import seed_generators
+from ocp_torch.training.state import seed_generators
 from ocp_torch.training.trainer import Trainer
 
 

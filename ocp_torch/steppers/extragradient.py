@@ -1,7 +1,5 @@
 """Extragradient (stochastic mirror-prox, equations 18 and 19 of the paper) around any optimiser."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch
@@ -23,8 +21,8 @@ class Extragradient(Stepper):
     def step(self, batches: Sequence[Samples], phase: Phase) -> StepReport:
         first, second = batches
         origin = self._parameters()
-        ahead, _ = self._differentiate(first, phase)
-        self._update(ahead)
+        players, _ = self._differentiate(first, phase)
+        self._update(players, ahead=True)
         counted = self._parameters()
         try:
             losses, norms = self._differentiate(second, phase)
@@ -33,5 +31,4 @@ class Extragradient(Stepper):
             with torch.no_grad():
                 torch._foreach_copy_(list(self.fields.parameters()), origin)
         self._update(losses)
-        self._advance_schedules(losses)
         return StepReport(losses, norms, batches, counted)

@@ -1,7 +1,5 @@
 """Simultaneous gradient steps: every player moves at once, from the same point and the same samples."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from ocp_torch.objectives.phase import Phase
@@ -17,5 +15,4 @@ class Simultaneous(Stepper):
         losses, norms = self._differentiate(samples, phase)
         counted = self._parameters()
         self._update(losses)
-        self._advance_schedules(losses)
         return StepReport(losses, norms, batches, counted)

@@ -31,7 +31,6 @@ class Alternating(Stepper):
             if player in all_losses:
                 losses[player], norms[player] = all_losses[player], all_norms[player]
                 self._update([player])
-                self._advance_schedules([player])
         return StepReport(losses, norms, batches, counted)
 
 

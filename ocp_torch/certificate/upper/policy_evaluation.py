@@ -22,7 +22,7 @@ from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import advance, short_fit
-from ocp_torch.steppers.optimizers import LARGEST_RATE
+from ocp_torch.steppers.fitting import LARGEST_RATE
 
 # The closed loop's data are computed once on so many states at most: their divergences cost more than a step.
 POOL = 2**16
