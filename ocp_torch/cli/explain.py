@@ -1,7 +1,5 @@
 """Hydra's and OmegaConf's own words as one sentence, with what would be right."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from functools import cache
@@ -60,8 +58,7 @@ def choices(group: str) -> list[str]:
 
 def field_hint(field: str, config_name: str, overrides: Iterable[str]) -> str:
     """A bracket with the nearest field of the chosen groups, or, where none is near, with all that the group has."""
-    chosen = tuple(o for o in overrides if is_choice(o))
-    known = known_fields(config_name, chosen)
+    known = known_fields(config_name, tuple(o for o in overrides if is_choice(o)))
     group, _, last = field.rpartition(".")
     below = [k.removeprefix(f"{group}.") for k in known if group and k.startswith(f"{group}.")]
     names = sorted(n for n in below if "." not in n and not n.startswith("_"))

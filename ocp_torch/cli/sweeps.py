@@ -1,18 +1,14 @@
 """A sweep is refused before its first job where a job of it could never run."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
-from ocp_torch.cli.compose import configuration, parsed, plain, run_data
+from ocp_torch.cli.compose import configuration, parsed, require_places, run_data
 from ocp_torch.cli.explain import explain, is_choice
-from ocp_torch.cli.required import require_places
 from ocp_torch.errors import InputError, require_flag, require_section, shown
 
 MOST_TRIED = 8  # jobs of a sweep that are tried for one value
@@ -32,38 +28,26 @@ def check_sweep(config_name: str, overrides: list[str], check: Callable[[dict], 
         first = [o for o in next(job for job in options if one in job) if not _is_hydras(o)]
         chosen = [o for o in first if is_choice(o) or o.lstrip("+").startswith("problem._target_=")]
         if (key := tuple(chosen)) not in defaults:
-            defaults[key] = _data(config_name, chosen, whole=False)
-        require_kinds(_data(config_name, first), defaults[key])
+            defaults[key] = configuration(config_name, chosen, whole=False)[1]
+        require_kinds(configuration(config_name, first)[1], defaults[key])
     ours = [[o for o in job if not _is_hydras(o)] for job in options]
     for one in representatives(parsed(overrides)):
         jobs = [job for job in ours if one in job][:MOST_TRIED]
-        require_one([partial(_checked_job, check, config_name, job) for job in jobs])
+        refusals: list[InputError] = []
+        for job in jobs:
+            try:
+                check(run_data(configuration(config_name, job)[1], job))
+                break
+            except InputError as error:
+                refusals.append(error)
+        if jobs and len(refusals) == len(jobs):
+            raise refusals[0]
     # Hydra's own settings are the same for every job.
-    configuration(config_name, [o for o in options[0] if _is_hydras(o)])
+    configuration(config_name, [o for o in options[0] if _is_hydras(o)], whole=False)
 
 
 def _is_hydras(override: str) -> bool:
     return override.startswith(("hydra.", "hydra/"))
-
-
-def _data(config_name: str, overrides: list[str], whole: bool = True) -> dict:
-    return plain(configuration(config_name, overrides), config_name, overrides, whole)
-
-
-def _checked_job(check: Callable[[dict], object], config_name: str, overrides: list[str]) -> None:
-    check(run_data(_data(config_name, overrides), overrides))
-
-
-def require_one(tries: list[Callable[[], None]]) -> None:
-    """Raise the `InputError` of the first of ``tries`` if all of them raise one."""
-    first: InputError | None = None
-    for attempt in tries:
-        try:
-            return attempt()
-        except InputError as error:
-            first = first or error
-    if first is not None:
-        raise first
 
 
 def representatives(overrides: list[Override]) -> list[str]:

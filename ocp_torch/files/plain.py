@@ -1,27 +1,28 @@
-"""JSON, YAML and what comes out of them as plain data of a bounded size: words, numbers, lists and groups, and nothing else.
+"""JSON and YAML texts from strangers become plain data of a bounded size: words, numbers, lists and groups, nothing else.
 
-Texts may come from strangers. Nothing in them is run, looked up elsewhere or unfolded; what is not plain is `NotPlain`.
+Nothing in a text is run, fetched from elsewhere, or unfolded to more than is written there. `NotPlain` says what is wrong.
 """
-
-from __future__ import annotations
 
 import json
 import math
 import re
+from typing import Any
 
 import yaml
 from torch import Tensor
 
-# More than any certificate, controller or configuration holds: values, levels, digits, bits, characters.
-MOST_VALUES, MOST_OF_YAML, DEEPEST, LONGEST_NUMBER, MOST_BITS, LONGEST_SCALAR = 2**21, 2**17, 32, 64, 128, 2**13
-# A value that stands for another one of the same file, a.b: the only kind of interpolation that is looked up for a file.
+# No certificate, controller or configuration holds more values; of these in YAML, more; or deeper nested ones.
+MOST_VALUES, MOST_OF_YAML, DEEPEST = 2**21, 2**17, 32
+# Signs of a number in JSON, bits of a whole number, and characters of a value in YAML, at most.
+LONGEST_NUMBER, MOST_BITS, LONGEST_SCALAR = 64, 128, 2**13
+# `${a.b}`, a value that stands for the one at a.b of the same file; such a value may stand for a third one, and so on.
 REFERENCE, MOST_STEPS = re.compile(r"\$\{([A-Za-z_]\w*(?:\.\w+)*)\}"), 8
-# libyaml's parser where PyYAML has it: ten times as fast.
+# The parser of the C library, where PyYAML has it, is ten times as fast.
 YAML = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class NotPlain(ValueError):
-    """What a file holds is not the plain data it should be; the message ends a sentence that begins with its name."""
+    """What a file holds is not the plain data it should be; the message is to follow the name of the file and a colon."""
 
 
 def json_object(text: str) -> dict:
@@ -41,8 +42,7 @@ def json_object(text: str) -> dict:
 
 
 def yaml_mapping(text: str) -> dict:
-    """``text`` as a YAML mapping of plain data; raises `NotPlain` for tags, references to anchors, and all but words,
-    numbers, lists and mappings."""
+    """``text`` as a YAML mapping of plain data; raises `NotPlain`, also for tags and for references to anchors."""
     depth = 0
     try:
         for count, event in enumerate(yaml.parse(text, Loader=YAML)):
@@ -78,10 +78,14 @@ def _float(digits: str) -> float:
     return float(digits)
 
 
-def require_plain(data: object, tensors: bool = False) -> None:
-    """Raise `NotPlain` unless ``data`` is made of `None`, flags, numbers and words in lists, tuples and dicts, and, with
-    ``tensors``, tensors; not too many (what is shared counts each time), not too deep, and no number too long."""
-    waiting, count = [(data, 0)], 0
+def require_plain(data: object, tensors: bool = False) -> list[Tensor]:
+    """Raise `NotPlain` unless ``data`` is made of `None`, flags, numbers and words in lists, tuples and dicts, and, where
+    ``tensors`` are allowed, of tensors, which are returned.
+
+    There may not be too many of them (one that stands in several places counts each time), none too deep inside others, and
+    no number too long.
+    """
+    found, waiting, count = [], [(data, 0)], 0
     while waiting:
         value, depth = waiting.pop()
         count += 1
@@ -97,14 +101,25 @@ def require_plain(data: object, tensors: bool = False) -> None:
         elif isinstance(value, int):
             if value.bit_length() > MOST_BITS:
                 raise NotPlain(f"it holds a whole number of {value.bit_length():,} bits")
-        elif not (value is None or isinstance(value, float | str) or (tensors and isinstance(value, Tensor))):
+        elif tensors and isinstance(value, Tensor):
+            found.append(value)
+        elif not (value is None or isinstance(value, float | str)):
             raise NotPlain(f"it holds a {type(value).__name__}, which is no word, number, list or group")
+    return found
+
+
+def value_at(data: object, field: str) -> Any:
+    """The value at the dotted ``field``, a.b, of nested ``data``; `None` where there is none."""
+    for key in field.split("."):
+        data = data.get(key) if isinstance(data, dict) else None
+    return data
 
 
 def looked_up(data: dict) -> dict:
-    """``data`` with each value `${a.b}` replaced by the word or number at a.b; any other `${` raises `NotPlain`.
+    """``data`` in which the value at a.b takes the place of each `${a.b}`, where it is a word or a number; raises `NotPlain`
+    for any other `${`.
 
-    A stranger's file is not given to OmegaConf: its interpolations may call functions, and unfold to any length.
+    OmegaConf would do this, but its interpolations may call functions and unfold to any length: not for a stranger's file.
     """
     return _replaced(data, data)
 
@@ -118,9 +133,7 @@ def _replaced(value: object, data: dict):
         reference = REFERENCE.fullmatch(value) if isinstance(value, str) else None
         if reference is None:
             break
-        found: object = data
-        for key in reference[1].split("."):
-            found = found.get(key) if isinstance(found, dict) else None
+        found = value_at(data, reference[1])
         if isinstance(found, dict | list):
             break
         value = found

@@ -1,18 +1,16 @@
-"""The door through which files come in, and the one through which a run's folder is written: ordinary files alone.
+"""Reading ordinary files, which a stranger may have written, and checking that nothing else lies where a run writes.
 
-Files may come from strangers. Whatever they hold, reading ends, in little memory, with plain data or an `InputError`.
+Whatever a file holds, reading it takes little memory and ends with plain data or with an `InputError`.
 """
-
-from __future__ import annotations
 
 import errno
 import os
 import stat
-import zipfile
 from collections.abc import Iterable
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
+from zipfile import ZipFile
 
 from ocp_torch.errors import InputError
 from ocp_torch.files.plain import NotPlain, json_object, looked_up, yaml_mapping
@@ -22,7 +20,7 @@ FILE, FOLDER, OTHER = "file", "folder", "other"
 LARGEST_FILE = 2**31
 # More bytes of text than any certificate, controller or configuration has.
 LARGEST_JSON, LARGEST_YAML = 2**26, 2**20
-# Of an archive what is read at once at most: its list of parts has 50 bytes and more for each.
+# Bytes of a ZIP archive that are read at once, at most; its list of parts, which is read at once, has 50 or more for each.
 LARGEST_PIECE = 2**20
 # What a run writes in its folder.
 WRITTEN = (".hydra", "checkpoints", "figures", "*.log", "*.json", "*.safetensors", "events.*")
@@ -31,7 +29,7 @@ WRITTEN = (".hydra", "checkpoints", "figures", "*.log", "*.json", "*.safetensors
 def kind(path: str | Path) -> str | None:
     """``FILE``, ``FOLDER`` or ``OTHER`` (a pipe, a device, a socket), links followed; `None` where there is nothing.
 
-    Raises `InputError` for a path that cannot be looked at: too long, in a folder that may not be entered, in a circle.
+    Raises `InputError` where nobody can say: the path is too long, in a folder that may not be entered, or a circle of links.
     """
     try:
         mode = os.stat(path).st_mode
@@ -82,7 +80,7 @@ def read_text(path: str | Path, most: int) -> str:
 
 
 def read_json(path: str | Path, most: int = LARGEST_JSON) -> dict:
-    """The JSON object in the file ``path``; `InputError`, naming the file, where there is none, or a crafted one."""
+    """The JSON object in the file ``path``, of at most ``most`` bytes; `InputError`, with its name, otherwise."""
     text = read_text(path, most)
     try:
         return json_object(text)
@@ -91,7 +89,8 @@ def read_json(path: str | Path, most: int = LARGEST_JSON) -> dict:
 
 
 def read_yaml(path: str | Path) -> dict:
-    """The YAML mapping in the file ``path`` with its references looked up; `InputError`, naming the file, otherwise."""
+    """The YAML mapping in the file ``path`` as plain data, values in the place of its references (`plain.looked_up`);
+    `InputError`, with the file's name, otherwise."""
     text = read_text(path, LARGEST_YAML)
     try:
         return looked_up(yaml_mapping(text))
@@ -100,7 +99,7 @@ def read_yaml(path: str | Path) -> dict:
 
 
 class _Frugal:
-    """An open file that is read in small pieces only."""
+    """An open file that refuses to have more than `LARGEST_PIECE` bytes read at once."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -113,14 +112,14 @@ class _Frugal:
         return data
 
 
-def zip_file(file: BinaryIO) -> zipfile.ZipFile:
-    """The ZIP archive in ``file``, whose list of parts is read at once; raises `ValueError` where that is too long."""
-    return zipfile.ZipFile(_Frugal(file))
+def zip_file(file: BinaryIO) -> ZipFile:
+    """The ZIP archive in ``file``; raises `ValueError` where its list of parts is too long to be read at once."""
+    return ZipFile(cast(BinaryIO, _Frugal(file)))
 
 
 def require_unlinked(folder: Path, names: Iterable[str] = WRITTEN) -> None:
-    """Raise `InputError` where an entry of ``folder`` that is about to be written, by the patterns ``names``, is a link, a
-    pipe or a device, or holds one.
+    """Raise `InputError` where a file in ``folder`` that is about to be written is a link, a pipe or a device: all that the
+    patterns ``names`` match, and all below folders that they match.
 
     A link would lead what is written somewhere else; a pipe would keep the run waiting. ``folder`` itself may be a link:
     it is the user who named it.
@@ -132,14 +131,11 @@ def require_unlinked(folder: Path, names: Iterable[str] = WRITTEN) -> None:
         if stat.S_ISDIR(status.st_mode):
             entries += _entries(entry.path)
             continue
-        # Logs are continued in place; everything else is replaced as a whole.
+        # Logs are continued in place, also where the file has a second name; everything else is replaced as a whole.
         second = status.st_nlink > 1 and entry.name.endswith(".log")
-        if stat.S_ISLNK(status.st_mode) or second:
-            wrong = "a link to another file"
-        elif stat.S_ISREG(status.st_mode):
+        if stat.S_ISREG(status.st_mode) and not second:
             continue
-        else:
-            wrong = "a pipe or a device"
+        wrong = "a link to another file" if stat.S_ISLNK(status.st_mode) or second else "a pipe or a device"
         raise InputError(
             f"{entry.path} is {wrong}, and nothing is written into a folder that holds one; remove it, or copy the run."
         )

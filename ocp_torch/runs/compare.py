@@ -1,7 +1,5 @@
 """Runs side by side: their certificates as rows, the smallest gap first; and what is broken or not finished."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -23,8 +21,7 @@ def compare(paths: Iterable[Path]) -> Comparison:
             raise InputError(f"{path} is not a folder; give runs' folders, or folders that hold some.")
         folders += run_folders(path)
     rows, unfinished = [], {}
-    names = named(list(dict.fromkeys(folders)))
-    for folder, name in names.items():
+    for folder, name in named(list(dict.fromkeys(folders))).items():
         try:
             rows.append(row_of(folder, name))
         except InputError as error:
@@ -63,15 +60,14 @@ def row_of(folder: Path, name: str) -> dict:
         raise InputError(progress_of(folder))
     try:
         certificate = read_json(file, LARGEST_CERTIFICATE)
-        lower, upper = (bound(certificate, *side) for side in SIDES)
         return {
             "run": name,
             **{k: printable(certificate[k]) for k in ("problem", "method")},
             **{k: int(_given(certificate[k])) for k in ("seed", "step")},
             "train_seconds": number(certificate["train_seconds"]),
-            "lower": lower,
+            "lower": bound(certificate, "lower"),
             "perf": performance(certificate),
-            "upper": upper,
+            "upper": bound(certificate, "upper"),
             "exact": number(certificate["exact"]),
             **{f"gap_{kind}": ranked(certificate["gap"][kind]) for kind in ("certified", "simulated")},
             "share": number(certificate["share"]["certified"]),
@@ -83,14 +79,10 @@ def row_of(folder: Path, name: str) -> dict:
         raise InputError(f"its certificate.json is damaged ({reason}).") from None
 
 
-# Each bound's group, and the key of `gap` that names the one in use.
-SIDES = (("lower", "lower_from"), ("upper", "upper_from"))
-
-
-def bound(certificate: dict, group: str, chosen: str) -> float | None:
-    """The bound the gap was taken from."""
-    name = certificate["gap"][chosen]
-    return None if name is None else number(certificate[group][name]["value"])
+def bound(certificate: dict, side: str) -> float | None:
+    """The bound of the ``side``, lower or upper, that the gap was taken from."""
+    name = certificate["gap"][f"{side}_from"]
+    return None if name is None else number(certificate[side][name]["value"])
 
 
 def performance(certificate: dict) -> float | None:
@@ -98,13 +90,11 @@ def performance(certificate: dict) -> float | None:
     upper bounds speak of, or else the one with the smallest value that its errors allow."""
     known = {name: e for name, e in certificate["perf"].items() if e is not None and number(e["value"]) is not None}
     spoken_of = [e.get("controller") for e in certificate["upper"].values() if e is not None]
-    at_most = lambda name: (
-        known[name]["value"] + (number(known[name].get("bias")) or 0.0) + 2.0 * _given(known[name]["se"])
-    )
-    names = [name for name in (certificate.get("controller"), "given", *spoken_of) if name in known] or sorted(
-        known, key=at_most
-    )
-    return number(known[names[0]]["value"]) if names else None
+    for name in (certificate.get("controller"), "given", *spoken_of):
+        if name in known:
+            return number(known[name]["value"])
+    at_most = lambda e: e["value"] + (number(e.get("bias")) or 0.0) + 2.0 * _given(e["se"])
+    return number(min(known.values(), key=at_most)["value"]) if known else None
 
 
 def _given(value) -> float:

@@ -1,7 +1,5 @@
 """Runs side by side: as a table for the terminal, as CSV, and as a plot."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +40,7 @@ class Comparison:
 
     def table(self) -> str:
         """For the terminal."""
-        cells = [list(COLUMNS), *([shown(row[c], form) for c, form in COLUMNS.items()] for row in self.rows)]
+        cells = [list(COLUMNS), *([_shown(row[c], form) for c, form in COLUMNS.items()] for row in self.rows)]
         widths = [max(len(line[k]) for line in cells) for k in range(len(COLUMNS))]
         lines = ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in cells]
         lines.insert(1, "-" * max(map(len, lines)))
@@ -81,6 +79,6 @@ class Comparison:
         write_atomically(file, lambda temporary: figure.savefig(temporary, format=kind, dpi=120))
 
 
-def shown(value, form: str) -> str:
+def _shown(value, form: str) -> str:
     text = "-" if value is None else format(value, form)
     return text if len(text) <= WIDEST or not isinstance(value, int | float) else f"{value:.6g}"

@@ -1,9 +1,4 @@
-"""The configurations that a run's folder keeps, one for each start, as plain data; and the checkpoint that a path names.
-
-Files may come from strangers: nothing in them is run, and what Hydra wrote is what was asked for, not what the run is.
-"""
-
-from __future__ import annotations
+"""The configurations that a run's folder keeps, one for each start, as plain data; and the checkpoint that a path names."""
 
 import contextlib
 import os

@@ -1,6 +1,4 @@
-"""Controllers by what the command line names: a function in a file, a run of ours, ONNX, TorchScript."""
-
-from __future__ import annotations
+"""Controllers by what the command line names: a function in a file, a run of ours, ONNX, TorchScript; and their policies."""
 
 import importlib.util
 import logging
@@ -10,13 +8,21 @@ from pathlib import Path
 
 import torch
 
+from ocp_torch.certificate.trained import in_float64
 from ocp_torch.control.controller import Controller, problem_name
 from ocp_torch.control.loading import load_controller
+from ocp_torch.control.policies import Policy, trained_policies
 from ocp_torch.errors import InputError, nearest
 from ocp_torch.files.reading import FOLDER, kind, require_file
 from ocp_torch.problems import PROBLEMS, Problem
 
 log = logging.getLogger(__name__)
+
+
+def policy_of(controller: Controller) -> Policy:
+    """The policy that ``controller`` follows, in float64."""
+    fields = in_float64(controller.fields)
+    return trained_policies(controller.occupation, controller.problem, fields, controller.constants)[controller.kind]
 
 
 def load_policy(source: str, problem: Problem) -> Callable | Controller:

@@ -3,8 +3,6 @@
 A problem that is not the package's own is never imported because a file names it.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterable
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import Any
 from ocp_torch.certificate import table
 from ocp_torch.errors import InputError
 from ocp_torch.files.limits import require_modest_problem, require_modest_run
+from ocp_torch.files.plain import value_at
 from ocp_torch.files.reading import read_json
 from ocp_torch.problems import PROBLEMS
 from ocp_torch.problems.commands import UNKNOWN, ForeignProblem, naming
@@ -108,25 +107,18 @@ def filled_from(config: dict, made: object) -> dict:
 def require_same_run(config: dict, made: dict) -> None:
     """Raise `InputError` when a field that the checkpoint's tensors belong to differs between ``config`` and ``made``."""
     for field in FIXED:
-        for name, (own, other) in _differences(_at(config, field), _at(made, field), field):
-            if not name.endswith("._target_"):
-                raise InputError(
-                    f"{name} is {own!r}, but the run has {repr(other)[:80]}, and it cannot change at a resume; "
-                    "fields of trainer, certificate, optimizer, schedule and stepper can."
-                )
+        _require_same(field, value_at(config, field), value_at(made, field))
 
 
-def _at(config: object, field: str):
-    for key in field.split("."):
-        config = config.get(key) if isinstance(config, dict) else None
-    return config
-
-
-def _differences(one: object, other: object, name: str) -> list[tuple[str, tuple]]:
-    if isinstance(one, dict) and isinstance(other, dict):
-        keys = list(dict.fromkeys([*one, *other]))
-        return [d for k in keys for d in _differences(one.get(k), other.get(k), f"{name}.{k}")]
-    return [] if one == other else [(name, (one, other))]
+def _require_same(name: str, own: object, other: object) -> None:
+    if isinstance(own, dict) and isinstance(other, dict):
+        for key in dict.fromkeys([*own, *other]):
+            _require_same(f"{name}.{key}", own.get(key), other.get(key))
+    elif own != other and not name.endswith("._target_"):
+        raise InputError(
+            f"{name} is {own!r}, but the run has {repr(other)[:80]}, and it cannot change at a resume; "
+            "fields of trainer, certificate, optimizer, schedule and stepper can."
+        )
 
 
 def result_of(folder: Path, state: dict, config: dict) -> str | None:

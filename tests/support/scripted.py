@@ -21,7 +21,7 @@ CHECKS = {
     "certify": "arguments",
     "evaluate": "recertification",
     "reference": "reference_job",
-    "record": "recorder",
+    "record": "arguments",
     "rollout": "rollout_job",
     "benchmark": "build",
     "reproduce_paper": "check",

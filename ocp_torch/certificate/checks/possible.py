@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.errors import InputError
-from ocp_torch.files.memory import require_memory
+from ocp_torch.files.limits import require_memory
 from ocp_torch.problems.problem import Problem
 
 DOUBLE = 8  # bytes of a number
