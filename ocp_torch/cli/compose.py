@@ -81,9 +81,15 @@ def composed(config_name: str, overrides: list[str], roots: tuple[Path, ...] = (
 def configuration(config_name: str, overrides: list[str], whole: bool = True) -> tuple[DictConfig, dict]:
     """The composed configuration with Hydra's own part, and without that part as plain data (see `resolved`).
 
-    Raises `InputError` where it cannot be composed, or a group or field of ``config_name`` has no place in it.
+    Raises `InputError` where it cannot be composed, or a group or field of ``config_name`` is left out or has no place.
     """
-    require_places(parsed(overrides))
+    own = any(o.key_or_group == "problem._target_" and not o.is_delete() for o in parsed(overrides))
+    for override in parsed(overrides):
+        name = override.key_or_group
+        # Defaults stand in the configuration alone; only a class of a user's own may do without the problem's.
+        needed = not name.startswith(("hydra", "problem.", "experiment")) and not (own and name == "problem")
+        if override.is_delete() and needed:
+            raise InputError(f"~{name} leaves out {name}, which is needed; set it to another value instead.")
     try:
         with initialize_config_dir(str(CONFIGS), job_name=config_name, version_base="1.3"):
             config = compose(config_name, overrides, return_hydra_config=True)
@@ -106,17 +112,6 @@ def configuration(config_name: str, overrides: list[str], whole: bool = True) ->
         if name not in data and not name.startswith(("hydra", "override ")):
             raise InputError(f"{name} is missing; give {name}=... on the command line.")
     return config, data
-
-
-def require_places(overrides: list[Override]) -> None:
-    """Raise `InputError` where a field or a group of ours is left out: defaults stand in the configuration alone. A class of
-    a user's own may do without some of the problem's, or all."""
-    own = any(o.key_or_group == "problem._target_" and not o.is_delete() for o in overrides)
-    for override in overrides:
-        name = override.key_or_group
-        if override.is_delete() and not name.startswith(("hydra", "problem.", "experiment")):
-            if not (own and name == "problem"):
-                raise InputError(f"~{name} leaves out {name}, which is needed; set it to another value instead.")
 
 
 def resolved(config: DictConfig, whole: bool = True) -> dict:

@@ -14,7 +14,6 @@ from ocp_torch.errors import nearest
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 CONFIGS = CHECKOUT / "configs"
-EXTRAS = {"hydra/launcher": "parallel"}  # Hydra's plugin groups -> the extra that installs them
 
 
 def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -> str:
@@ -23,10 +22,8 @@ def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -
     unknown = re.search(r"Could not find '([\w./-]+)/([^'/]*)'", text)
     if isinstance(error, MissingConfigException) and unknown:
         group, choice = unknown.groups()
-        if group in EXTRAS:
-            return (
-                f"{group} is {choice!r}, which is not installed; pip install -e '.[{EXTRAS[group]}]' brings joblib's."
-            )
+        if group == "hydra/launcher":
+            return f"{group} is {choice!r}, which is not installed; pip install -e '.[parallel]' brings joblib's."
         known = choices(group)
         return f"{group} is {choice!r}, but must be one of {', '.join(known)}{nearest(choice, known)}."
     override = re.search(r"Could not override '([\w.@/-]+)'", text)

@@ -7,7 +7,7 @@ from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
-from ocp_torch.cli.compose import configuration, parsed, require_places, run_data
+from ocp_torch.cli.compose import configuration, parsed, run_data
 from ocp_torch.cli.explain import explain, is_choice
 from ocp_torch.errors import InputError, require_flag, require_section, shown
 
@@ -18,19 +18,19 @@ def check_sweep(config_name: str, overrides: list[str], check: Callable[[dict], 
     """Raise `InputError` where a job of the sweep would not even compose, every value of every field, one at a time; or
     where ``check`` lets none through that has a value of some kind: words are, and numbers by their sign. What the problem
     makes of numbers, a sweep may be there to find out."""
-    require_places(parsed(overrides))
     try:
         options = BasicSweeper.split_arguments(parsed(overrides), None)[0]
     except HydraException as error:
         raise InputError(explain(error, config_name)) from None
+    is_hydras = lambda override: override.startswith(("hydra.", "hydra/"))
     defaults: dict[tuple, dict] = {}
     for one in dict.fromkeys(o for job in options for o in job):
-        first = [o for o in next(job for job in options if one in job) if not _is_hydras(o)]
+        first = [o for o in next(job for job in options if one in job) if not is_hydras(o)]
         chosen = [o for o in first if is_choice(o) or o.lstrip("+").startswith("problem._target_=")]
         if (key := tuple(chosen)) not in defaults:
             defaults[key] = configuration(config_name, chosen, whole=False)[1]
         require_kinds(configuration(config_name, first)[1], defaults[key])
-    ours = [[o for o in job if not _is_hydras(o)] for job in options]
+    ours = [[o for o in job if not is_hydras(o)] for job in options]
     for one in representatives(parsed(overrides)):
         jobs = [job for job in ours if one in job][:MOST_TRIED]
         refusals: list[InputError] = []
@@ -43,11 +43,7 @@ def check_sweep(config_name: str, overrides: list[str], check: Callable[[dict], 
         if jobs and len(refusals) == len(jobs):
             raise refusals[0]
     # Hydra's own settings are the same for every job.
-    configuration(config_name, [o for o in options[0] if _is_hydras(o)], whole=False)
-
-
-def _is_hydras(override: str) -> bool:
-    return override.startswith(("hydra.", "hydra/"))
+    configuration(config_name, [o for o in options[0] if is_hydras(o)], whole=False)
 
 
 def representatives(overrides: list[Override]) -> list[str]:

@@ -41,11 +41,9 @@ class After:
 
 
 def unpacked(content: After) -> Any:
-    """Plain data with tensors, as `torch.save` wrote them. No code from the archive runs.
-
-    Raises `pickle.UnpicklingError` where the archive holds anything else, `ValueError` where what it holds is too large or
-    not what it claims to be, and whatever PyTorch raises where it is damaged.
-    """
+    """Plain data with tensors, as `torch.save` wrote them; no code from the archive runs. Raises `pickle.UnpicklingError`
+    where it holds anything else, `ValueError` where that is too large or not what it claims to be, and what PyTorch raises
+    where it is damaged."""
     _require_modest(content)
     state = torch.load(cast(BinaryIO, content), map_location="cpu", weights_only=True)
     claimed = 0

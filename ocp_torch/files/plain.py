@@ -1,7 +1,5 @@
 """JSON and YAML texts from strangers become plain data of a bounded size: words, numbers, lists and groups, nothing else.
-
-Nothing in a text is run, fetched from elsewhere, or unfolded to more than is written there. `NotPlain` says what is wrong.
-"""
+Nothing in a text is run, fetched from elsewhere, or unfolded to more than is written there."""
 
 import json
 import math
@@ -80,11 +78,8 @@ def _float(digits: str) -> float:
 
 def require_plain(data: object, tensors: bool = False) -> list[Tensor]:
     """Raise `NotPlain` unless ``data`` is made of `None`, flags, numbers and words in lists, tuples and dicts, and, where
-    ``tensors`` are allowed, of tensors, which are returned.
-
-    There may not be too many of them (one that stands in several places counts each time), none too deep inside others, and
-    no number too long.
-    """
+    ``tensors`` are allowed, of tensors, which are returned; or where there are too many of them (one that stands in several
+    places counts each time), one lies too deep inside others, or a number is too long."""
     found, waiting, count = [], [(data, 0)], 0
     while waiting:
         value, depth = waiting.pop()
@@ -117,10 +112,7 @@ def value_at(data: object, field: str) -> Any:
 
 def looked_up(data: dict) -> dict:
     """``data`` in which the value at a.b takes the place of each `${a.b}`, where it is a word or a number; raises `NotPlain`
-    for any other `${`.
-
-    OmegaConf would do this, but its interpolations may call functions and unfold to any length: not for a stranger's file.
-    """
+    for any other `${`. (OmegaConf's interpolations may call functions and unfold to any length.)"""
     return _replaced(data, data)
 
 
@@ -131,10 +123,7 @@ def _replaced(value: object, data: dict):
         return [_replaced(one, data) for one in value]
     for _ in range(MOST_STEPS):
         reference = REFERENCE.fullmatch(value) if isinstance(value, str) else None
-        if reference is None:
-            break
-        found = value_at(data, reference[1])
-        if isinstance(found, dict | list):
+        if reference is None or isinstance(found := value_at(data, reference[1]), dict | list):
             break
         value = found
     return _literal(value)

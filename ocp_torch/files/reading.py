@@ -1,7 +1,5 @@
-"""Reading ordinary files, which a stranger may have written, and checking that nothing else lies where a run writes.
-
-Whatever a file holds, reading it takes little memory and ends with plain data or with an `InputError`.
-"""
+"""Reading ordinary files, whatever a stranger wrote in them: in little memory, and with an `InputError` where they are none
+or not what they should be; and checking that nothing else lies where a run is about to write."""
 
 import errno
 import os
@@ -27,10 +25,8 @@ WRITTEN = (".hydra", "checkpoints", "figures", "*.log", "*.json", "*.safetensors
 
 
 def kind(path: str | Path) -> str | None:
-    """``FILE``, ``FOLDER`` or ``OTHER`` (a pipe, a device, a socket), links followed; `None` where there is nothing.
-
-    Raises `InputError` where nobody can say: the path is too long, in a folder that may not be entered, or a circle of links.
-    """
+    """``FILE``, ``FOLDER`` or ``OTHER`` (a pipe, a device, a socket), links followed; `None` where there is nothing, and
+    `InputError` where nobody can say: the path is too long, in a folder that may not be entered, or a circle of links."""
     try:
         mode = os.stat(path).st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -81,19 +77,16 @@ def read_text(path: str | Path, most: int) -> str:
 
 def read_json(path: str | Path, most: int = LARGEST_JSON) -> dict:
     """The JSON object in the file ``path``, of at most ``most`` bytes; `InputError`, with its name, otherwise."""
-    text = read_text(path, most)
     try:
-        return json_object(text)
+        return json_object(read_text(path, most))
     except NotPlain as error:
         raise InputError(f"{path} is damaged: {error}.") from None
 
 
 def read_yaml(path: str | Path) -> dict:
-    """The YAML mapping in the file ``path`` as plain data, values in the place of its references (`plain.looked_up`);
-    `InputError`, with the file's name, otherwise."""
-    text = read_text(path, LARGEST_YAML)
+    """The YAML mapping in the file ``path``, its references looked up; `InputError`, with its name, otherwise."""
     try:
-        return looked_up(yaml_mapping(text))
+        return looked_up(yaml_mapping(read_text(path, LARGEST_YAML)))
     except NotPlain as error:
         raise InputError(f"{path} is damaged or not a run's configuration: {error}.") from None
 
@@ -118,12 +111,9 @@ def zip_file(file: BinaryIO) -> ZipFile:
 
 
 def require_unlinked(folder: Path, names: Iterable[str] = WRITTEN) -> None:
-    """Raise `InputError` where a file in ``folder`` that is about to be written is a link, a pipe or a device: all that the
-    patterns ``names`` match, and all below folders that they match.
-
-    A link would lead what is written somewhere else; a pipe would keep the run waiting. ``folder`` itself may be a link:
-    it is the user who named it.
-    """
+    """Raise `InputError` where anything in ``folder`` that the patterns ``names`` match, or below a folder that they match,
+    is a link, which would lead what is written somewhere else, a pipe, which would keep the run waiting, or a device.
+    ``folder`` itself may be a link: it is the user who named it."""
     entries = [entry for entry in _entries(str(folder)) if any(fnmatch(entry.name, name) for name in names)]
     while entries:
         entry = entries.pop()

@@ -60,16 +60,21 @@ def row_of(folder: Path, name: str) -> dict:
         raise InputError(progress_of(folder))
     try:
         certificate = read_json(file, LARGEST_CERTIFICATE)
+        gap, bounds = certificate["gap"], {}
+        for side in ("lower", "upper"):  # the bounds that the gap was taken from
+            source = gap[f"{side}_from"]
+            bounds[side] = None if source is None else number(certificate[side][source]["value"])
+        gaps = {f"gap_{kind}": number(gap[kind]) for kind in ("certified", "simulated")}
         return {
             "run": name,
             **{k: printable(certificate[k]) for k in ("problem", "method")},
-            **{k: int(_given(certificate[k])) for k in ("seed", "step")},
+            **{k: int(given_number(certificate[k])) for k in ("seed", "step")},
             "train_seconds": number(certificate["train_seconds"]),
-            "lower": bound(certificate, "lower"),
             "perf": performance(certificate),
-            "upper": bound(certificate, "upper"),
+            **bounds,
             "exact": number(certificate["exact"]),
-            **{f"gap_{kind}": ranked(certificate["gap"][kind]) for kind in ("certified", "simulated")},
+            # None to rank by where the bounds cross, as older versions wrote them: one of them is then wrong.
+            **{k: None if value is not None and value < 0.0 else value for k, value in gaps.items()},
             "share": number(certificate["share"]["certified"]),
             "stopped": printable(certificate.get("stopped", "steps")),
             "warnings": len(list(certificate["warnings"])),
@@ -77,12 +82,6 @@ def row_of(folder: Path, name: str) -> dict:
     except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
         reason = visible(error if isinstance(error, InputError) else f"{type(error).__name__}: {error}", 200)
         raise InputError(f"its certificate.json is damaged ({reason}).") from None
-
-
-def bound(certificate: dict, side: str) -> float | None:
-    """The bound of the ``side``, lower or upper, that the gap was taken from."""
-    name = certificate["gap"][f"{side}_from"]
-    return None if name is None else number(certificate[side][name]["value"])
 
 
 def performance(certificate: dict) -> float | None:
@@ -93,31 +92,22 @@ def performance(certificate: dict) -> float | None:
     for name in (certificate.get("controller"), "given", *spoken_of):
         if name in known:
             return number(known[name]["value"])
-    at_most = lambda e: e["value"] + (number(e.get("bias")) or 0.0) + 2.0 * _given(e["se"])
+    at_most = lambda e: e["value"] + (number(e.get("bias")) or 0.0) + 2.0 * given_number(e["se"])
     return number(min(known.values(), key=at_most)["value"]) if known else None
-
-
-def _given(value) -> float:
-    """A finite number; `TypeError` where there is none."""
-    found = number(value)
-    if found is None:
-        raise TypeError("a number is missing")
-    return found
 
 
 def number(value) -> float | None:
     """A finite number, or `None`; `ValueError` for anything else."""
+    return None if value is None else given_number(value)
+
+
+def given_number(value) -> float:
+    """A finite number; `TypeError` where there is none, `ValueError` for anything else."""
     if value is None:
-        return None
+        raise TypeError("a number is missing")
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ValueError(f"{value!r} is not a number")
     return value
-
-
-def ranked(value) -> float | None:
-    """A gap to rank by: none where the bounds cross, as older versions wrote them, since one of them is then wrong."""
-    gap = number(value)
-    return gap if gap is not None and gap >= 0.0 else None
 
 
 def progress_of(folder: Path) -> str:

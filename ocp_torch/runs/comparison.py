@@ -75,8 +75,7 @@ class Comparison:
         axis.set_yticks(range(len(self.rows)), [row["run"] for row in self.rows], parse_math=False)
         axis.invert_yaxis()
         axis.set(xlabel="lower bound | simulated performance o upper bound | (x: OPT)")
-        kind = file.suffix.lower()[1:]
-        write_atomically(file, lambda temporary: figure.savefig(temporary, format=kind, dpi=120))
+        write_atomically(file, lambda path: figure.savefig(path, format=file.suffix.lower()[1:], dpi=120))
 
 
 def _shown(value, form: str) -> str:

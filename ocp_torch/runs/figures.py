@@ -1,7 +1,7 @@
 """Figures of a run: its certificate on a line; `V`, `u`, `mu` and the HJB slack as curves, or as maps of two coordinates."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,10 +18,7 @@ from ocp_torch.maths.supremum import batched
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.starts import initial_points
-from ocp_torch.runs.canvas import blank_figure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from ocp_torch.runs.canvas import Figure, blank_figure
 
 LINE_POINTS, MAP_POINTS = 400, 80
 # Of the simulated occupation density: bins a coordinate by dimension, starts, steps of a trajectory.
@@ -36,7 +33,7 @@ TITLES = {
 Function = Callable[[Tensor], Any]
 
 
-def interval_figure(certificate: dict) -> "Figure":
+def interval_figure(certificate: dict) -> Figure:
     """The certificate (as a dict of its schema) on a line: bounds, `OPT` where known and performances, with their intervals.
 
     What is much farther from the tightest of them than they are from one another is cut off, with an arrow and its value.
@@ -77,7 +74,7 @@ def interval_figure(certificate: dict) -> "Figure":
     return figure
 
 
-def draw(problem: Problem, fields: Fields, constants: Constants, occupation: str | None) -> dict[str, "Figure"]:
+def draw(problem: Problem, fields: Fields, constants: Constants, occupation: str | None) -> dict[str, Figure]:
     """A figure per quantity; in three and more dimensions a cut along the first two coordinates through 1/2."""
     plot, x = (_curve, _line()) if problem.dim == 1 else (_map, _plane(problem.dim))
     figures = {}
@@ -113,13 +110,13 @@ def quantities(
 
 
 @torch.no_grad()
-def simulated_occupation(problem: Problem, policy: Function, seed: int = 0) -> Function:
+def simulated_occupation(problem: Problem, policy: Function) -> Function:
     """A histogram of `mu^u`, for one or two coordinates: where the closed loop of ``policy`` is at a time `T ~ Exp(rho)`.
 
     Starts weigh `mu0`; their number and the bins are few enough for a fraction of a second.
     """
     bins = BINS[problem.dim]
-    points, start_mass = initial_points(problem, STARTS, 0, derive_seed(seed, Branch.FIGURES), extra=1)
+    points, start_mass = initial_points(problem, STARTS, 0, derive_seed(0, Branch.FIGURES), extra=1)
     x0, times = points[:, :-1], -torch.log1p(-points[:, -1]) / problem.discount
     _, end = rate_at(lambda x: (problem.velocity(x, policy(x)), x[:, 0]), x0, problem.discount, times, FIGURE_STEPS)
     cell = lambda x: ((x * bins).long().clamp(0, bins - 1) * bins ** torch.arange(problem.dim)).sum(dim=-1)
@@ -142,7 +139,7 @@ def _line() -> Tensor:
     return torch.linspace(0.0, 1.0, LINE_POINTS, dtype=torch.float64).unsqueeze(-1)
 
 
-def _curve(title: str, values: dict[str, Tensor]) -> "Figure":
+def _curve(title: str, values: dict[str, Tensor]) -> Figure:
     figure = blank_figure(5.2, 4.0)
     axis = figure.subplots()
     for label, form in (("simulated", "C7"), ("learned", "C0"), ("exact", "k:")):
@@ -162,7 +159,7 @@ def _plane(dim: int) -> Tensor:
     return x
 
 
-def _map(title: str, panels: dict[str, Tensor]) -> "Figure":
+def _map(title: str, panels: dict[str, Tensor]) -> Figure:
     # A control of several components is drawn as its size, with arrows for its first two.
     sizes = {label: v.norm(dim=-1) if v.shape[1] > 1 else v[:, 0] for label, v in panels.items()}
     low = min(float(s.nan_to_num(nan=torch.inf).min()) for s in sizes.values())

@@ -95,8 +95,7 @@ def _onnx(path: Path) -> Callable:
 
 
 def _torchscript(path: Path) -> Callable:
-    """A program of its own, which may write wherever the user may."""
-    warn_of_code(path)
+    _warn_of_code(path)
     try:
         return torch.jit.load(str(path), map_location="cpu").eval()
     except Exception as error:  # the loader has no one type for a bad file
@@ -105,8 +104,7 @@ def _torchscript(path: Path) -> Callable:
 
 
 @cache
-def warn_of_code(path: Path) -> None:
+def _warn_of_code(path: Path) -> None:
     """Say once what TorchScript can do."""
-    log.warning(
-        "warning: %s is TorchScript, code that can write your files; load it if you trust it, or take ONNX.", path
-    )
+    said = "warning: %s is TorchScript, code that can write your files; load it if you trust it, or take ONNX."
+    log.warning(said, path)

@@ -16,7 +16,7 @@ from ocp_torch.files.limits import require_held
 from ocp_torch.files.reading import require_unlinked
 from ocp_torch.files.storage import sweep_temporaries
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
-from ocp_torch.runs.configuration import keep_configuration, latest_subfolder, load_state
+from ocp_torch.runs.configuration import keep_configuration, load_state, starts
 from ocp_torch.runs.finish import complete, failure_of, hand_out, missing, salvaged, unless_it_failed, with_warnings
 from ocp_torch.runs.loading import policy_of
 from ocp_torch.runs.metrics.trial import write_metrics
@@ -76,7 +76,7 @@ def train(run: TrainingRun, folder: Path) -> None:
     for note in run.notes:
         log.warning("warning: %s", note)
     # What Hydra wrote is what was asked for, not what the run is.
-    if run.state is not None or latest_subfolder(folder) != folder / ".hydra":
+    if run.state is not None or len(starts(folder)) > 1:
         keep_configuration(folder, run.config)
     if run.state is not None:
         result = result_of(folder, run.state, run.trainer.config)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,14 +18,11 @@ from ocp_torch.problems.systems.planar import PlanarVehicle
 from ocp_torch.problems.systems.robot import RobotArm
 from ocp_torch.runs.metrics.measures import Path
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 # Earlier poses of an arm that stay visible.
 GHOSTS = 12
 
 
-def _obstacles(axes: "Axes", discs: list, clearance: float, period: float | None = None) -> None:
+def _obstacles(axes: Any, discs: list, clearance: float, period: float | None = None) -> None:
     from matplotlib.patches import Circle
 
     shifts = [0.0] if period is None else [-period, 0.0, period]
@@ -54,7 +51,7 @@ def _broken(track: Tensor, jump: float) -> Tensor:
     return track
 
 
-def draw_arm(problem: Linkage, axes: "Axes", path: Path, k: int) -> None:
+def draw_arm(problem: Linkage, axes: Any, path: Path, k: int) -> None:
     """One trajectory: poses from light to dark, the way of the tip, target and obstacles; in the plane or in space."""
     base = [0.0] * len(problem.shoulder)
     reach = 1.08 * max(problem.length, *(math.dist(problem.shoulder, place) for place in (problem.target, base)))
@@ -70,7 +67,7 @@ def draw_arm(problem: Linkage, axes: "Axes", path: Path, k: int) -> None:
     axes.set(**limits, aspect="equal", xlabel="m", title=f"{path.times[k]:.2f} s")
 
 
-def draw_vehicles(problem: PlanarVehicle, axes: "Axes", path: Path, k: int) -> None:
+def draw_vehicles(problem: PlanarVehicle, axes: Any, path: Path, k: int) -> None:
     """Trajectories in the periodic plane with their headings."""
     _obstacles(axes, problem.obstacles, problem.clearance, problem.size)
     for i in range(path.states.shape[1]):
@@ -84,7 +81,7 @@ def draw_vehicles(problem: PlanarVehicle, axes: "Axes", path: Path, k: int) -> N
     axes.set(**limits, aspect="equal", xlabel="m", title=f"{path.times[k]:.2f}")
 
 
-def draw_phases(problem: Kuramoto | PhaseNeurons, axes: "Axes", path: Path, k: int) -> None:
+def draw_phases(problem: Kuramoto | PhaseNeurons, axes: Any, path: Path, k: int) -> None:
     """The order parameter in time: each start, and their mean."""
     order = path.each(problem.order_parameter)[: k + 1]
     axes.plot(path.times[: k + 1], order, color="C0", linewidth=0.6, alpha=0.5)
@@ -92,7 +89,7 @@ def draw_phases(problem: Kuramoto | PhaseNeurons, axes: "Axes", path: Path, k: i
     axes.set(xlim=(0, float(path.times[-1])), ylim=(0, 1.02), xlabel="time", ylabel="order parameter")
 
 
-def draw_pendulums(problem: Pendulum, axes: "Axes", path: Path, k: int) -> None:
+def draw_pendulums(problem: Pendulum, axes: Any, path: Path, k: int) -> None:
     """The portrait of angle and velocity, with the band in which the model is faithful; the rod at the end in a corner."""
     from matplotlib.patches import Wedge
 
