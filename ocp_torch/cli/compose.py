@@ -70,10 +70,7 @@ def _file(config_name: str) -> tuple[list[tuple[str, Any]], list[str]]:
 
 
 def composed(config_name: str, overrides: list[str], roots: tuple[Path, ...] = ()) -> dict:
-    """What a command of the configuration ``config_name`` is given, as plain data. `roots`: see `run_data`.
-
-    Raises `InputError`, in one sentence, for whatever Hydra or OmegaConf has against it.
-    """
+    """What a command of the configuration ``config_name`` is given: `configuration` and `run_data`, with its ``roots``."""
     overrides = with_own_defaults(config_name, overrides)
     return run_data(configuration(config_name, overrides)[1], overrides, roots)
 
@@ -115,8 +112,7 @@ def configuration(config_name: str, overrides: list[str], whole: bool = True) ->
 
 
 def resolved(config: DictConfig, whole: bool = True) -> dict:
-    """``config`` as nested plain data without Hydra's own part, interpolations resolved. OmegaConf raises where it cannot be
-    resolved, or, if it has to be ``whole``, lacks a value."""
+    """``config`` without Hydra's part, resolved to plain data; OmegaConf raises where that cannot be, or is not ``whole``."""
     own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     data: Any = OmegaConf.to_container(own, resolve=True, throw_on_missing=whole)
     return data

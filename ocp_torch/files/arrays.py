@@ -32,8 +32,7 @@ class Form:
 
 
 def form_of(file: BinaryIO, kinds: str = REAL) -> Form:
-    """The form of the array at the beginning of ``file``. Raises `ValueError` where there is none, or one of numbers of
-    another kind than the letters ``kinds`` stand for."""
+    """The form of the array that begins in ``file``; `ValueError` where there is none, or its numbers are of no such kind."""
     begin = file.read(8)
     if len(begin) < 8 or begin[:6] != b"\x93NUMPY" or begin[6] not in (1, 2):
         raise ValueError("is damaged: it is no array of NumPy's")

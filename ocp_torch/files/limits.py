@@ -1,7 +1,4 @@
-"""How much a file may ask of the machine; more than this only the user may, on the command line or in Python.
-
-And how much anybody may ask for: what fits into the memory of this machine.
-"""
+"""How much a file may ask of the machine, more than which only the user may; and what fits into its memory at all."""
 
 import os
 from collections.abc import Collection
@@ -34,8 +31,7 @@ CONTAINER_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memo
 
 
 def require_modest_problem(source: object, parameters: dict, remedy: str) -> None:
-    """Raise `InputError`, which ends with ``remedy``, where the arguments ``parameters`` of a problem, as the file ``source``
-    gives them, hold a number or a list that is too large."""
+    """Raise `InputError`, which ends with ``remedy``, where the file ``source`` gives a problem too large an argument."""
     for name, parameter in parameters.items():
         waiting = [parameter]
         while waiting:
@@ -50,8 +46,8 @@ def require_modest_problem(source: object, parameters: dict, remedy: str) -> Non
 
 
 def require_modest_run(source: object, config: dict, named: Collection[str] = frozenset()) -> None:
-    """Raise `InputError` where a field of ``config``, the plain configuration in the file ``source``, is beyond its limit in
-    `MOST` or `LEAST`. Fields that the command line ``named`` may have any value."""
+    """Raise `InputError` where a field of ``config``, as the file ``source`` has it, is beyond its limit in `MOST` or `LEAST`
+    and is not one that the command line ``named``."""
     for field, limit in {**MOST, **LEAST}.items():
         value = value_at(config, field)
         if not isinstance(value, int | float) or field in named:
@@ -65,8 +61,7 @@ def require_modest_run(source: object, config: dict, named: Collection[str] = fr
 
 
 def require_held(source: object, model: object, numbers: int) -> None:
-    """Raise `InputError` where one network of the configuration ``model`` would have more weights than the ``numbers`` that
-    the file ``source`` holds."""
+    """Raise `InputError` where networks of the form ``model`` have more weights than the file ``source`` has ``numbers``."""
     if not isinstance(model, dict):
         return
     sizes = {name: model.get(name) for name in ("width", "depth", "modes", "waves")}

@@ -1,5 +1,4 @@
-"""JSON and YAML texts from strangers become plain data of a bounded size: words, numbers, lists and groups, nothing else.
-Nothing in a text is run, fetched from elsewhere, or unfolded to more than is written there."""
+"""JSON and YAML from strangers as plain data of a bounded size, words, numbers, lists and groups: nothing in them is run."""
 
 import json
 import math
@@ -110,17 +109,14 @@ def value_at(data: object, field: str) -> Any:
     return data
 
 
-def looked_up(data: dict) -> dict:
-    """``data`` in which the value at a.b takes the place of each `${a.b}`, where it is a word or a number; raises `NotPlain`
-    for any other `${`. (OmegaConf's interpolations may call functions and unfold to any length.)"""
-    return _replaced(data, data)
-
-
-def _replaced(value: object, data: dict):
+def looked_up(value: Any, data: dict | None = None) -> Any:
+    """``value``, the whole of a file or a part of its ``data``, in which what stands at a.b takes the place of each `${a.b}`,
+    where that is a word or a number; raises `NotPlain` for any other `${`. (OmegaConf's may call functions.)"""
+    data = value if data is None else data
     if isinstance(value, dict):
-        return {_literal(key): _replaced(one, data) for key, one in value.items()}
+        return {_literal(key): looked_up(one, data) for key, one in value.items()}
     if isinstance(value, list):
-        return [_replaced(one, data) for one in value]
+        return [looked_up(one, data) for one in value]
     for _ in range(MOST_STEPS):
         reference = REFERENCE.fullmatch(value) if isinstance(value, str) else None
         if reference is None or isinstance(found := value_at(data, reference[1]), dict | list):

@@ -1,5 +1,4 @@
-"""Reading ordinary files, whatever a stranger wrote in them: in little memory, and with an `InputError` where they are none
-or not what they should be; and checking that nothing else lies where a run is about to write."""
+"""Reading ordinary files, whatever a stranger put there, in little memory; and checking that a run writes to such alone."""
 
 import errno
 import os

@@ -81,11 +81,8 @@ def _require_room(dim: int, control_dim: object) -> None:
 
 
 def use_threads(threads: int) -> None:
-    """Use ``threads`` CPU threads, and keep freed memory for the next tensor.
-
-    By default glibc returns large blocks to the system at once, and the page faults of getting them back can cost as much as
-    the arithmetic. Elsewhere than on glibc only the threads are set.
-    """
+    """Use ``threads`` CPU threads, and, with glibc, keep freed memory for the next tensor: by default large blocks return to
+    the system at once, and the page faults of getting them back can cost as much as the arithmetic."""
     torch.set_num_threads(threads)
     if platform.libc_ver()[0] == "glibc":
         for parameter, largest in MALLOPT:

@@ -31,8 +31,7 @@ def locate(path: Path) -> tuple[Path | None, Path | None]:
 
 
 def load_state(path: Path) -> tuple[Any, Path, list[str]]:
-    """The state that ``path`` names, of a run of any version but with the names that its problem has now; the file it came
-    from; and a sentence on each damaged newer one."""
+    """The state that ``path`` names, in this version's names; its file; and a sentence on each damaged newer one."""
     checkpoint = locate(path)[1]
     if checkpoint is not None:
         state, notes = load_checkpoint(checkpoint), list[str]()
@@ -63,8 +62,7 @@ def _number(path: Path) -> int:
 
 
 def saved_configuration(path: Path) -> dict:
-    """The configuration of the run that ``path`` names, as plain data: that of its newest start that got going, or, for
-    a checkpoint without a run's folder, its own copy."""
+    """The plain configuration of the newest start that got going of the run that ``path`` names, or its checkpoint's copy."""
     folder = locate(path)[0]
     for start in reversed(starts(folder)[1:] if folder else []):
         # Until a start has been checked, its file is what was asked for, names a run, and may be half written.

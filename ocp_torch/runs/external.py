@@ -63,12 +63,12 @@ def certify(
     network = build_network(defaults["model"])
     policy = policy_of(controller, problem)
     steps = defaults["trainer"]["steps"] if train_steps is None else require_integer("train_steps", train_steps, 0)
-    run = Run(problem_name(problem), "given", seed)
-    if value is None and steps:
+    steps = 0 if value is not None else steps
+    if steps:
         value = in_float64(train_value(problem, constants, network, steps, defaults, seed)).value
-        run = Run(problem_name(problem), "given", seed, steps, steps * defaults["trainer"]["batch"])
     elif value is not None:
         value = value_of(value, problem)
+    run = Run(problem_name(problem), "given", seed, steps, steps * defaults["trainer"]["batch"])
     return certify_policy(problem, policy, value, network, constants, settings, run)
 
 
@@ -133,11 +133,10 @@ def arguments(config: dict) -> dict:
     """The arguments of `certify` that the plain ``config`` of the command line names; only it may name code to run."""
     use_threads(1)
     problem = build_problem(config["problem"])
-    filled = _defaults(problem, config["certificate"])
+    settings = build_certificate_settings(_defaults(problem, config["certificate"]))
     train = require_flag("train", config["train"])
     if config["steps"] is not None:
         require_integer("steps", config["steps"], 1)
-    settings = build_certificate_settings(filled)
     require_possible(problem, settings, trains_value=False)  # a given controller's bounds are not proved
     controller = loading.load_policy(config["controller"], problem)
     policy_of(controller, problem)

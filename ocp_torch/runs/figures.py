@@ -76,21 +76,25 @@ def interval_figure(certificate: dict) -> Figure:
 
 def draw(problem: Problem, fields: Fields, constants: Constants, occupation: str | None) -> dict[str, Figure]:
     """A figure per quantity; in three and more dimensions a cut along the first two coordinates through 1/2."""
-    plot, x = (_curve, _line()) if problem.dim == 1 else (_map, _plane(problem.dim))
+    if problem.dim == 1:
+        x = torch.linspace(0.0, 1.0, LINE_POINTS, dtype=torch.float64).unsqueeze(-1)
+    else:
+        middles = (torch.arange(MAP_POINTS, dtype=torch.float64) + 0.5) / MAP_POINTS
+        x = torch.full((MAP_POINTS**2, problem.dim), 0.5, dtype=torch.float64)
+        x[:, :2] = torch.cartesian_prod(middles, middles)
     figures = {}
     for name, functions in quantities(problem, fields, constants, occupation).items():
         values = {label: _columns(function, x) for label, function in functions.items()}
-        figures[name] = plot(TITLES[name], {label: v for label, v in values.items() if v is not None})
+        known = {label: v for label, v in values.items() if v is not None}
+        figures[name] = (_curve if problem.dim == 1 else _map)(TITLES[name], x, known)
     return figures
 
 
-def quantities(
-    problem: Problem, fields: Fields, constants: Constants, occupation: str | None
-) -> dict[str, dict[str, Function | None]]:
-    """Name -> the learned, the exact and the simulated function, for what the fields give."""
+def quantities(problem: Problem, fields: Fields, constants: Constants, occupation: str | None) -> dict[str, dict]:
+    """Name -> the learned, the exact and the simulated function, or `None`, for what the fields give."""
     fields = in_float64(fields)
     policies = trained_policies(occupation, problem, fields, constants)
-    drawn: dict[str, dict[str, Function | None]] = {}
+    drawn: dict[str, dict] = {}
     if fields.value is not None:
         drawn["value"] = {"learned": fields.value, "exact": problem.exact_value}
         if problem.has_simulator:
@@ -98,23 +102,20 @@ def quantities(
     for kind, policy in policies.items():
         if kind != "value" or problem.knows_control_matrix:
             drawn[f"control_{kind}"] = {"learned": policy, "exact": problem.exact_control}
-    histogram = problem.dim in BINS and problem.has_simulator
-    learned = None
+    learned, simulated = None, None
     if occupation is not None and (problem.has_simulator or occupation == NETWORK):
         learned = occupation_density(occupation, problem, fields, constants)
-    if learned is not None or histogram:
-        drawn["occupation"] = {"learned": learned, "exact": problem.exact_occupation}
-    if histogram:
-        drawn["occupation"]["simulated"] = simulated_occupation(problem, next(iter(policies.values())))
+    if problem.dim in BINS and problem.has_simulator:
+        simulated = simulated_occupation(problem, next(iter(policies.values())))
+    if learned is not None or simulated is not None:
+        drawn["occupation"] = {"learned": learned, "exact": problem.exact_occupation, "simulated": simulated}
     return drawn
 
 
 @torch.no_grad()
 def simulated_occupation(problem: Problem, policy: Function) -> Function:
-    """A histogram of `mu^u`, for one or two coordinates: where the closed loop of ``policy`` is at a time `T ~ Exp(rho)`.
-
-    Starts weigh `mu0`; their number and the bins are few enough for a fraction of a second.
-    """
+    """A histogram of `mu^u`, for one or two coordinates: where the closed loop of ``policy`` is at a time `T ~ Exp(rho)`,
+    from starts that weigh `mu0`, few enough for a fraction of a second."""
     bins = BINS[problem.dim]
     points, start_mass = initial_points(problem, STARTS, 0, derive_seed(0, Branch.FIGURES), extra=1)
     x0, times = points[:, :-1], -torch.log1p(-points[:, -1]) / problem.discount
@@ -135,31 +136,21 @@ def _columns(function: Function | None, x: Tensor) -> Tensor | None:
     return values.where(torch.isfinite(values), torch.nan)
 
 
-def _line() -> Tensor:
-    return torch.linspace(0.0, 1.0, LINE_POINTS, dtype=torch.float64).unsqueeze(-1)
-
-
-def _curve(title: str, values: dict[str, Tensor]) -> Figure:
+def _curve(title: str, x: Tensor, values: dict[str, Tensor]) -> Figure:
     figure = blank_figure(5.2, 4.0)
     axis = figure.subplots()
     for label, form in (("simulated", "C7"), ("learned", "C0"), ("exact", "k:")):
         if label in values:
-            axis.plot(_line(), values[label], form, label=label)
+            axis.plot(x, values[label], form, label=label)
     if len(axis.lines) > 1:
         axis.legend()
     axis.set(title=title, xlabel="x")
     return figure
 
 
-def _plane(dim: int) -> Tensor:
-    """States on the cut that a map shows, row by row."""
-    middles = (torch.arange(MAP_POINTS, dtype=torch.float64) + 0.5) / MAP_POINTS
-    x = torch.full((MAP_POINTS**2, dim), 0.5, dtype=torch.float64)
-    x[:, :2] = torch.cartesian_prod(middles, middles)
-    return x
-
-
-def _map(title: str, panels: dict[str, Tensor]) -> Figure:
+def _map(title: str, x: Tensor, panels: dict[str, Tensor]) -> Figure:
+    stride = MAP_POINTS // 16
+    some = lambda t: t[:, :2].reshape(MAP_POINTS, MAP_POINTS, 2)[::stride, ::stride].unbind(-1)
     # A control of several components is drawn as its size, with arrows for its first two.
     sizes = {label: v.norm(dim=-1) if v.shape[1] > 1 else v[:, 0] for label, v in panels.items()}
     low = min(float(s.nan_to_num(nan=torch.inf).min()) for s in sizes.values())
@@ -169,9 +160,7 @@ def _map(title: str, panels: dict[str, Tensor]) -> Figure:
         grid = sizes[label].reshape(MAP_POINTS, MAP_POINTS).T
         image = axis.imshow(grid, origin="lower", extent=(0, 1, 0, 1), vmin=low, vmax=high)
         if values.shape[1] > 1:
-            stride = MAP_POINTS // 16
-            places, arrows = (t.reshape(MAP_POINTS, MAP_POINTS, -1)[::stride, ::stride] for t in (_plane(2), values))
-            axis.quiver(*places.unbind(-1), arrows[..., 0], arrows[..., 1], color="w")
+            axis.quiver(*some(x), *some(values), color="w")
         name = f"|{title}|" if values.shape[1] > 1 else title
         axis.set(title=name if label == "learned" else f"{name}, {label}", xlabel="$x_1$", ylabel="$x_2$")
         figure.colorbar(image, ax=axis)

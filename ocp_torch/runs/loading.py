@@ -50,8 +50,7 @@ def load_policy(source: str, problem: Problem) -> Callable | Controller:
 
 
 def load_saved(path: Path, problem: Problem) -> Controller:
-    """A controller of ours, by its file or its run's folder; of the same problem, and for one of the package's, which the
-    file makes again, whatever its parameters were."""
+    """A controller of ours, by its file or its run's folder, for ``problem``, or, of one of the package's, for its class."""
     file = path / "controller.safetensors" if kind(path) == FOLDER else path
     if problem_name(problem) not in PROBLEMS:
         return load_controller(file, problem=problem)

@@ -1,7 +1,4 @@
-"""What a resumed run is made of: its own configuration, and what the command line may change in it.
-
-A problem that is not the package's own is never imported because a file names it.
-"""
+"""What a resumed run is made of: its own configuration, and what the command line may change in it."""
 
 import copy
 from collections.abc import Iterable
@@ -65,6 +62,7 @@ def resumed_configuration(composed: dict, named: Iterable[str]) -> dict:
     problem: Any = result.get("problem")
     target = problem.get("_target_") if isinstance(problem, dict) else None
     if target not in OWN_TARGETS and not {"problem", "problem._target_"} & set(named):
+        # A problem that is not the package's own is never imported because a file names it.
         raise ForeignProblem(
             f"the configuration of {path} names the problem {str(target)[:80]!r}, which is not part of ocp_torch and is not "
             f"imported for a file; name it yourself: problem._target_={UNKNOWN}.",

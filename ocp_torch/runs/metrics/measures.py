@@ -1,5 +1,4 @@
-"""Trajectories at equal times, for numbers and pictures (the certificate has an integrator of its own); what is measured of
-them on each system, and which states are fair to start from."""
+"""Trajectories at equal times, for numbers and pictures: the certificate has its own; and what is measured on each system."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

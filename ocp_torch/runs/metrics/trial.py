@@ -47,21 +47,17 @@ def metrics(problem: Problem, policy: Policy, seed: int = 0, starts: int = START
     duration = TRIAL / problem.discount
     policies = {"controller": policy, "zero": zero_policy(problem), "classical": classical_policy(problem)}
     found = {}
+    # A classical policy knows no limit of the control, and others round.
+    within = lambda each: lambda x: problem.control_cost.within(each(x), torch.ones_like(x[:, 0]))
     for name, each in policies.items():
         if each is not None:
-            path = simulate(problem, _within_limit(problem, each), x0, duration, STEPS)
+            path = simulate(problem, within(each), x0, duration, STEPS)
             found[name] = {**(measure(problem, path) or {}), "cost": float(path.cost.mean())}
     return {"starts": starts, "seed": seed, "duration": duration, **found}
 
 
-def _within_limit(problem: Problem, policy: Policy) -> Policy:
-    """``policy``, shrunk to the problem's control limit where it has one: a classical policy knows none, and others round."""
-    return lambda x: problem.control_cost.within(policy(x), torch.ones_like(x[:, 0]))
-
-
 def random_starts(problem: Problem, count: int, seed: int) -> Tensor:
-    """``count`` starts, ``(count, d)`` float64: drawn from `mu0` where that is narrow; else uniform admissible ones, or all
-    where hardly any is admissible."""
+    """``(count, d)`` float64: drawn from `mu0` where that is narrow; else uniform admissible ones, or any if few are."""
     if starts_narrowly(problem):
         return drawn_starts(problem, count, seed)
     generator = torch.Generator().manual_seed(seed)

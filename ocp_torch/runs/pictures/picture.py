@@ -20,8 +20,7 @@ FRAMES_PER_SECOND, STRIDE, DPI = 12, 4, 60
 
 
 def _panels(problem: Problem, look: Scene, policy: Policy, seed: int) -> list[tuple[str, Path]]:
-    """Titles and paths of ``problem`` under ``policy`` from random admissible starts: each apart, or all in one panel beside
-    the same without control."""
+    """Titles and paths from random admissible starts: each apart, or all in one panel beside the same without control."""
     x0 = random_starts(problem, look.starts, derive_seed(seed, Branch.PICTURES))
     run = lambda each, starts: simulate(problem, each, starts, DURATION / problem.discount, FRAMES)
     if look.apart:
@@ -59,10 +58,8 @@ def require_gif(problem: Problem, path: object) -> FilePath:
 
 
 def animate(problem: Problem, policy: Policy, path: str | FilePath, seed: int = 0) -> FilePath:
-    """Write the motion of ``problem`` under ``policy`` as ``path``, a `.gif`, through Pillow, which Matplotlib brings along.
-
-    Raises `InputError` for another suffix or a problem without a scene, `StorageError` for a file that cannot be written.
-    """
+    """Write the motion of ``problem`` under ``policy`` as ``path``, a `.gif`; `InputError` for another suffix or a problem
+    without a scene, `StorageError` for a file that cannot be written."""
     from matplotlib.animation import PillowWriter
 
     path, look = require_gif(problem, path), scene(problem)
