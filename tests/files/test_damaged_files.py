@@ -11,7 +11,7 @@ import torch
 from ocp_torch.cli.compose import composed
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.files import storage
-from ocp_torch.runs.training_run import training_run
+from ocp_torch.runs.run import training_run
 from ocp_torch.training.checkpoint import MAGIC, SCHEMA, load_checkpoint, newest, save_checkpoint
 from ocp_torch.training.monitor import Silent
 from support.forked import TINY, completed, train
