@@ -3,7 +3,7 @@ r"""A discounted control-affine problem on the unit torus, known through evaluat
 minimise  rho E_{x0 ~ mu0} int_0^inf e^{-rho t} (f(x_t) + |u_t|^q / q) dt,   dx/dt = a(x) + B(x) u
 """
 
-from __future__ import annotations
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from ocp_torch.maths import jets
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.control_limit import control_cost
-from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.reproducible import Reproducible
 from ocp_torch.problems.samples import Samples
 
@@ -27,6 +26,19 @@ MARGIN = 1.05
 # States scanned for narrow features of a user's own data, for each at which a bound is evaluated: more find narrower ones,
 # and take longer.
 SCAN_FACTOR = 32
+
+
+@dataclass(frozen=True)
+class Lipschitz:
+    """`|g(x) - g(y)| <= L |x - y|`, Euclidean in torus units, for each entry `g` of the data; `None` where `L` is unknown.
+
+    A method that is not overridden needs none.
+    """
+
+    state_cost: float | None = None
+    drift: float | None = None
+    control_matrix: float | None = None
+    initial_density: float | None = None
 
 
 class Problem(Reproducible):
@@ -160,7 +172,7 @@ class Problem(Reproducible):
         return Samples.of(self, x, divergences=False)
 
     @property
-    def validation_view(self) -> Problem:
+    def validation_view(self) -> "Problem":
         """The problem as evaluations during training see it, by which choices are made: itself, where fresh states cost
         nothing; a data set gives other samples than the certificate's."""
         return self

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import torch
 
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.objectives.objective import Phase
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers.stepper import Stepper, StepReport
 

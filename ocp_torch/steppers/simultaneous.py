@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.objectives.objective import Phase
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers.stepper import Stepper, StepReport
 
