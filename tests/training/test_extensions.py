@@ -92,5 +92,5 @@ def test_an_architecture_of_ones_own_brings_its_sizes_and_leaves_all_that_a_run_
 
 def test_an_architecture_nobody_knows_is_refused_by_name():
     config = configured(*SMALL)
-    with pytest.raises(InputError, match=r"model\.name is 'ripples', but must be one of mlp, sobolev"):
-        build_trainer({**config, "model": {"name": "ripples"}})
+    with pytest.raises(InputError, match=rf"model\.name is 'nobodys', but must be one of {', '.join(sorted(MODELS))}"):
+        build_trainer({**config, "model": {"name": "nobodys"}})
