@@ -71,14 +71,10 @@ class Problem(Reproducible):
         control_limit: float | None = None,
     ) -> None:
         self.dim = require_integer("problem.dim", dim, 1, maximum=MOST_COORDINATES)
-        self.control_dim = (
-            self.dim
-            if control_dim is None
-            else require_integer("problem.control_dim", control_dim, 1, maximum=MOST_COORDINATES)
-        )
-        self.discount = require_number(
-            "problem.discount", discount, above=0.0, at_least=LEAST_DISCOUNT, at_most=LARGEST_DISCOUNT
-        )
+        controls = self.dim if control_dim is None else control_dim
+        self.control_dim = require_integer("problem.control_dim", controls, 1, maximum=MOST_COORDINATES)
+        within = dict(at_least=LEAST_DISCOUNT, at_most=LARGEST_DISCOUNT)
+        self.discount = require_number("problem.discount", discount, above=0.0, **within)
         self.exponent = require_number("problem.exponent", exponent, above=1.0, at_most=2.0)
         self.control_cost = control_cost(self.exponent, control_limit)
         self.control_limit = None if control_limit is None else float(control_limit)
@@ -185,15 +181,15 @@ class Problem(Reproducible):
     def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
         """The state ``(d,)`` that an observation of the Gymnasium environment ``env`` shows. Override it, with `to_action`,
         for the environments the problem is a model of; ours need neither."""
-        raise InputError(
-            f"{type(self).__name__} does not know the environment {env}: it must define from_observation and to_action."
-        )
+        raise self._unknown(env)
 
     def to_action(self, env: str, control: np.ndarray) -> np.ndarray:
         """The action of ``env`` that applies ``control`` ``(m,)``."""
-        raise InputError(
-            f"{type(self).__name__} does not know the environment {env}: it must define from_observation and to_action."
-        )
+        raise self._unknown(env)
+
+    def _unknown(self, env: str) -> InputError:
+        must = "it must define from_observation and to_action"
+        return InputError(f"{type(self).__name__} does not know the environment {env}: {must}.")
 
     def _like(self, x: Tensor, name: str, constant: Tensor) -> Tensor:
         """``constant`` in the precision and on the device of ``x``, converted once."""

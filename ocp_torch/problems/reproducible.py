@@ -25,4 +25,5 @@ class Reproducible:
         for name, parameter in signature.parameters.items():
             if parameter.kind is parameter.VAR_KEYWORD:
                 found |= found.pop(name)
-        return {name: getattr(self, name, value) for name, value in found.items()}
+        kept = {name: getattr(self, name, value) for name, value in found.items()}
+        return {name: found[name] if inspect.ismethod(value) else value for name, value in kept.items()}

@@ -67,10 +67,6 @@ class Manufactured(Problem):
         self._derive()
 
     @property
-    def parameters(self) -> dict:
-        return {**super().parameters, "drift": self.drift_size}
-
-    @property
     def driftless(self) -> bool:
         return False
 
