@@ -110,10 +110,10 @@ def half_written(path: Path, content: bytes) -> int:
 
 
 FAILING = {
-    "no room for the name": (storage.tempfile, "mkstemp", full, "No space left"),
+    "no room for the name": (storage.tempfile, "NamedTemporaryFile", full, "No space left"),
     "no room for the contents": (Path, "write_bytes", half_written, "No space left"),
     "no room when it is flushed": (storage.os, "fsync", full, "No space left"),
-    "a folder that must not be written": (storage.tempfile, "mkstemp", forbidden, "Permission denied"),
+    "a folder that must not be written": (storage.tempfile, "NamedTemporaryFile", forbidden, "Permission denied"),
     "no folder": (Path, "mkdir", forbidden, "Permission denied"),
 }
 
