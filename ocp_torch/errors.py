@@ -1,7 +1,5 @@
 """What a user is told when an input is wrong: one sentence with the field, the value and what would be right."""
 
-from __future__ import annotations
-
 import difflib
 import inspect
 import math

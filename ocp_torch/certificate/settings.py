@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from ocp_torch.certificate.estimate import CONFIDENCE
 from ocp_torch.certificate.upper.policy_evaluation import StageSettings
 from ocp_torch.errors import InputError, require_choice, require_flag, require_integer, require_number, visible
-from ocp_torch.files.memory import require_memory
+from ocp_torch.files.limits import require_memory
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 

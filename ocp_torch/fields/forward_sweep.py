@@ -6,8 +6,6 @@ curvature `D : h_ij` ``(N, F)``. A linear layer maps them alike. An activation `
 fewer; then one reverse pass gives the gradient.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,7 +25,7 @@ class Along:
     diagonal: Tensor | None  # (N, d): of D, where that is all of it and the directions are the coordinates
 
     @classmethod
-    def of(cls, sigma: Tensor) -> Along:
+    def of(cls, sigma: Tensor) -> "Along":
         """The cheapest directions for the noise ``sigma`` ``(N, d, k)``."""
         d, k = sigma.shape[1:]
         if k < d:
@@ -56,7 +54,7 @@ class Sweep:
     curvature: Tensor  # (N, F)
 
     @classmethod
-    def embedded(cls, embedding: FourierEmbedding, x: Tensor, along: Along) -> Sweep:
+    def embedded(cls, embedding: FourierEmbedding, x: Tensor, along: Along) -> "Sweep":
         """The embedding and its derivatives at the states ``x`` ``(N, d)``."""
         value = embedding(x)
         cosines, sines = value.chunk(2, dim=-1)
@@ -66,17 +64,17 @@ class Sweep:
         bent = along.form(moved, moved).repeat(1, 2)
         return cls(value, torch.cat([-sines * moved, cosines * moved], dim=-1), -bent * value)
 
-    def linear(self, layer: nn.Linear) -> Sweep:
+    def linear(self, layer: nn.Linear) -> "Sweep":
         """Through an affine layer: its bias moves the value alone."""
         return Sweep(layer(self.value), self.slopes @ layer.weight.T, self.curvature @ layer.weight.T)
 
-    def activated(self, activation: nn.Module, along: Along) -> Sweep:
+    def activated(self, activation: nn.Module, along: Along) -> "Sweep":
         """Through a smooth function of each entry."""
         value, first, second = DERIVATIVES[type(activation)](self.value)
         bent = second * along.form(self.slopes, self.slopes)
         return Sweep(value, first * self.slopes, first * self.curvature + bent)
 
-    def times(self, other: Sweep, along: Along) -> Sweep:
+    def times(self, other: "Sweep", along: Along) -> "Sweep":
         """The product of two layers, entry by entry."""
         crossed = 2.0 * along.form(self.slopes, other.slopes)
         return Sweep(

@@ -1,7 +1,5 @@
 """Smooth multilayer perceptrons on a periodic embedding."""
 
-from __future__ import annotations
-
 import copy
 from math import inf
 
@@ -146,7 +144,7 @@ class PeriodicMLP(nn.Module):
         """`D : hess` of each of the features, ``(N, width)``, for noise ``sigma`` ``(N, d, k)``."""
         return self.scale * self._swept_body(x, Along.of(sigma)).curvature
 
-    def shifted_by(self, weights: Tensor) -> PeriodicMLP:
+    def shifted_by(self, weights: Tensor) -> "PeriodicMLP":
         """A copy whose one output has ``weights`` ``(width,)`` times the features added."""
         other = copy.deepcopy(self)
         with torch.no_grad():

@@ -5,8 +5,6 @@ Along one path halving a step changes a result by its square root; but the mean 
 paths, what they differ by shows little of the noise itself.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -43,10 +41,10 @@ class Grid:
         return torch.linspace(0.0, 1.0, self.steps + 1, dtype=self.horizon.dtype) ** self.grading
 
     @property
-    def halved(self) -> Grid:
+    def halved(self) -> "Grid":
         return Grid(self.horizon, 2 * self.steps, self.grading)
 
-    def of(self, rows: slice) -> Grid:
+    def of(self, rows: slice) -> "Grid":
         """That of the paths ``rows``."""
         return Grid(self.horizon[rows], self.steps, self.grading)
 

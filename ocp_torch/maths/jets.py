@@ -8,8 +8,6 @@ Noise adds `D : hess`, `D = sigma sigma^T / 2`, for columns of `sigma` ``(N, d, 
 column. A field that knows a shorter way has a method ``jet(x, sigma)`` of its own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -32,13 +30,13 @@ class Jet:
     gradient: Any
     curvature: Any = None
 
-    def map(self, function: Callable[[Any], Any]) -> Jet:
+    def map(self, function: Callable[[Any], Any]) -> "Jet":
         """``function`` of each part, for what acts on all alike: a choice of states, a multiple, the field as mere data."""
         curvature = None if self.curvature is None else function(self.curvature)
         return Jet(function(self.value), function(self.gradient), curvature)
 
     @staticmethod
-    def concatenate(jets: list[Jet]) -> Jet:
+    def concatenate(jets: "list[Jet]") -> "Jet":
         """The jets of one field at several batches of states as one."""
         curvature = None if jets[0].curvature is None else torch.cat([j.curvature for j in jets])
         return Jet(torch.cat([j.value for j in jets]), torch.cat([j.gradient for j in jets]), curvature)

@@ -6,8 +6,6 @@ equation for `V`, and the residual of Liouville's (with noise Fokker and Planck'
 They are written here, once.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,7 +50,7 @@ class Generator:
     cost: PowerCost | Any = None
 
     @classmethod
-    def of(cls, problem: Problem, samples: Samples) -> Generator:
+    def of(cls, problem: Problem, samples: Samples) -> "Generator":
         """That of ``problem`` at ``samples`` of it."""
         return cls(samples, problem.discount, problem.control_cost)
 

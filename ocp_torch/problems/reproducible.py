@@ -17,13 +17,11 @@ class Reproducible:
     def parameters(self) -> dict:
         """The arguments that make this object again: each `__init__` argument is read from the attribute of its name, or,
         where there is none, is what was given."""
-        args, kwargs = self._given
-        signature = inspect.signature(type(self).__init__)
+        signature, (args, kwargs) = inspect.signature(type(self).__init__), self._given
         bound = signature.bind(self, *args, **kwargs)
         bound.apply_defaults()
         found = dict(list(bound.arguments.items())[1:])
-        for name, parameter in signature.parameters.items():
-            if parameter.kind is parameter.VAR_KEYWORD:
-                found |= found.pop(name)
+        for name in (n for n, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD):
+            found |= found.pop(name)
         kept = {name: getattr(self, name, value) for name, value in found.items()}
         return {name: found[name] if inspect.ismethod(value) else value for name, value in kept.items()}

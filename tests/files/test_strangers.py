@@ -28,14 +28,13 @@ from ocp_torch.problems import Kuramoto, Torus
 from ocp_torch.problems.recorded.recording import read
 from ocp_torch.problems.simulator.target import resolved
 from ocp_torch.problems.systems.robot import read_chain
-from ocp_torch.runs import figures
+from ocp_torch.runs import canvas
 from ocp_torch.runs.compare import compare
 from ocp_torch.runs.configuration import read_configuration, saved_configuration
 from ocp_torch.runs.evaluate import certify_saved, load_run, settings_for
-from ocp_torch.runs.interval import interval_figure
+from ocp_torch.runs.figures import interval_figure
 from ocp_torch.runs.loading import load_policy
-from ocp_torch.runs.run import summary
-from ocp_torch.runs.training_run import training_run
+from ocp_torch.runs.run import summary, training_run
 from ocp_torch.studies.reference.session import ReferenceJob
 from ocp_torch.training.checkpoint import load_checkpoint
 from support.forked import command
@@ -169,7 +168,7 @@ def test_a_name_in_a_figure_is_no_formula(run, tmp_path):
     certificate = json.loads((run / "certificate.json").read_text())
     for name in ("$\\nothing{", "$x$", ESCAPE, "x" * 10**5):
         figure = interval_figure({**certificate, "problem": name})
-        figures.save({"certificate": figure}, tmp_path)
+        canvas.save({"certificate": figure}, tmp_path)
         assert figure.axes[0].get_title().startswith(visible(name)[:20])
     (tmp_path / "runs" / "$\\bad{").mkdir(parents=True)
     (tmp_path / "runs" / "$\\bad{" / "certificate.json").write_text(json.dumps(certificate))

@@ -13,7 +13,7 @@ from ocp_torch.errors import InputError
 from ocp_torch.gym.environment import ControlEnvironment, clocks, observe, require_gymnasium, state_of
 from ocp_torch.gym.rollout import Agent, RolloutJob, made, play, save_gif
 from ocp_torch.problems import PROBLEMS, Dataset, Manufactured
-from ocp_torch.runs.record import Recorder
+from ocp_torch.runs.record import record
 from support import zoo
 from support.small import session, small
 
@@ -102,7 +102,7 @@ def test_actions_beyond_the_limit_are_cut_to_the_ball(gymnasium):
 
 def test_a_data_set_is_no_environment(tmp_path):
     path = tmp_path / "a.npz"
-    Recorder(zoo.build("circle rho=2"), 300, path, 0, True, 0.0).run()
+    record(zoo.build("circle rho=2"), 300, path, 0, True, 0.0)
     with pytest.raises(InputError, match="cannot be simulated"):
         ControlEnvironment(Dataset(str(path)))
 
@@ -270,7 +270,7 @@ def test_the_pendulum_is_gymnasiums_over_a_short_time(theirs):
 
 def test_a_saved_pendulum_controller_plays_gymnasiums_untouched(gymnasium, tmp_path):
     """The classical swing-up through the same maps: what does not swing up returns about -1200."""
-    from ocp_torch.runs.metrics import classical_policy
+    from ocp_torch.runs.metrics.classical import classical_policy
 
     pendulum = PROBLEMS["pendulum"](torque_cost=0.001, control_limit=1.0)
     policy = classical_policy(pendulum)

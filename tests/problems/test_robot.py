@@ -8,8 +8,9 @@ from PIL import Image
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Arm, RobotArm
 from ocp_torch.problems.systems.linkage import Linkage
-from ocp_torch.runs.metrics import classical_policy, metrics
-from ocp_torch.runs.pictures import motion
+from ocp_torch.runs.metrics.classical import classical_policy
+from ocp_torch.runs.metrics.trial import metrics
+from ocp_torch.runs.pictures.picture import motion
 
 IDENTITY = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 

@@ -21,7 +21,7 @@ CHECKS = {
     "certify": "arguments",
     "evaluate": "recertification",
     "reference": "ReferenceJob",
-    "record": "recorder",
+    "record": "arguments",
     "rollout": "RolloutJob",
     "benchmark": "Contest",
     "reproduce_paper": "check",

@@ -14,7 +14,7 @@ from ocp_torch.control import policies
 from ocp_torch.errors import InputError, require_integer, require_number
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.fields.sobolev import SobolevFeatures
-from ocp_torch.files.memory import require_memory
+from ocp_torch.files.limits import require_memory
 from ocp_torch.gym.environment import ControlEnvironment, observe
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
