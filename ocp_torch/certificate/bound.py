@@ -1,5 +1,7 @@
 """What a bound is: a number on one side of the optimum, how it is found, and what it rests on."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, cast
 

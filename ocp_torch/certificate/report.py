@@ -1,5 +1,7 @@
 """A certificate as `certificate.json` holds it, by a stable schema, and that as a table for the terminal, and in words."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
