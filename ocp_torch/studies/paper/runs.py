@@ -14,7 +14,7 @@ from ocp_torch.problems import Circle
 from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.studies.benchmark.contenders import OCCUPATION, SCHEDULE
 from ocp_torch.studies.benchmark.measure import Judge, relative
-from ocp_torch.studies.kernel.expansions import BernoulliKernel
+from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
 from ocp_torch.studies.kernel.iterations import Iteration, step_sizes
 
 Tick = Callable[[int], None]

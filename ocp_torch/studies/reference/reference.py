@@ -1,7 +1,8 @@
 """A reference for `V*` and `OPT` in one to three dimensions, from grids alone: no network, no objective, no certificate."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -9,6 +10,7 @@ from torch import Tensor
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
 from ocp_torch.studies.reference.error import extrapolate, look_between
+from ocp_torch.studies.reference.finite_differences import FiniteDifferences
 from ocp_torch.studies.reference.grid import PIECE, Grid, grid_sides, require_solvable
 from ocp_torch.studies.reference.policy_iteration import GridSolution, solve
 from ocp_torch.studies.reference.semi_lagrangian import CLIP, SemiLagrangian, minimiser
@@ -18,6 +20,8 @@ CELLS, LONGEST = 1.0, 0.25
 # Policy iteration ends where one more policy changes V by less, relative to the oscillation of f; and where it only makes a
 # start for another.
 TOLERANCE, ROUGH = 1e-7, 1e-3
+# With noise, where policy iteration converges like Newton's: ten digits of the optimum, of what is left to be summed.
+WITH_NOISE = 1e-12
 # How fast a typical state moves is found on a grid of at most so many nodes per coordinate, by dimension. The optimal speed
 # depends on the step a little, so it is found again with the step it gave, so many times in all.
 SPEED_SIDE, SPEED_ROUNDS = {1: 64, 2: 32, 3: 16}, 3
@@ -53,6 +57,12 @@ class Reference:
         """The controls of the finest grid, each held for one step, ``(side,) * d + (m,)``."""
         return self.solution.control.reshape(*self.value.shape, -1)
 
+    @property
+    def occupation(self) -> Tensor | None:
+        """The density `mu*` of the finest grid, ``(side,) * d``; `None` without noise."""
+        found = self.solution.occupation
+        return None if found is None else found.reshape(self.value.shape)
+
     def interpolate(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """`V` ``(N,)`` and `u = grad R*(-B^T grad V / rho)` ``(N, m)`` at states ``(N, d)``, any reals.
 
@@ -71,30 +81,22 @@ class Reference:
 
 
 def solve_reference(problem: Problem, side: int | None = None, memory: float = 4.0) -> Reference:
-    """Solve ``problem`` on three grids, the finest with ``side`` nodes per coordinate (None: 1024, 192, 40 by dimension).
+    """Solve ``problem`` on three grids, the finest with ``side`` nodes per coordinate (None: 1024, 192, 40 by dimension,
+    4096 in one with noise).
 
     ``memory`` in gigabytes is what the finest may take. Raises `InputError` for more than three dimensions, a grid that
     does not fit, functions that are not finite or not periodic, and a control cost other than `|u|^q / q`.
     """
-    sides = grid_sides(problem.dim, side, memory)
+    sides = grid_sides(problem, side, memory)
     with torch.no_grad():
         require_solvable(problem, Grid(problem.dim, sides[0]))
-        start, pace = _speed(problem, sides[0])
-        rise = float(start.value.max() - start.value.min())
-        solutions = []
-        for n in sides:
-            grid = Grid(problem.dim, n)
-            value, control = _carried(start, grid)
-            # The monotone scheme first: from a rough policy the clipped one may not settle.
-            rough = solve(SemiLagrangian(problem, grid, pace * grid.spacing), value, control, ROUGH)
-            scheme = SemiLagrangian(problem, grid, pace * grid.spacing, rise)
-            start = solve(scheme, rough.value, rough.control, TOLERANCE)
-            solutions.append(start)
+        solutions, even = (_with_noise if problem.noisy else _without_noise)(problem, sides)
+        start = solutions[-1]
         estimates = tuple(_mean(problem, s) for s in solutions)
         fall, missing, unknown = look_between(problem, start.grid)
         change = float((_carried(solutions[1], start.grid)[0] - start.value).abs().max())
     noise = max(s.residual + s.defect for s in solutions)
-    result = extrapolate([1.0 / n for n in sides], estimates, noise)
+    result = extrapolate([1.0 / n for n in sides], estimates, noise, even)
     error = result.error if unknown is None else None
     if error is not None:
         error = error + noise + fall + missing * float(start.value.abs().max())
@@ -102,6 +104,41 @@ def solve_reference(problem: Problem, side: int | None = None, memory: float = 4
         unknown = "the three grids do not approach evenly"
     unsettled = max(s.residual for s in solutions)
     return Reference(problem, result.optimum, error, result.order, sides, estimates, change, unsettled, start, unknown)
+
+
+def _without_noise(problem: Problem, sides: Sequence[int]) -> tuple[list[GridSolution], bool]:
+    """The solutions on grids of ``sides`` nodes a coordinate, and whether their error is known to be a series in `h^2`."""
+    start, pace = _speed(problem, sides[0])
+    rise = float(start.value.max() - start.value.min())
+    solutions = []
+    for n in sides:
+        grid = Grid(problem.dim, n)
+        value, control = _carried(start, grid)
+        # The monotone scheme first: from a rough policy the clipped one may not settle.
+        rough = solve(SemiLagrangian(problem, grid, pace * grid.spacing), value, control, ROUGH)
+        scheme = SemiLagrangian(problem, grid, pace * grid.spacing, rise)
+        start = solve(scheme, rough.value, rough.control, TOLERANCE)
+        solutions.append(start)
+    return solutions, False
+
+
+def _with_noise(problem: Problem, sides: Sequence[int]) -> tuple[list[GridSolution], bool]:
+    """The same by finite differences, with densities. Their error is a series in `h^2` where noise alone makes the weights
+    positive, along each coordinate and on all grids."""
+    solutions: list[GridSolution] = []
+    even = True
+    for n in sides:
+        scheme = FiniteDifferences(problem, Grid(problem.dim, n))
+        value, control = scheme.f.clone(), scheme.f.new_zeros(scheme.grid.count, problem.control_dim)
+        if solutions:
+            value, control = _carried(solutions[-1], scheme.grid)
+        rough = solve(scheme, value, control, ROUGH)
+        scheme = FiniteDifferences(problem, scheme.grid, float(rough.value.max() - rough.value.min()))
+        found = solve(scheme, rough.value, rough.control, WITH_NOISE)
+        even = even and not scheme.needs_viscosity(found.control)
+        occupation = scheme.occupation(found.value, found.control, WITH_NOISE)
+        solutions.append(replace(found, occupation=occupation))
+    return solutions, even
 
 
 def _speed(problem: Problem, coarsest: int) -> tuple[GridSolution, float]:
