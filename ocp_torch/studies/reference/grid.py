@@ -38,21 +38,22 @@ class Stencil:
 
 
 class Grid:
-    """``side`` nodes per coordinate of the `dim`-dimensional unit torus, at multiples of `h = 1 / side`; float64."""
+    """``side`` nodes per coordinate of the `dim`-dimensional unit torus, at multiples of `h = 1 / side`, all moved by
+    ``offset`` cells along each coordinate; float64."""
 
-    def __init__(self, dim: int, side: int) -> None:
-        self.dim, self.side = dim, side
+    def __init__(self, dim: int, side: int, offset: float = 0.0) -> None:
+        self.dim, self.side, self.offset = dim, side, offset
         self.count, self.spacing = side**dim, 1.0 / side
         self._strides = [side ** (dim - 1 - k) for k in range(dim)]
 
     def nodes(self) -> Tensor:
         """All nodes, ``(side^d, d)``, the last coordinate running fastest."""
-        line = torch.arange(self.side, dtype=torch.float64) / self.side
+        line = (torch.arange(self.side, dtype=torch.float64) + self.offset) / self.side
         return torch.cartesian_prod(*[line] * self.dim).reshape(-1, self.dim)
 
     def stencil(self, x: Tensor) -> Stencil:
         """The stencils at points ``(N, d)``, any reals."""
-        position = x * self.side
+        position = x * self.side - self.offset
         base = position.floor()
         t = (position - base).unsqueeze(-1)
         s, r, p = t - 1.0, t - 2.0, t + 1.0

@@ -15,8 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ocp_torch.maths.supremum import batched
+from ocp_torch.problems.problem import Problem
 from ocp_torch.studies.reference.finite_differences import FiniteDifferences
-from ocp_torch.studies.reference.grid import Grid
+from ocp_torch.studies.reference.grid import PIECE, Grid
 from ocp_torch.studies.reference.semi_lagrangian import SemiLagrangian, minimiser, running_cost
 
 # Policy iteration takes some ten policies; more than so many go in circles.
@@ -51,6 +53,21 @@ class GridSolution:
     residual: float
     defect: float
     occupation: Tensor | None = None
+
+    def carried(self, grid: Grid) -> tuple[Tensor, Tensor]:
+        """Value and control at the nodes of another grid, the control from the nearest node."""
+        values, controls = [], []
+        for part in grid.nodes().split(PIECE):
+            stencil = self.grid.stencil(part)
+            values.append((stencil.cubic * self.value[stencil.index]).sum(dim=-1))
+            nearest = stencil.index.gather(1, stencil.linear.argmax(dim=1, keepdim=True)).squeeze(1)
+            controls.append(self.control[nearest])
+        return torch.cat(values), torch.cat(controls)
+
+    def mean(self, problem: Problem) -> float:
+        """`int V dmu0` by the rule of equal weights, which on a torus is the trapezoidal one."""
+        density = batched(problem.initial_density, self.grid.nodes(), PIECE)
+        return math.fsum((self.value * density).tolist()) / self.grid.count
 
 
 def solve(scheme: SemiLagrangian | FiniteDifferences, value: Tensor, control: Tensor, relative: float) -> GridSolution:

@@ -2,26 +2,23 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
 from ocp_torch.studies.reference.error import extrapolate, look_between
-from ocp_torch.studies.reference.finite_differences import FiniteDifferences
 from ocp_torch.studies.reference.grid import PIECE, Grid, grid_sides, require_solvable
 from ocp_torch.studies.reference.policy_iteration import GridSolution, solve
 from ocp_torch.studies.reference.semi_lagrangian import CLIP, SemiLagrangian, minimiser
+from ocp_torch.studies.reference.with_noise import error_of_jumps, moved_numbers, with_noise
 
 # The step moves a typical state by this many cells, and is at most this share of 1 / rho on the coarsest grid.
 CELLS, LONGEST = 1.0, 0.25
 # Policy iteration ends where one more policy changes V by less, relative to the oscillation of f; and where it only makes a
 # start for another.
 TOLERANCE, ROUGH = 1e-7, 1e-3
-# With noise, where policy iteration converges like Newton's: ten digits of the optimum, of what is left to be summed.
-WITH_NOISE = 1e-12
 # How fast a typical state moves is found on a grid of at most so many nodes per coordinate, by dimension. The optimal speed
 # depends on the step a little, so it is found again with the step it gave, so many times in all.
 SPEED_SIDE, SPEED_ROUNDS = {1: 64, 2: 32, 3: 16}, 3
@@ -90,16 +87,18 @@ def solve_reference(problem: Problem, side: int | None = None, memory: float = 4
     sides = grid_sides(problem, side, memory)
     with torch.no_grad():
         require_solvable(problem, Grid(problem.dim, sides[0]))
-        solutions, even = (_with_noise if problem.noisy else _without_noise)(problem, sides)
-        start = solutions[-1]
-        estimates = tuple(_mean(problem, s) for s in solutions)
+        solutions, even = (with_noise if problem.noisy else _without_noise)(problem, sides)
+        start, moved = solutions[-1], moved_numbers(problem, solutions[0]) if problem.noisy else []
+        estimates = tuple(s.mean(problem) for s in solutions)
         fall, missing, unknown = look_between(problem, start.grid)
-        change = float((_carried(solutions[1], start.grid)[0] - start.value).abs().max())
+        change = float((solutions[1].carried(start.grid)[0] - start.value).abs().max())
     noise = max(s.residual + s.defect for s in solutions)
     result = extrapolate([1.0 / n for n in sides], estimates, noise, even)
     error = result.error if unknown is None else None
     if error is not None:
         error = error + noise + fall + missing * float(start.value.abs().max())
+        if moved:
+            error += error_of_jumps(sides, estimates[0], result.optimum, moved)
     elif unknown is None:
         unknown = "the three grids do not approach evenly"
     unsettled = max(s.residual for s in solutions)
@@ -113,32 +112,13 @@ def _without_noise(problem: Problem, sides: Sequence[int]) -> tuple[list[GridSol
     solutions = []
     for n in sides:
         grid = Grid(problem.dim, n)
-        value, control = _carried(start, grid)
+        value, control = start.carried(grid)
         # The monotone scheme first: from a rough policy the clipped one may not settle.
         rough = solve(SemiLagrangian(problem, grid, pace * grid.spacing), value, control, ROUGH)
         scheme = SemiLagrangian(problem, grid, pace * grid.spacing, rise)
         start = solve(scheme, rough.value, rough.control, TOLERANCE)
         solutions.append(start)
     return solutions, False
-
-
-def _with_noise(problem: Problem, sides: Sequence[int]) -> tuple[list[GridSolution], bool]:
-    """The same by finite differences, with densities. Their error is a series in `h^2` where noise alone makes the weights
-    positive, along each coordinate and on all grids."""
-    solutions: list[GridSolution] = []
-    even = True
-    for n in sides:
-        scheme = FiniteDifferences(problem, Grid(problem.dim, n))
-        value, control = scheme.f.clone(), scheme.f.new_zeros(scheme.grid.count, problem.control_dim)
-        if solutions:
-            value, control = _carried(solutions[-1], scheme.grid)
-        rough = solve(scheme, value, control, ROUGH)
-        scheme = FiniteDifferences(problem, scheme.grid, float(rough.value.max() - rough.value.min()))
-        found = solve(scheme, rough.value, rough.control, WITH_NOISE)
-        even = even and not scheme.needs_viscosity(found.control)
-        occupation = scheme.occupation(found.value, found.control, WITH_NOISE)
-        solutions.append(replace(found, occupation=occupation))
-    return solutions, even
 
 
 def _speed(problem: Problem, coarsest: int) -> tuple[GridSolution, float]:
@@ -161,20 +141,3 @@ def _speed(problem: Problem, coarsest: int) -> tuple[GridSolution, float]:
         speed = max(float(g.abs().amax(dim=-1).square().mean().sqrt()), 1e-300)
         step = min(longest, CELLS * grid.spacing / speed)
     return rough, min(CELLS / speed, longest * coarsest)
-
-
-def _carried(solution: GridSolution, grid: Grid) -> tuple[Tensor, Tensor]:
-    """Value and control of ``solution`` at the nodes of another grid, the control from the nearest node."""
-    values, controls = [], []
-    for part in grid.nodes().split(PIECE):
-        stencil = solution.grid.stencil(part)
-        values.append((stencil.cubic * solution.value[stencil.index]).sum(dim=-1))
-        nearest = stencil.index.gather(1, stencil.linear.argmax(dim=1, keepdim=True)).squeeze(1)
-        controls.append(solution.control[nearest])
-    return torch.cat(values), torch.cat(controls)
-
-
-def _mean(problem: Problem, solution: GridSolution) -> float:
-    """`int V dmu0` by the rule of equal weights, which on a torus is the trapezoidal one."""
-    density = batched(problem.initial_density, solution.grid.nodes(), PIECE)
-    return math.fsum((solution.value * density).tolist()) / solution.grid.count
