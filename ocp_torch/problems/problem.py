@@ -166,11 +166,17 @@ class Problem(Reproducible):
         return torch.einsum("inim->nm", tangents)
 
     @property
-    def gives_divergences(self) -> bool:
-        """Whether `div a`, `div B` and, where there is noise, `div D` are to be had."""
+    def unknown_divergences(self) -> str:
+        """Of which of `a`, `B` and, where there is noise, `D` no divergences are to be had, in words; empty for none."""
         x = torch.full((1, self.dim), 0.5, dtype=torch.float64)
-        known = self.drift_divergence(x) is not None and self.control_divergence(x) is not None
-        return known and (not self.noisy or self.noise_divergences(x) is not None)
+        found: dict[str, object] = {"a": self.drift_divergence(x), "B": self.control_divergence(x)}
+        found |= {"D": self.noise_divergences(x)} if self.noisy else {}
+        return " and ".join(name for name, value in found.items() if value is None)
+
+    @property
+    def gives_divergences(self) -> bool:
+        """Whether all of these are to be had."""
+        return not self.unknown_divergences
 
     # Exact truth, where known: `None` otherwise.
     def exact_value(self, x: Tensor) -> Tensor | None:
