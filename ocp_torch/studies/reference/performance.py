@@ -39,8 +39,8 @@ def _evaluated(problem: Problem, policy: Policy, grid: Grid) -> tuple[float, boo
     """`Perf` on one grid, and whether noise alone makes its weights positive."""
     scheme, x = FiniteDifferences(problem, grid), grid.nodes()
     control = batched(policy, x, PIECE).to(scheme.f)
-    rough = scheme.evaluate(scheme.f, control, TOLERANCE)
+    rough = scheme.evaluate(scheme.f, control, TOLERANCE[grid.dim])
     scheme = FiniteDifferences(problem, grid, float(rough.max() - rough.min()))
-    value = scheme.evaluate(rough, control, TOLERANCE)
+    value = scheme.evaluate(rough, control, TOLERANCE[grid.dim])
     mean = math.fsum((value * batched(problem.initial_density, x, PIECE)).tolist()) / grid.count
     return mean, not scheme.needs_viscosity(control)
