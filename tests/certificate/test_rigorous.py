@@ -14,12 +14,14 @@ from hypothesis import strategies as st
 
 from ocp_torch.certificate import CertificateSettings, Run, Trained, certify_fields, table
 from ocp_torch.certificate.lower.shifted import slack_function
+from ocp_torch.certificate.proof.activated import activate
 from ocp_torch.certificate.proof.activations import SERIES
 from ocp_torch.certificate.proof.cover import cell_models
 from ocp_torch.certificate.proof.enclosures import Enclosure, enclosure
-from ocp_torch.certificate.proof.models import Box, SmoothModel, absolute, power, reciprocal
-from ocp_torch.certificate.proof.network_model import activate, embed, network_model, product
+from ocp_torch.certificate.proof.models import Box, absolute, power, reciprocal
+from ocp_torch.certificate.proof.network_model import embed, network_model, product
 from ocp_torch.certificate.proof.rigorous import contradiction, obstacle, rigorous_lower_bound
+from ocp_torch.certificate.proof.smooth import SmoothModel
 from ocp_torch.certificate.proof.taylor import TaylorModel
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
@@ -126,9 +128,9 @@ def test_a_network_and_its_gradient_lie_in_their_models(dim, degree, level, acti
     V = network(dim, seed, activation=activation, gated=gated, depth=depth)
     box = random_box(dim, level, degree, seed)
     t = corners_and_inside(box)
-    value, gradient = network_model(V, box)
-    assert holds(value, flat(V, box, t), t)
-    assert holds(gradient, flat(lambda x: jet(V, x).gradient, box, t), t)
+    found = network_model(V, box)
+    assert holds(found.value, flat(V, box, t), t)
+    assert holds(found.gradient, flat(lambda x: jet(V, x).gradient, box, t), t)
 
 
 def perturbed_models(degree: int, size: float, offset: float, slope: float, seed: int):
@@ -186,8 +188,8 @@ def test_radii_shrink_at_the_order_of_the_expansion(degree):
     radii = []
     for level in (7, 8):  # well above the floor of rounding
         box = random_box(2, level, degree, 0)
-        value, gradient = network_model(V, Box(box.centre, torch.full_like(box.half, 0.5 / 2**level), degree))
-        radii.append((float(value.radius.median()), float(gradient.radius.median())))
+        found = network_model(V, Box(box.centre, torch.full_like(box.half, 0.5 / 2**level), degree))
+        radii.append((float(found.value.radius.median()), float(found.gradient.radius.median())))
     (value, slope), (finer_value, finer_slope) = radii
     assert value / finer_value == pytest.approx(2.0 ** (degree + 1), rel=0.35)
     assert slope / finer_slope == pytest.approx(2.0**degree, rel=0.35)
@@ -199,7 +201,8 @@ def test_rounding_is_enclosed_on_the_smallest_cells(gated):
     V = network(2, 7, activation="tanh", gated=gated, width=32)
     box = random_box(2, 6, 3, 1)
     box = Box(box.centre, torch.full_like(box.half, 2.0**-32), 3)
-    value, gradient = network_model(V, box)
+    found = network_model(V, box)
+    value, gradient = found.value, found.gradient
     exact = lambda p: p.numpy().astype(np.longdouble)
     x = exact(box.centre)
     waves = np.array([[1, 0], [2, 0], [0, 1], [0, 2], [1, -2], [1, 1]], dtype=np.longdouble)

@@ -66,10 +66,8 @@ def obstacle(problem: Problem, value: Field) -> str | None:
     """Why there can be no rigorous bound for ``value`` on ``problem``; `None` where there can."""
     if problem.dim > MOST_DIMENSIONS:
         return f"cells cover the torus in at most {MOST_DIMENSIONS} dimensions, and this problem has {problem.dim}"
-    if problem.noisy:
-        return "there is noise, and the models of V have no second derivatives"
     if not is_known(value):
-        return "V is not one of the package's own scalar networks"
+        return "V is not one of the package's own scalar networks or Sobolev fields"
     weights = [*value.parameters(), *value.buffers()]
     if not all(bool(torch.isfinite(w).all()) for w in weights):
         return "V has weights that are not finite"
@@ -97,6 +95,11 @@ def contradiction(problem: Problem, box: Box, found: Enclosure, t: Tensor) -> st
     powers = torch.stack([(t ** t.new_tensor(alpha)).prod(dim=-1) for alpha in box.basis.exponents])
     models = {"state_cost": found.f, "control_matrix": found.B, "initial_density": found.mu0}
     models["drift"] = found.a or box.constant(torch.zeros_like(x))
+    sigma = problem.noise(x)
+    if sigma is not None or found.noise is not None:
+        if sigma is None or found.noise is None or found.noise.radius.shape != sigma.shape:
+            return "noise"
+        models["noise"] = found.noise
     for name, model in models.items():
         value = getattr(problem, name)(x)
         shaped = powers.reshape(*powers.shape, *[1] * (value.dim() - 1))
