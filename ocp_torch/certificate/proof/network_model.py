@@ -19,7 +19,7 @@ from ocp_torch.certificate.proof.models import Box
 from ocp_torch.certificate.proof.smooth import SmoothModel, derivatives
 from ocp_torch.certificate.proof.taylor import ROUNDING, TaylorModel, upward
 from ocp_torch.fields.mlp import Gated, PeriodicMLP
-from ocp_torch.fields.sobolev import SobolevField
+from ocp_torch.fields.sobolev import SobolevFeatures, SobolevField
 from ocp_torch.maths.jets import Jet
 from ocp_torch.maths.sums import summed
 
@@ -32,7 +32,7 @@ def is_known(field: object) -> TypeGuard[Known]:
     """Whether `network_model` encloses ``field``: the package's own scalar Sobolev field, or its own scalar perceptron with
     activations in plain form."""
     if type(field) is SobolevField:
-        return field.scalar
+        return field.scalar and type(field.features) is SobolevFeatures
     plain = lambda layer: getattr(layer, "approximate", "none") == "none" and getattr(layer, "beta", 1.0) == 1.0
     known = lambda layer: plain(layer) and type(layer) in (nn.Sequential, nn.Linear, Gated, *SERIES)
     return type(field) is PeriodicMLP and field.scalar and all(map(known, field.body.modules()))
