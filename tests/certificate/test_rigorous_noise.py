@@ -43,7 +43,7 @@ def field_of(kind: str, dim: int, seed: int, gated: bool, depth: int):
 @settings(max_examples=20)
 @given(
     dim=st.sampled_from([1, 2]),
-    degree=st.integers(2, 5),
+    degree=st.integers(2, 6),
     level=st.integers(2, 9),
     kind=st.sampled_from(["sobolev", *sorted(ACTIVATIONS)]),
     gated=st.booleans(),

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.lower.shifted import slack_function
-from ocp_torch.certificate.proof.cover import DEGREE, Cover
+from ocp_torch.certificate.proof.cover import Cover, degree
 from ocp_torch.certificate.proof.enclosures import EVALUATION, Enclosure, conjugate_model, enclosure
 from ocp_torch.certificate.proof.models import Box, equal_cells
 from ocp_torch.certificate.proof.network_model import is_known
@@ -76,7 +76,7 @@ def obstacle(problem: Problem, value: Field) -> str | None:
     if not enclosure.holds_for(problem) or not conjugate_model.holds_for(problem.control_cost):
         return "the problem's class changes its data, but not the enclosure it inherits"
     generator = fixed_generator()
-    box = equal_cells(problem.dim, SPOT_CELLS, DEGREE[problem.dim])
+    box = equal_cells(problem.dim, SPOT_CELLS, degree(problem))
     if enclosure(problem, box) is None:
         return "the problem gives neither an enclosure of its data nor their Lipschitz constants (lipschitz)"
     for size in SPOT_SIZES:
@@ -136,7 +136,7 @@ def rigorous_lower_bound(
     room = tolerance * max(float(initial.abs().mean()), LEAST_SIZE * float(cost.abs().mean()), 1e-300)
     if sampled_slack is None:
         sampled_slack = supremum(slack_function(problem, lambda x: theta * value(x)), points).value
-    first = equal_cells(problem.dim, FIRST_CELLS[problem.dim], DEGREE[problem.dim])
+    first = equal_cells(problem.dim, FIRST_CELLS[problem.dim], degree(problem))
     pieces = zip(first.centre.split(CHUNK), first.half.split(CHUNK), strict=True)
     pending, finished = Cover.join([Cover.of(problem, value, theta, *piece) for piece in pieces]), []
     count, goal = len(pending), sampled_slack + room
