@@ -131,21 +131,21 @@ def test_with_noise_the_occupation_density_is_the_mean_over_paths(problem):
 
 
 @zoo.on(("noisy 1-d", "noisy 2-d degenerate"))
-@pytest.mark.parametrize("horizon", ["truncated", "random"])
+@pytest.mark.parametrize("horizon", ["truncated", pytest.param("random", marks=pytest.mark.nightly)])
 def test_any_control_variate_gives_the_performance_with_noise(problem, horizon):
-    """`Perf = E[V mu0] - E int rho e^{-rho t} Q_u` for a rough `V`, by Ito's formula; of 20 intervals 4 may miss, 1 is
+    """`Perf = E[V mu0] - E int rho e^{-rho t} Q_u` for a rough `V`, by Ito's formula; of 12 intervals 3 may miss, 1 is
     expected."""
     value, missed = zoo.rough_network(problem.dim, seed=1, size=0.05), 0
     x = zoo.states(problem, 2**16, seed=5)
     initial = [float((value(x) * problem.initial_density(x)).mean())] * 4
-    for seed in range(20):
+    for seed in range(12):
         found = simulate_performance(
             problem, problem.exact_control, 32, 4, seed, value=value, initial=initial, horizon=horizon, tolerance=1e-3
         ).perf
         low, high = found.interval(0.95)
         missed += not low <= problem.exact_optimum <= high
         assert high - low < (0.2 if horizon == "truncated" else 0.6) * problem.exact_optimum
-    assert missed <= 4
+    assert missed <= 3
 
 
 @zoo.on(zoo.QUIET)
