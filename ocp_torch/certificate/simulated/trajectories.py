@@ -146,7 +146,7 @@ def settled_occupation(problem: Problem, policy: Policy, x: Tensor) -> Tensor:
         pieces.append(means.mean(dim=1) - (2.0 / math.sqrt(paths) * means.std(dim=1) if problem.noisy else 0.0))
         # From here on the discount of the time that has passed is part of the factor.
         state = torch.cat([state[:, :-1].remainder(1.0), state[:, -1:] - PIECE], dim=-1)
-        if bool((piece <= SETTLED * summed(pieces)).all()):
+        if bool((pieces[-1] <= SETTLED * summed(pieces)).all()):
             return summed(pieces)
     before, last = summed(pieces[-4:-2]), summed(pieces[-2:])
     ratio = last / before.clamp_min(1e-300)
