@@ -22,7 +22,7 @@ LONGEST = 4.5
 
 def degree(problem: Problem) -> int:
     """That of the models for ``problem``: one more with noise, as second derivatives lose an order. Measured in two
-    dimensions: half of the cells, in two thirds of the time."""
+    dimensions: half of the cells, in 0.7 to 0.85 of the time."""
     return DEGREE[problem.dim] + problem.noisy
 
 
