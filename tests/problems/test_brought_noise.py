@@ -63,7 +63,7 @@ def test_differences_in_single_precision_are_good_to_three_digits(name):
     problem = zoo.build(name)
     box, x = boxed(problem, as_arrays(problem, ("sigma",), np.float32), differences=True), zoo.states(problem, 40)
     for found, expected in zip(box.noise_divergences(x), problem.noise_divergences(x), strict=True):
-        assert float((found - expected).abs().max()) < 1e-3 * float(expected.abs().max())
+        assert float((found - expected).detach().abs().max()) < 1e-3 * float(expected.detach().abs().max())
 
 
 def test_without_differences_a_simulator_says_which_divergences_are_missing():
@@ -76,6 +76,19 @@ def test_without_differences_a_simulator_says_which_divergences_are_missing():
     quiet = boxed(zoo.build("swing"), as_arrays(zoo.build("swing"), ()))
     assert (quiet.noisy, quiet.unknown_divergences) == (False, "a and B")
     assert Samples.of(quiet, zoo.states(problem, 5)).noise is None
+
+
+def test_a_number_stands_beside_the_noise_of_a_simulator():
+    problem = zoo.build("noisy swing")
+    x, oracle = zoo.states(problem, 5), as_arrays(problem, ("sigma",))
+    both = boxed(problem, oracle, differences=True, noise=[0.01, 0.0])
+    alone = boxed(zoo.build("swing"), as_arrays(zoo.build("swing"), ()), noise=0.01)
+    D = lambda p: 0.5 * p.noise(x) @ p.noise(x).mT
+    torch.testing.assert_close(D(both) - D(problem), torch.tensor([[0.01, 0.0], [0.0, 0.0]]).double().expand(5, 2, 2))
+    for found, expected in zip(both.noise_divergences(x), problem.noise_divergences(x), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-7)
+    assert (alone.noisy, alone.unknown_divergences) == (True, "a and B")
+    assert not alone.noise_divergences(x)[0].any()
 
 
 def plain(x):
