@@ -5,7 +5,7 @@ volume `v_b` it is least for probabilities `P_b` proportional to `sqrt(v_b int_b
 (Cauchy and Schwarz); every split of a box lowers that sum or leaves it. So boxes are split where it falls most.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -64,18 +64,31 @@ class Boxes:
 
     def require_density(self, dim: int) -> None:
         """Raise `InputError` unless these are boxes in ``dim`` coordinates, of volume 1 and probability 1 in all."""
-        count, shapes = len(self.axis), [tuple(getattr(self, f.name).shape) for f in fields(self)]
-        if shapes == [(count, dim), (count, dim), (count,), (count,), (count, 2)]:
-            own, leaves = torch.arange(count).unsqueeze(-1), self.leaves
-            sums = [part[leaves].sum() for part in (self.size.prod(dim=-1), self.probability)]
-            after = ((self.children > own) | (self.children == own)) & (self.children < count)  # no circles
+        count = len(self.axis)
+        shapes = {
+            "low": (count, dim),
+            "size": (count, dim),
+            "probability": (count,),
+            "axis": (count,),
+            "children": (count, 2),
+        }
+        floats = ("low", "size", "probability")
+        plain = all(
+            tuple((t := getattr(self, name)).shape) == shape
+            and t.dtype == (torch.float64 if name in floats else torch.int64)
+            for name, shape in shapes.items()
+        )
+        if plain and bool(((self.children >= 0) & (self.children < count)).all()):
+            own = torch.arange(count)
+            split = self.children[:, 0] != own
+            after = (self.children > own.unsqueeze(-1)).all(dim=-1) | ~split  # no circles
+            measures = torch.stack([self.size.prod(dim=-1), self.probability])
+            halves = torch.where(split, measures[:, self.children].sum(dim=-1), measures)
             inside = (self.low >= 0.0) & (self.size > 0.0) & (self.low + self.size <= 1.0 + 1e-12)
-            right = all(abs(float(s) - 1.0) < 1e-9 for s in sums) and 0 <= int(self.axis.min())
-            if (
-                right
-                and int(self.axis.max()) < dim
-                and bool(after.all() & inside.all() & (self.probability > 0.0).all())
-            ):
+            axes = (self.axis >= 0) & (self.axis < dim)
+            full = (measures[:, 0] - 1.0).abs().max() < 1e-9
+            even = ((halves - measures).abs() < 1e-9) & (measures > 0.0)
+            if bool(full & after.all() & inside.all() & axes.all() & even.all()):
                 return
         raise InputError(f"the checkpoint holds boxes that are no density of {dim} coordinates.")
 
