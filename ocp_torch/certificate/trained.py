@@ -119,8 +119,8 @@ class TrainedContext(FieldsContext):
             return None, []
         kind = self.kind  # before this part is announced: it may have to be simulated
         self.progress("closed-loop fit")
-        if not self.problem.gives_divergences:
-            return None, ["no upper bound without simulation: this problem gives no divergences of a and B."]
+        if unknown := self.problem.unknown_divergences:
+            return None, [f"no upper bound without simulation: this problem gives no divergences of {unknown}."]
         problem, trained, policy = self.problem, self.trained, self.policies_of(self.trained.fields)[kind]
         how = self.constants, self.settings.stage, self.seed
         try:

@@ -25,6 +25,9 @@ SIZES = {
 # Where the worst state counts: waves at least, for an error that is small everywhere and not on average. And gelu leaves
 # fewer steep spots than tanh.
 MANY_WAVES = 64
+# In one dimension with noise, which turns a kink of the cost into one of the second derivative: on the circle with nu = 0.05
+# F_M was 0.055 % below OPT with 6 modes, and 0.017 % with 24 and the 2,000 steps that these take.
+NOISY_MODES = 24
 
 
 class Gated(nn.Module):
@@ -89,12 +92,14 @@ class PeriodicMLP(nn.Module):
         self.register_buffer("scale", torch.tensor(float(scale)))
 
     @classmethod
-    def defaults(cls, dim: int, worst_state: bool = False) -> dict:
+    def defaults(cls, dim: int, worst_state: bool = False, noisy: bool = False) -> dict:
         """What won in measurements in dimension ``dim``, by the name of the argument; with ``worst_state`` where the bound
         is decided by the worst state and not by an average."""
         sizes = next(sizes for largest, sizes in SIZES.items() if dim <= largest)
         gentle = worst_state and not sizes["gated"]
         waves = max(sizes["waves"], MANY_WAVES) if worst_state else sizes["waves"]
+        if noisy and dim == 1:
+            sizes = {**sizes, "modes": NOISY_MODES}
         return {**sizes, "waves": waves, "activation": "gelu" if gentle else "tanh"}
 
     def forward(self, x: Tensor) -> Tensor:

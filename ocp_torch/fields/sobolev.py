@@ -144,7 +144,7 @@ class SobolevField(nn.Module):
         self._make(SobolevFeatures(dim, regularity, kernel, modes), outputs, shift, scale, scaled)
 
     @classmethod
-    def defaults(cls, dim: int, worst_state: bool = False) -> dict:
+    def defaults(cls, dim: int, worst_state: bool = False, noisy: bool = False) -> dict:
         """None: where ``modes`` is `None` the features choose."""
         return {}
 

@@ -43,7 +43,8 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
 
     Observations are cosine and sine of each coordinate, actions in `[-1, 1]^m` are controls in units of
     ``control_bound`` (default: what the problem knows of `sup |u*|`), within the problem's own limit; one step holds the
-    control for ``time_step`` (units of time) with one midpoint step, and the reward is minus the cost of that step.
+    control for ``time_step`` (units of time) with one midpoint step, and the reward is minus the cost of that step. Where
+    there is noise it is added as Euler and Maruyama do, from the environment's own generator.
     Episodes are cut, not ended, after ``horizon``. Raises `InputError` for wrong numbers, and for a data set.
     """
 
@@ -106,10 +107,17 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
         u = problem.control_cost.within(self.control_bound * u, torch.ones(1, dtype=torch.float64))
         middle = self.x + 0.5 * h * problem.velocity(self.x, u)
         cost = float(problem.state_cost(middle) + problem.control_cost.cost(u))
-        self.x = (self.x + h * problem.velocity(middle, u)).remainder(1.0)
+        self.x = (self.x + h * problem.velocity(middle, u) + self._kick()).remainder(1.0)
         self.elapsed += h
         done = self.elapsed >= self.horizon * (1.0 - 1e-9)
         return observe(self.x), -self._weight * cost, False, done, {"state": self.x[0].numpy(), "cost": cost}
+
+    def _kick(self) -> torch.Tensor | float:
+        """`sigma dW` over one step, ``(1, d)``; 0 where there is no noise."""
+        if (sigma := self.problem.noise(self.x)) is None:
+            return 0.0
+        moves = torch.randn(sigma.shape[-1], dtype=torch.float64, generator=self.generator)
+        return math.sqrt(self.time_step) * (sigma @ moves)
 
     def render(self):
         return clocks(self.x[0]) if self.render_mode == "rgb_array" else None

@@ -8,6 +8,8 @@ from torch import Tensor
 # Half the distance of the two states of a difference quotient, by what the function computes in: near the cube root of its
 # rounding, which balances what rounding and what curvature cost.
 STEPS = {torch.float64: 1e-5, torch.float32: 2e-3}
+# The same for second derivatives of fourth order, which rounding spoils more: near the sixth root of it.
+SECOND_STEPS = {torch.float64: 1e-3, torch.float32: 2e-2}
 
 
 class Differenced(torch.autograd.Function):
@@ -53,3 +55,30 @@ def _difference(x: Tensor, direction: Tensor, function: Callable, step: float, g
     x64, along = x.double(), direction.double()
     ahead, behind = (Differenced.apply(x64 + s * step * along, function, step, gradients) for s in (1.0, -1.0))
     return ((ahead - behind) / (2.0 * step)).to(direction)
+
+
+def spread_divergences(
+    noise: Callable[[Tensor], Tensor], x: Tensor, here: Tensor, step: float
+) -> tuple[Tensor, Tensor]:
+    """`div D` ``(N, d)`` and `div div D` ``(N,)`` of `D = sigma sigma^T / 2` by central differences of ``noise``, `sigma`:
+    ``(N, d) -> (N, d, k)``, which is ``here`` at the float64 states ``x``; all `2 d (d + 1)` shifted batches in one call.
+
+    Steps of ``step`` and twice as much are extrapolated: what is left is of order 4. `d_i d_j D_ij` is made of second
+    differences along `e_i + e_j`, `e_i` and `e_j`.
+    """
+    d = x.shape[1]
+    axes = torch.eye(d, dtype=x.dtype)
+    pairs = [(i, j) for i in range(d) for j in range(i)]
+    ways = torch.cat([axes, *(axes[i : i + 1] + axes[j : j + 1] for i, j in pairs)])
+    shifts = torch.cat([size * sign * step * ways for size in (1.0, 2.0) for sign in (1.0, -1.0)])
+    square = lambda sigma: 0.5 * sigma @ sigma.mT
+    around = square(noise((x + shifts.unsqueeze(1)).flatten(0, 1))).reshape(2, 2, len(ways), len(x), d, d)
+    sizes = step * torch.tensor([1.0, 2.0], dtype=x.dtype).reshape(2, 1, 1, 1, 1)
+    finer = lambda steps: (4.0 * steps[0] - steps[1]) / 3.0
+    first = finer((around[:, 0] - around[:, 1]) / (2.0 * sizes))  # (ways, N, d, d): the derivative along each way
+    second = finer((around[:, 0] + around[:, 1] - 2.0 * square(here)) / sizes**2)
+    div_D = torch.einsum("jnij->ni", first[:d])
+    div_div_D = torch.einsum("inii->n", second[:d])
+    for (i, j), along in zip(pairs, second[d:], strict=True):
+        div_div_D = div_div_D + (along - second[i] - second[j])[:, i, j]
+    return div_D, div_div_D

@@ -60,7 +60,8 @@ def primal(problem: Problem, occupation: str = "auto") -> Objective:
     if occupation == "closed" and not problem.has_simulator:
         raise InputError("method.occupation is 'closed', but mu at a new state needs f there, which no data set gives.")
     if not problem.gives_divergences:
-        note = "this problem gives no divergences of a and B: primal falls back to the saddle, without J."
+        unknown = problem.unknown_divergences
+        note = f"this problem gives no divergences of {unknown}: primal falls back to the saddle, without J."
         return Saddle(problem, augmentation=1.0, notes=(note,))
     closed = problem.still and problem.has_simulator and occupation != "network"
     return (ClosedPrimal if closed else NetworkPrimal)(problem)

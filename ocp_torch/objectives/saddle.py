@@ -130,5 +130,5 @@ def saddle(
         return Saddle(problem)
     if problem.gives_divergences:
         return AugmentedSaddle(problem, weight, coupling, residual, warm_start, density_batch)
-    note = "this problem gives no divergences of a and B: pd trains w alone, with mu in closed form."
+    note = f"this problem gives no divergences of {problem.unknown_divergences}: pd trains w alone, with mu in closed form."
     return Saddle(problem, weight, notes=(note,))

@@ -52,7 +52,7 @@ class ClosedLoop(Problem):
     def noise(self, x: Tensor) -> Tensor | None:
         return self.problem.noise(x)
 
-    def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
         return self.problem.noise_divergences(x)
 
     def initial_density(self, x: Tensor) -> Tensor:

@@ -65,9 +65,11 @@ def resolve_constants(
 ) -> Constants:
     """Each bound from the configuration if it was set there, else from the problem, else estimated with a warning.
 
-    `OPT <= J` needs `C_V >= sup V*`, for which `sup f` will do (Proposition 1); `C_u` is that of Proposition 2 where
-    `a = 0` and an estimate by the same formula with the least-squares `alpha` (`B alpha = a`) otherwise. A limit on the
-    control is a `C_u` that is known.
+    `OPT <= J` needs `C_V >= sup V*`, for which `sup f` will do (Proposition 1), with noise as well: doing nothing costs no
+    more. `C_u` is that of Proposition 2 where `a = 0` and there is no noise. Otherwise the same formula, with the
+    least-squares `alpha` (`B alpha = a`), is an estimate: its proof takes `|B^T grad V*|` from the Hamilton-Jacobi-Bellman
+    equation, state by state, where noise adds a `D : hess V*` of either sign. No bound rests on it, but the control is held
+    against it. A limit on the control is a `C_u` that is known.
     """
     chosen: dict[str, float] = {}
     sources: dict[str, str] = {}
@@ -128,12 +130,15 @@ def _estimate_value_bound(problem: Problem) -> tuple[float, str]:
 def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
     q, conjugate = problem.exponent, problem.control_cost.conjugate_exponent
     total = 2.0 * conjugate * state_cost_supremum(problem)
+    beside = ", which noise may take the control beyond" if problem.noisy else ""
     if problem.driftless:
-        return total ** (1.0 / q), "Proposition 2 of the paper with a sampled sup f"
+        return total ** (1.0 / q), f"Proposition 2 of the paper with a sampled sup f{beside}"
     B, a = problem.probe(PROBED_MATRICES, 1, "B", "a")
     alpha = (torch.linalg.pinv(B) @ a.unsqueeze(-1)).squeeze(-1)
     largest = float(alpha.norm(dim=-1).max())
-    return (total + 2.0**q * (conjugate - 1.0) * largest) ** (1.0 / q), "Proposition 2 with a least-squares alpha"
+    return (total + 2.0**q * (conjugate - 1.0) * largest) ** (
+        1.0 / q
+    ), f"Proposition 2 with a least-squares alpha{beside}"
 
 
 def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError, require_integer, require_number, require_numbers
+from ocp_torch.errors import InputError, require_integer, require_number
 from ocp_torch.maths import jets
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
+from ocp_torch.problems.constant_noise import column_matrix, constant_diffusion
 from ocp_torch.problems.control_limit import control_cost
 from ocp_torch.problems.reproducible import Reproducible
 from ocp_torch.problems.samples import Samples
@@ -88,6 +89,7 @@ class Problem(Reproducible):
         self.exact_optimum: float | None = None
         self.lipschitz: Lipschitz | None = None
         self.diffusion = constant_diffusion(noise, self.dim)
+        self._sigma = column_matrix(self.diffusion)
         self._placed: dict = {}
 
     def state_cost(self, x: Tensor) -> Tensor:
@@ -105,11 +107,16 @@ class Problem(Reproducible):
 
     def noise(self, x: Tensor) -> Tensor | None:
         """`sigma`, ``(N, d, k)``, of `k` Brownian motions (Ito); `None` where there is no noise. By default that of the
-        argument ``noise``. An override may be degenerate, and vary with the state."""
-        if self.diffusion is None:
-            return None
-        sigma = torch.tensor(self.diffusion, dtype=torch.float64).mul(2.0).sqrt().diag()
-        return self._like(x, "sigma", sigma).expand(len(x), -1, -1)
+        argument ``noise`` and of `add_noise`. An override may be degenerate, and vary with the state."""
+        return None if self._sigma is None else self._like(x, "sigma", self._sigma).expand(len(x), -1, -1)
+
+    def add_noise(self, columns: Tensor) -> None:
+        """Put ``columns`` ``(d, k)``, torus units per square root of time, beside those of `sigma`; for `__init__` alone.
+
+        Each is a Brownian motion of its own; those that are 0 are left out."""
+        columns = columns.double()[:, columns.any(dim=0)]
+        if columns.shape[1]:
+            self._sigma = columns if self._sigma is None else torch.cat([self._sigma, columns], dim=1)
 
     @property
     def noisy(self) -> bool:
@@ -121,9 +128,9 @@ class Problem(Reproducible):
         """Whether nothing moves without control: there is neither drift nor noise."""
         return self.driftless and not self.noisy
 
-    def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
         """`div D` ``(N, d)``, with components `sum_j d_j D_ij`, and its divergence ``(N,)``, where there is noise: by
-        autograd through `noise`. Override it where they are known."""
+        autograd through `noise`. Override it where they are known, or give `None`."""
         if type(self).noise is Problem.noise:
             return torch.zeros_like(x), torch.zeros_like(x[:, 0])
         return jets.diffusion_divergences(self.noise, x)
@@ -159,10 +166,17 @@ class Problem(Reproducible):
         return torch.einsum("inim->nm", tangents)
 
     @property
-    def gives_divergences(self) -> bool:
-        """Whether `div a` and `div B` are to be had."""
+    def unknown_divergences(self) -> str:
+        """Of which of `a`, `B` and, where there is noise, `D` no divergences are to be had, in words; empty for none."""
         x = torch.full((1, self.dim), 0.5, dtype=torch.float64)
-        return self.drift_divergence(x) is not None and self.control_divergence(x) is not None
+        found: dict[str, object] = {"a": self.drift_divergence(x), "B": self.control_divergence(x)}
+        found |= {"D": self.noise_divergences(x)} if self.noisy else {}
+        return " and ".join(name for name, value in found.items() if value is None)
+
+    @property
+    def gives_divergences(self) -> bool:
+        """Whether all of these are to be had."""
+        return not self.unknown_divergences
 
     # Exact truth, where known: `None` otherwise.
     def exact_value(self, x: Tensor) -> Tensor | None:
@@ -226,17 +240,3 @@ class Problem(Reproducible):
         if key not in self._placed:
             self._placed[key] = constant.to(x)
         return self._placed[key]
-
-
-def constant_diffusion(noise: float | Sequence[float], dim: int) -> tuple[float, ...] | None:
-    """``noise`` as the diagonal of `D`; `None` where all of it is 0. Raises `InputError` unless it is a number `>= 0`, or
-    ``dim`` of them."""
-    if isinstance(noise, Sequence) and not isinstance(noise, str):
-        each = require_numbers("problem.noise", noise, dim)
-    else:
-        each = [require_number("problem.noise", noise)] * dim
-    if min(each) < 0.0:
-        raise InputError(
-            f"problem.noise is {noise}, but must be 0 or more: it is a diffusion, a variance per unit time."
-        )
-    return tuple(each) if max(each) > 0.0 else None

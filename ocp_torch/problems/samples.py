@@ -40,7 +40,8 @@ class Samples:
     def of(cls, problem: "Problem", x: Tensor, divergences: bool = True, weight: Tensor | None = None) -> "Samples":
         """Evaluate ``problem`` at the states ``x`` of shape ``(N, d)``."""
         noise = problem.noise(x)
-        spread = problem.noise_divergences(x) if divergences and noise is not None else (None, None)
+        spread = problem.noise_divergences(x) if divergences and noise is not None else None
+        div_D, div_div_D = spread or (None, None)
         return cls(
             x=x,
             f=problem.state_cost(x),
@@ -51,8 +52,8 @@ class Samples:
             div_a=problem.drift_divergence(x) if divergences else None,
             div_B=problem.control_divergence(x) if divergences else None,
             noise=noise,
-            div_D=spread[0],
-            div_div_D=spread[1],
+            div_D=div_D,
+            div_div_D=div_div_D,
         )
 
     def __len__(self) -> int:

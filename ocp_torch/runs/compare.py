@@ -42,10 +42,12 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Comparison:
-    """``rows`` of the columns `COLUMNS`, `None` where a number does not apply; ``unfinished``: per run, why it has no row."""
+    """``rows`` of the columns `COLUMNS`, `None` where a number does not apply; ``unfinished``: per run, why it has no row;
+    ``folders``: where each run is."""
 
     rows: list[dict]
     unfinished: dict[str, str]
+    folders: dict[str, Path]
 
     def table(self) -> str:
         """For the terminal."""
@@ -96,13 +98,14 @@ def compare(paths: Iterable[Path]) -> Comparison:
         if kind(path) != FOLDER:
             raise InputError(f"{path} is not a folder; give runs' folders, or folders that hold some.")
         folders += run_folders(path)
-    for folder, name in named(list(dict.fromkeys(folders))).items():
+    places = named(list(dict.fromkeys(folders)))
+    for folder, name in places.items():
         try:
             rows.append(row_of(folder, name))
         except InputError as error:
             unfinished[name] = str(error)
     rows.sort(key=lambda row: [math.inf if row[c] is None else row[c] for c in ("gap_certified", "gap_simulated")])
-    return Comparison(rows, unfinished)
+    return Comparison(rows, unfinished, {name: folder for folder, name in places.items()})
 
 
 def run_folders(path: Path) -> list[Path]:

@@ -12,6 +12,7 @@ from ocp_torch.certificate.trained import in_float64
 from ocp_torch.control.policies import NETWORK, occupation_density, trained_policies
 from ocp_torch.errors import visible
 from ocp_torch.fields import Fields
+from ocp_torch.maths.brownian import Grid, discounted, increments, path_integral
 from ocp_torch.maths.runge_kutta import rate_at
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import batched
@@ -119,7 +120,14 @@ def simulated_occupation(problem: Problem, policy: Function) -> Function:
     bins = BINS[problem.dim]
     points, start_mass = initial_points(problem, STARTS, 0, derive_seed(0, Branch.FIGURES), extra=1)
     x0, times = points[:, :-1], -torch.log1p(-points[:, -1]) / problem.discount
-    _, end = rate_at(lambda x: (problem.velocity(x, policy(x)), x[:, 0]), x0, problem.discount, times, FIGURE_STEPS)
+    moving = lambda x: (problem.velocity(x, policy(x)), x[:, 0])
+    sigma, rho = problem.noise(x0), problem.discount
+    if sigma is None:
+        _, end = rate_at(moving, x0, rho, times, FIGURE_STEPS)
+    else:
+        grid = Grid(times, FIGURE_STEPS, 1.0)
+        moves = increments(grid, sigma.shape[-1], 0, 0, 0)
+        end = path_integral(moving, problem.noise, x0, grid, moves, discounted(rho))[1].remainder(1.0)
     cell = lambda x: ((x * bins).long().clamp(0, bins - 1) * bins ** torch.arange(problem.dim)).sum(dim=-1)
     mass = torch.zeros(bins**problem.dim, dtype=torch.float64)
     mass.index_add_(0, cell(end), start_mass)

@@ -31,7 +31,9 @@ def arguments(config: dict) -> dict:
     divergences = require_flag("divergences", config["divergences"]) and problem.gives_divergences
     count = require_integer("samples", config["samples"], recording.FEWEST, maximum=10**8)
     d, m = problem.dim, problem.control_dim
-    require_memory("samples", count, 8 * (2 * d + d * m + m + 3))  # x, f, a, B, mu0 and divergences in float64
+    sigma = problem.noise(torch.full((1, d), 0.5, dtype=torch.float64))
+    spread = 0 if sigma is None else sigma.numel() + d + 1
+    require_memory("samples", count, 8 * (2 * d + d * m + m + 3 + spread))  # all columns and divergences in float64
     return {
         "problem": problem,
         "count": count,

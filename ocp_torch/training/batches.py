@@ -21,8 +21,9 @@ from ocp_torch.training.importance import scores
 VISITED = 0.25
 # At least a tenth of a batch is for the integrals.
 MOST_VISITED = 0.9
-# From batch to batch a visited state moves on by Euler's method for this part of 1 / rho, but no further than this distance
-# on the torus: longer steps leave the flow's paths, shorter ones repeat nearly the same states.
+# From batch to batch a visited state moves on by Euler's method (with noise Euler and Maruyama's) for this part of 1 / rho,
+# but no further than this distance on the torus: longer steps leave the flow's paths, shorter ones repeat nearly the same
+# states.
 STEP_TIME, LONGEST_STEP = 0.05, 0.05
 
 
@@ -103,7 +104,11 @@ class Batches:
         u = policy(at.x).detach()
         velocity = at.a + torch.einsum("ndm,nm->nd", at.B, u)
         time = (LONGEST_STEP / velocity.norm(dim=-1).clamp_min(1e-12)).clamp_max(STEP_TIME / rho)
-        moved = (at.x + time.unsqueeze(-1) * velocity).remainder(1.0)
+        moved = at.x + time.unsqueeze(-1) * velocity
+        if at.noise is not None:
+            drawn = torch.randn(len(moved), at.noise.shape[-1], generator=self.generator).to(moved)
+            moved = moved + time.sqrt().unsqueeze(-1) * torch.einsum("ndk,nk->nd", at.noise, drawn)
+        moved = moved.remainder(1.0)
         chance = torch.rand(len(moved), generator=self.generator).to(moved)
         again = (chance < 1.0 - torch.exp(-rho * time)) | ~torch.isfinite(moved).all(dim=-1)
         self.states = torch.where(again.unsqueeze(-1), self._uniform(len(moved), moved), moved)

@@ -32,6 +32,8 @@ BUDGETS = (
 
 # Where no M is known the bound is decided by the worst state: that wants more states at once, and longer.
 LARGE_BATCH, MANY_STEPS = 1024, 1200
+# In one dimension with noise, where networks are given more modes.
+NOISY_STEPS = 2000
 # The larger batch is for the supremum of the slack, of which the density player of pd knows nothing.
 DENSITY_BATCH = 256
 # Evenly spread states leave more steep spots than independent ones, and the worst state is in one.
@@ -52,10 +54,12 @@ def fill(config: dict, problem: Problem) -> dict:
     method = require_section("method", config.get("method") or {})
     model = MODELS[require_choice("model.name", config["model"].get("name"), MODELS)]
     unbounded = is_unbounded(problem, method.get("occupation_bound"))
+    if problem.noisy and problem.dim == 1:
+        budget = replace(budget, steps=NOISY_STEPS)
     if unbounded:
         budget = replace(budget, batch=max(budget.batch, LARGE_BATCH), steps=max(budget.steps, MANY_STEPS))
     defaults: dict[str, object] = {
-        **{f"model.{name}": value for name, value in model.defaults(problem.dim, worst_state=unbounded).items()},
+        **{f"model.{name}": value for name, value in model.defaults(problem.dim, unbounded, problem.noisy).items()},
         "trainer.rounds": 2 if config["trainer"].get("steps") is None else 1,
         "trainer.good_gap": budget.good_gap,
         "trainer.steps": budget.steps,

@@ -25,7 +25,8 @@ from support import zoo
 
 def parts_of(problem, value, count: int = 400) -> SlackParts:
     samples = Samples.of(problem, zoo.states(problem, count))
-    return SlackParts.of(Generator.of(problem, samples), jet(value, samples.x))
+    generator = Generator.of(problem, samples)
+    return SlackParts.of(generator, generator.jet(value))
 
 
 def near(problem, seed: int, size: float):
@@ -61,7 +62,7 @@ def test_scaling_never_loses_and_never_passes_the_optimum(name, seed, size):
     sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
     found = SampledValue(problem, V, sets, ascents=8)
     pieces = [
-        SlackParts.of(Generator.of(problem, s), jet(V, s.x)) for s in sets
+        SlackParts.of(L, L.jet(V)) for L in (Generator.of(problem, s) for s in sets)
     ]  # the multiple 1, as it was before there was a choice
     plain = climbed(problem, V, SlackParts.join(pieces), 1.0, 8)
     initial = sum(found.initial) / len(found.initial)

@@ -17,7 +17,6 @@ from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.certificate.upper.penalised import density_bounds
 from ocp_torch.control.policies import CLOSED, NETWORK, occupation_density
 from ocp_torch.fields import Fields
-from ocp_torch.maths.jets import jet
 from ocp_torch.objectives import Dual, Phase, primal, saddle
 from ocp_torch.objectives.primal import ClosedPrimal, NetworkPrimal
 from ocp_torch.problems import Problem
@@ -46,7 +45,7 @@ def paper_dual(problem: Problem) -> Dual:
 
 # Far from the truth and close to it: `size` is that of the network, `near` says whether it is added to the exact answer.
 case = dict(
-    name=st.sampled_from(zoo.EXACT),
+    name=st.sampled_from((*zoo.EXACT, *zoo.EXACT_NOISY)),
     seed=st.integers(0, 10**6),
     size=st.sampled_from([1e-3, 1e-2, 0.1, 1.0, 5.0]),
     near=st.booleans(),
@@ -87,13 +86,13 @@ def test_no_densities_give_an_upper_bound_below_the_optimum(name, seed, size, ne
         mu = lambda x: problem.exact_occupation(x) * fields.log_occupation(x).exp()
     J, G, *_ = density_bounds(problem, w, mu, sets_of(name), problem.value_bound)
     assert J.value >= problem.exact_optimum - ERRORS * J.se - 1e-9
-    assert (G is None) == (not problem.driftless)
+    assert (G is None) == (not problem.still)
     if G is not None:
         assert problem.exact_optimum - ERRORS * G.se - 1e-9 <= G.value <= J.value * (1.0 + 1e-12)
 
 
 @settings(max_examples=4)
-@given(**{**case, "name": st.sampled_from(zoo.SMOOTH)})
+@given(**{**case, "name": st.sampled_from((*zoo.SMOOTH, *zoo.EXACT_NOISY))})
 def test_no_value_and_density_give_a_closed_loop_bound_below_the_optimum(name, seed, size, near):
     """For any regular controller, `V` and `mu`: the Lagrangian bound, and `J` with the `C_V` that these prove."""
     problem = zoo.build(name)
@@ -137,7 +136,7 @@ def test_losses_are_the_numbers_of_the_certificate(name, seed, size):
         problem, fields.control_density, occupation_density(NETWORK, problem, fields, constants), sets, constants.C_V
     )
     assert mean(NetworkPrimal(problem), "density") == pytest.approx(J.value, rel=1e-9)
-    if problem.driftless:
+    if problem.still:
         assert mean(ClosedPrimal(problem), "density") == pytest.approx(G.value, rel=1e-9)
         closed = occupation_density(CLOSED, problem, fields, constants)
         attained, least, *_ = density_bounds(problem, fields.control_density, closed, sets, constants.C_V)
@@ -157,9 +156,8 @@ def test_the_saddle_is_never_below_the_dual_and_meets_it_at_the_best_response(na
     fields, constants = random_fields(problem, seed, size), bounds_of(name)
 
     def best_response(x):
-        V = jet(fields.value, x)
-        samples = Samples.of(problem, x, divergences=False)
-        generator = Generator.of(problem, samples)
+        generator = Generator.of(problem, Samples.of(problem, x, divergences=False))
+        V = generator.jet(fields.value)
         slack, u = generator.hjb_slack(V), problem.control_cost.argmax(generator.push(V))
         return torch.where(slack > 0.0, constants.M, 0.0).unsqueeze(-1) * u
 

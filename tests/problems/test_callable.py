@@ -154,7 +154,7 @@ HOSTILE = {
     "an exception": (raises_beyond(0.5), r"raised ZeroDivisionError at x = \[0\.[5-9].*no mass\.$"),
     "words": (broken(a=lambda x, a: np.full(a.shape, "left")), "the oracle's a is no array of real numbers"),
     "nothing": (lambda x: None, "gave a NoneType, but must give f, a, B"),
-    "five things": (lambda x: (1, 2, 3, 4, 5), "gave a tuple"),
+    "six things": (lambda x: (1, 2, 3, 4, 5, 6), "gave a tuple"),
     "no period": (broken(f=lambda x, f: x[:, 1]), r"f jumps by 1 where coordinate 1 passes from 1 to 0, at x = \["),
     "no period of a": (broken(a=lambda x, a: x), "a jumps by 1 where coordinate 0"),
     "memory": (Moody(), "the oracle's f differs between two calls"),

@@ -200,7 +200,10 @@ def test_the_exact_truth_solves_its_equations_with_the_limit_reached(problem):
     reached = (u.norm(dim=-1) >= problem.control_limit * (1.0 - 1e-9)).double().mean()
     assert 0.001 < float(reached) < 0.98
     assert float(u.norm(dim=-1).max()) <= problem.control_bound * (1.0 + 1e-12)
-    flux = lambda y: problem.exact_occupation(y).unsqueeze(-1) * problem.velocity(y, problem.exact_control(y))
+    nu = torch.tensor(problem.diffusion or (0.0,) * problem.dim, dtype=x.dtype)
+    spread = lambda y: nu * jets.jet(problem.exact_occupation, y).gradient
+    carried = lambda y: problem.exact_occupation(y).unsqueeze(-1) * problem.velocity(y, problem.exact_control(y))
+    flux = lambda y: carried(y) - spread(y)
     outflow = jets.divergence(flux, x) / problem.discount
     torch.testing.assert_close(problem.initial_density(x), problem.exact_occupation(x) + outflow, **ROUNDING)
     given, by_autograd = problem.drift_divergence(x), jets.divergence(problem.drift, x)

@@ -5,11 +5,13 @@ import json
 
 import pytest
 import torch
+import yaml
 from matplotlib.image import imread
 
 from ocp_torch.certificate import Run
 from ocp_torch.errors import InputError
 from ocp_torch.runs.compare import COLUMNS, compare
+from ocp_torch.runs.trend import field_of, save_trend
 from ocp_torch.training.checkpoint import save_checkpoint
 from support.forked import command
 from support.looks import certificate
@@ -104,3 +106,22 @@ def test_a_slip_is_told_in_one_sentence(arguments, tmp_path):
 def test_a_folder_that_is_not_there_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="nowhere"):
         compare([tmp_path / "nowhere"])
+
+
+def test_gaps_are_plotted_against_a_number_of_the_configuration(tmp_path):
+    """Runs that have no such number are named."""
+    for run, noise, gap in (("a", 0.01, 0.3), ("b", 0.1, 0.2)):
+        finished(tmp_path / "runs" / run, gap, gap)
+        (tmp_path / "runs" / run / ".hydra").mkdir()
+        text = yaml.safe_dump({"problem": {"_target_": "ocp_torch.problems.Circle", "noise": noise, "shape": "x"}})
+        (tmp_path / "runs" / run / ".hydra" / "config.yaml").write_text(text)
+    found = compare([tmp_path / "runs"])
+    assert [field_of(found.folders[name], "problem.noise") for name in ("a", "b")] == [0.01, 0.1]
+    save_trend(found, "problem.noise", tmp_path / "trend.png")
+    assert imread(tmp_path / "trend.png").std() > 0
+    for field in ("problem.nose", "problem.shape", "problem", "problem.noise.size"):
+        with pytest.raises(InputError, match=r"against is .* but .*runs/[ab] has no such number"):
+            save_trend(found, field, tmp_path / "never.png")
+    with pytest.raises(InputError, match="must end in"):
+        save_trend(found, "problem.noise", tmp_path / "trend.txt")
+    assert "plot=FILE" in command("compare", "runs", "against=problem.noise", cwd=tmp_path).sentence

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 
-from ocp_torch.maths import jets
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 
@@ -13,8 +12,8 @@ ROUNDING = dict(rtol=1e-9, atol=1e-9)
 
 
 def exact_slack(problem, x):
-    samples = Samples.of(problem, x)
-    return Generator.of(problem, samples).hjb_slack(jets.jet(problem.exact_value, x))
+    generator = Generator.of(problem, Samples.of(problem, x))
+    return generator.hjb_slack(generator.jet(problem.exact_value))
 
 
 def lattice(dim: int) -> torch.Tensor:

@@ -132,6 +132,43 @@ def steps_of(self, x):
     return torch.where(x[:, :1].remainder(1.0) < 0.3, 0.5, 1.0).to(x)
 
 
+def column(size=0.1):
+    """`sigma` of one Brownian motion that varies with the state."""
+    return lambda self, x: (size * torch.stack([torch.sin(TURN * x[:, 1]), 2.0 + torch.cos(TURN * x[:, 0])], -1))[
+        ..., None
+    ]
+
+
+def sigma(change):
+    """`column` with its answer ``change``d."""
+    return lambda self, x: change(column()(self, x), x)
+
+
+class NoiseNumber(Good):
+    def __init__(self) -> None:
+        super().__init__()
+        self.noise = 0.1
+
+
+class MoodyNoise(Good):
+    calls = 0
+
+    def noise(self, x):
+        self.calls += 1
+        return 0.1 * self.calls * column()(self, x)
+
+
+def noise_raises(self, x):
+    if (x[:, 0] > 0.97).any():
+        raise KeyError("no table")
+    return column()(self, x)
+
+
+def noisy(divergences):
+    return with_(noise=column(), noise_divergences=divergences)
+
+
+autograd = Problem.noise_divergences
 plain_cost = Good.state_cost
 # Name -> the problem (made when called) and what the sentence must hold.
 REFUSED = {
@@ -197,6 +234,36 @@ REFUSED = {
     "div a": (lambda: with_(drift_divergence=lambda self, x: 0.0 * x[:, 0]), "drift_divergence .* by differences of drift"),
     "detached": (lambda: with_(control_matrix=lambda self, x: Good.control_matrix(self, x.detach())),
                  "control_divergence .* by differences of control_matrix"),
+    "noise without columns": (lambda: with_(noise=sigma(lambda s, x: s[..., 0])),
+                              r"noise of .*Mine gave shape \(7, 2\) .* \(N, d, k\) = \(7, 2, 1\) with d = 2, k = 1"),
+    "noise of too few rows": (lambda: with_(noise=sigma(lambda s, x: s[:, :1])), r"noise .* gave shape \(7, 1, 1\)"),
+    "noise of no column": (lambda: with_(noise=sigma(lambda s, x: s[..., :0])), r"noise .* gave shape \(7, 2, 0\)"),
+    "noise of N columns": (lambda: with_(noise=sigma(lambda s, x: s.expand(-1, -1, len(x)))),
+                           r"noise .* gave shape \(7, 2, 7\) .* as many at all states"),
+    "noise a number": (lambda: with_(noise=lambda self, x: 0.1), "noise of .* gave a float"),
+    "noise an attribute": (NoiseNumber, r"NoiseNumber sets noise to 0.1, but .* super\(\).__init__\(noise=..\)"),
+    "noise in few batches": (lambda: with_(noise=lambda self, x: None if len(x) < 9 else column()(self, x)),
+                             "noise .* gave a NoneType"),
+    "noise in many batches": (lambda: with_(noise=lambda self, x: None if len(x) < 30 else column()(self, x)),
+                              "noise .* gives None for some states"),
+    "noise always double": (lambda: with_(noise=sigma(lambda s, x: s.double())), "noise .* gave torch.float64"),
+    "noise of NaN": (lambda: with_(noise=sigma(lambda s, x: torch.where(x[:, :1, None].remainder(1.0) > 0.9, math.nan, s))),
+                     r"noise .* gives \[.*nan.*\] at x = \[0\.9"),
+    "noise without period": (lambda: with_(noise=sigma(lambda s, x: s * x[:, :1, None])), "noise .* is not periodic"),
+    "noise that counts": (MoodyNoise, "noise .* is no function of the state alone"),
+    "noise of the batch": (lambda: with_(noise=sigma(lambda s, x: s - s.mean(0))), "noise .* no function of the state"),
+    "noise in place": (lambda: with_(noise=lambda self, x: column()(self, x.mul_(2.0))), "noise .* changes its argument"),
+    "noise raises": (lambda: with_(noise=noise_raises), r"noise .* KeyError: .no table. at x = \[0\.9.*s.py, line"),
+    "noise detached": (lambda: with_(noise=lambda self, x: column()(self, x.detach())),
+                       r"noise_divergences\[0\] .* by differences of D = noise noise\^T / 2"),
+    "noise beyond all units": (lambda: with_(noise=sigma(lambda s, x: 1e4 * s)), "the noise of .* is too large"),
+    "div D alone": (lambda: noisy(lambda self, x: x), "noise_divergences .* gave a Tensor, but must give two tensors"),
+    "div D a number": (lambda: noisy(lambda self, x: (x[:, 0], x[:, 0])), r"noise_divergences\[0\] .* gave shape \(7,\)"),
+    "div div D a column": (lambda: noisy(lambda self, x: (x, x)), r"noise_divergences\[1\] .* \(N,\) = \(7,\)"),
+    "div D of 0": (lambda: noisy(lambda self, x: (0.0 * x, autograd(self, x)[1])),
+                   r"noise_divergences\[0\] .* by differences of D"),
+    "div div D of 0": (lambda: noisy(lambda self, x: (autograd(self, x)[0], 0.0 * x[:, 0])),
+                       r"noise_divergences\[1\] .* by differences of noise_divergences\[0\]"),
     "wide units": (lambda: with_(state_cost=lambda self, x: 1e12 * plain_cost(self, x)), "units of .* are too far apart"),
 }  # fmt: skip
 LEGAL = {
@@ -215,6 +282,12 @@ LEGAL = {
     "a spike": lambda: with_(state_cost=lambda self, x: 5000.0 * bump(0.0025, 0.5)(self, x)),
     "single inside": lambda: with_(state_cost=lambda self, x: 1.0 + torch.cos(TURN * x[:, 0].float()).to(x)),
     "no divergences": lambda: with_(drift_divergence=lambda self, x: None, control_divergence=lambda self, x: None),
+    "noise": lambda: with_(noise=column()),
+    "noise of 0": lambda: with_(noise=column(0.0)),
+    "noise of five motions": lambda: with_(noise=sigma(lambda s, x: s * torch.linspace(0.1, 1.0, 5, dtype=x.dtype))),
+    "noise that jumps": lambda: with_(noise=sigma(lambda s, x: s * steps_of(None, x)[:, :, None])),
+    "noise without divergences": lambda: noisy(lambda self, x: None),
+    "noise with divergences": lambda: noisy(lambda self, x: autograd(self, x)),
     "small units": lambda: with_(state_cost=lambda self, x: 1e-12 * plain_cost(self, x)),
     **{f"mu0 of width {s} in {d}-d": lambda s=s, d=d: with_(d, initial_density=gaussian(s, d))
        for s in (0.1, 0.004) for d in (1, 2, 3, 5)},

@@ -79,13 +79,14 @@ _LIMITED = {
     "limited 2-d q=1.5 B(x)": partial(
         Manufactured, exponent=1.5, control_limit=0.4, state_dependent_control=True, initial_contrast=0.5
     ),
+    "limited 2-d with noise": partial(Manufactured, control_limit=0.5, noise=[0.0, 0.02]),
     "limited 3-d m=2 q=1.2": partial(Manufactured, dim=3, control_dim=2, exponent=1.2, control_limit=0.5),
 }
 # Exact truth with noise: isotropic; full and varying; in one coordinate of two; and beside all else.
 _NOISY = {
     "noisy 1-d": partial(Manufactured, dim=1, noise=0.02),
     "noisy 2-d sigma(x)": partial(Manufactured, noise=[0.02, 0.01], state_dependent_noise=True, seed=1),
-    "noisy 2-d degenerate": partial(Manufactured, noise=[0.0, 0.05], control_limit=0.5, initial_contrast=0.5),
+    "noisy 2-d degenerate": partial(Manufactured, noise=[0.0, 0.05], initial_contrast=0.5),
     "noisy 3-d m=2 sigma(x) B(x) q=1.5": partial(
         Manufactured,
         dim=3,
@@ -100,8 +101,8 @@ _CASES = {**_KINKED, **_SMOOTH, **_LIMITED, **_NOISY, "swing": Swing, "noisy swi
 
 # Names by what is known: V* with kinks and no drift; V* smooth, with drift; both of them; and every problem there is.
 KINKED, SMOOTH, EXACT = tuple(_KINKED), tuple(_SMOOTH), (*_KINKED, *_SMOOTH)
-ALL, LIMITED = (*EXACT, "swing"), tuple(_LIMITED)
-EXACT_NOISY, NOISY = tuple(_NOISY), (*_NOISY, "noisy swing")
+EXACT_NOISY, NOISY, LIMITED = tuple(_NOISY), (*_NOISY, "noisy swing"), tuple(_LIMITED)
+ALL = (*EXACT, "swing", *NOISY)
 # Systems people have, without exact truth.
 _NATURAL = {
     "arm n=2": Arm,
@@ -122,7 +123,8 @@ _NATURAL = {
 
 NATURAL = tuple(_NATURAL)
 # A few that together show every feature, for tests that cost more.
-FEW_SMOOTH = ("manufactured 1-d q=2", "manufactured 2-d mu0", "manufactured 3-d m=2 B(x) q=1.5")
+FEW_SMOOTH = ("manufactured 1-d q=2", "manufactured 2-d mu0", "manufactured 3-d m=2 B(x) q=1.5", "noisy 2-d sigma(x)")
+QUIET = FEW_SMOOTH[:3]  # without noise
 FEW = ("circle rho=2", "torus 2-d chain", "torus 3-d random", *FEW_SMOOTH)
 
 

@@ -63,7 +63,7 @@ class Ripples(nn.Module):
         self.register_buffer("scale", torch.tensor(float(scale)))
 
     @classmethod
-    def defaults(cls, dim, worst_state=False) -> dict:
+    def defaults(cls, dim, worst_state=False, noisy=False) -> dict:
         return {"count": (8 if worst_state else 5) + dim}
 
     def forward(self, x):

@@ -80,7 +80,9 @@ def observe(
     if simulated is not None:
         near, largest_value = torch.cat([near, simulated.end_states[:CONTROLLED]]), simulated.largest_value
         # Where the problem says that mu* is unbounded there is no M to hold a largest density against.
-        if occupation_states and problem.occupation_bound != math.inf:
+        # With noise the density is followed back in time by its divergences.
+        followed = problem.gives_divergences or not problem.noisy
+        if occupation_states and followed and problem.occupation_bound != math.inf:
             occupation = estimated_sup_occupation(problem, policy, simulated.end_states, occupation_states)
             a_priori = a_priori_sup_occupation(problem, policy, sets[0].x[:CONTROLLED])
     jump = largest_jump(policy, problem.dim, problem=problem, near=near)

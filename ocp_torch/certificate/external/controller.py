@@ -94,5 +94,6 @@ class ControllerContext(Context):
     def remarks(self) -> list[str]:
         notes = [] if self.value is not None else ["no lower bound: there is no V to give one."]
         if self.settings.stage.steps and self.fitted is None:
-            notes.append("no bound on Perf without simulation: this problem gives no divergences of a and B.")
+            unknown = self.problem.unknown_divergences
+            notes.append(f"no bound on Perf without simulation: this problem gives no divergences of {unknown}.")
         return notes

@@ -57,7 +57,8 @@ class RecordedContext(FieldsContext):
             why = "B varies over the samples, so that from V is known at them only; use method=pd"
             return None, [f"no controller: {why}."]
         if not self.problem.gives_divergences:
-            return None, ["no upper bound: the recording holds no div_a (and, where B varies, no div_B)."]
+            spread = "; where the noise varies div_D and div_div_D too" if self.problem.noisy else ""
+            return None, [f"no upper bound: the recording holds no div_a (and, where B varies, no div_B{spread})."]
         if not self.settings.stage.steps:
             return None, []
         try:

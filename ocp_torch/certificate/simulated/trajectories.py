@@ -103,8 +103,8 @@ def backward_flow(problem: Problem, policy: Policy) -> Dynamics:
     of a flow changes by its divergence (the representation behind Proposition 8 of the paper). Valid for a Lipschitz loop.
     Differences of `g`, all in one call, are cheaper than derivatives of a controller that is a derivative itself.
 
-    With noise `dy = (2 div D - g) dt + sigma dW`, the density grows by `div div D - div g`, and `mu^u(x)` is the mean over
-    paths (Feynman and Kac, for the adjoint equation written out).
+    With noise, whose divergences must be known, `dy = (2 div D - g) dt + sigma dW`, the density grows by `div div D - div
+    g`, and `mu^u(x)` is the mean over paths (Feynman and Kac, for the adjoint equation written out).
     """
 
     def backward(state: Tensor) -> tuple[Tensor, Tensor]:
@@ -115,7 +115,7 @@ def backward_flow(problem: Problem, policy: Policy) -> Dynamics:
         divergence = summed((g[:, i] - here[:, i]) / DIFFERENCE for i, g in enumerate(moved))
         motion = torch.cat([-here, -divergence.unsqueeze(-1)], dim=-1)
         if problem.noisy:
-            div_D, div_div_D = problem.noise_divergences(y)
+            div_D, div_div_D = cast(tuple[Tensor, Tensor], problem.noise_divergences(y))
             motion = motion + torch.cat([2.0 * div_D, div_div_D.unsqueeze(-1)], dim=-1)
         return motion, problem.initial_density(y) * log_factor.clamp_max(LARGEST_GROWTH).exp()
 
@@ -146,7 +146,7 @@ def settled_occupation(problem: Problem, policy: Policy, x: Tensor) -> Tensor:
         pieces.append(means.mean(dim=1) - (2.0 / math.sqrt(paths) * means.std(dim=1) if problem.noisy else 0.0))
         # From here on the discount of the time that has passed is part of the factor.
         state = torch.cat([state[:, :-1].remainder(1.0), state[:, -1:] - PIECE], dim=-1)
-        if bool((piece <= SETTLED * summed(pieces)).all()):
+        if bool((pieces[-1] <= SETTLED * summed(pieces)).all()):
             return summed(pieces)
     before, last = summed(pieces[-4:-2]), summed(pieces[-2:])
     ratio = last / before.clamp_min(1e-300)
@@ -190,7 +190,7 @@ def a_priori_sup_occupation(problem: Problem, policy: Policy, points: Tensor) ->
         return None
     loop = ClosedLoop(problem, policy)
     largest = lambda function: supremum(function, points, ASCENTS, ASCENT_STEPS, differentiable=False).value
-    spread = lambda x: problem.noise_divergences(x)[1] if problem.noisy else 0.0
+    spread = lambda x: cast(tuple, problem.noise_divergences(x))[1] if problem.noisy else 0.0
     contraction = lambda x: spread(x) - cast(Tensor, loop.drift_divergence(x))  # there is one: see above
     excess = problem.discount - max(0.0, largest(contraction))
     return problem.discount * largest(problem.initial_density) / excess if excess > 0.0 else None

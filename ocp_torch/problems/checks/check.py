@@ -9,9 +9,9 @@ import math
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import ProblemError, require_integer, require_number
+from ocp_torch.errors import ProblemError, require_integer, require_number, shown
 from ocp_torch.problems.blame import named
-from ocp_torch.problems.checks.functions import FORMS, Functions
+from ocp_torch.problems.checks.functions import Functions
 from ocp_torch.problems.checks.mass import require_mass
 from ocp_torch.problems.checks.sameness import require_differentiable, require_period, require_purity, require_still
 from ocp_torch.problems.checks.values import require_divergences, require_finite, require_signs
@@ -24,7 +24,7 @@ SIZES = (7, 1, 37, 2)
 SET_BY_INIT = ("dim", "control_dim", "discount", "exponent", "control_cost")
 DECLARED = ("state_cost_bound", "occupation_bound", "control_bound", "value_bound", "exact_optimum")
 # Turns of a state round the torus within 1 / discount. Paths are simulated in steps of a fraction of a turn: more than so
-# many would take hours.
+# many would take hours; the square of the turns that noise spreads it over counts as much.
 MOST_TURNS = 1e4
 # States at which typical speeds are taken, and the number of their fixed design.
 SPEED_STATES, SPEED_DESIGN = 64, 13
@@ -49,8 +49,9 @@ def _check(functions: Functions) -> None:
     for dtype in (torch.float64, torch.float32):
         for size in SIZES:
             x = functions.states(size).to(dtype)
-            for name in FORMS:
+            for name in functions.forms:
                 functions.given(name, x)
+            functions.require_silence(x)
     first = require_purity(functions)
     if not functions.simulator:
         require_differentiable(functions)
@@ -65,6 +66,11 @@ def require_made(problem: Problem) -> None:
     if missing:
         raise ProblemError(
             f"{named(problem)} has no {missing[0]}: its __init__ must call super().__init__(dim=..), which sets it."
+        )
+    if not callable(problem.noise):
+        raise ProblemError(
+            f"{named(problem)} sets noise to {shown(problem.noise)}, but noise is a function of the state; give a number to "
+            "super().__init__(noise=..) and leave self.noise alone."
         )
     require_integer("problem.dim", problem.dim, 1, maximum=MOST_COORDINATES)
     require_integer("problem.control_dim", problem.control_dim, 1, maximum=MOST_COORDINATES)
@@ -86,7 +92,7 @@ def require_made(problem: Problem) -> None:
 
 def require_units(problem: Problem) -> None:
     """Units of cost and time in which a state can be followed for the time that counts."""
-    f, a, B = problem.probe(SPEED_STATES, SPEED_DESIGN, "f", "a", "B")
+    x, f, a, B = problem.probe(SPEED_STATES, SPEED_DESIGN, "x", "f", "a", "B")
     # A control that costs as much as the state cost varies.
     u = (problem.exponent * float(f.std())) ** (1.0 / problem.exponent)
     u = u if problem.control_limit is None else min(u, problem.control_limit)
@@ -99,6 +105,15 @@ def require_units(problem: Problem) -> None:
             f"{turns:.2g} times round the torus (drift {drift:.2g} and control {push:.2g} per unit of time), more than the "
             f"{MOST_TURNS:g} that can be followed; discount, drift and control_matrix must be of one unit of time, and "
             "state_cost of the unit of |u|^q / q: f times s goes with control_matrix times s^(-1/q)."
+        )
+
+    sigma = problem.noise(x)
+    spread = 0.0 if sigma is None else float(sigma.square().sum(dim=(1, 2)).mean()) / problem.discount
+    if spread > MOST_TURNS:
+        raise ProblemError(
+            f"the noise of {named(problem)} is too large: within 1 / discount = {1.0 / problem.discount:.3g} it would spread "
+            f"a state over {spread**0.5:.2g} turns of the torus, more than the {MOST_TURNS**0.5:g} that can be followed; "
+            "sigma is in turns per square root of the unit of time, and a diffusion in turns squared per unit of time."
         )
 
 

@@ -1,6 +1,7 @@
 """The functions of a problem, asked with care: what each gives has the right shape, precision and device."""
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,6 +16,9 @@ DATA = {"state_cost": "", "drift": "d", "control_matrix": "dm", "initial_density
 DIVERGENCES = {"drift_divergence": "", "control_divergence": "m"}
 TRUTH = {"exact_value": "", "exact_control": "m", "exact_occupation": ""}
 FORMS = {**DATA, **DIVERGENCES, **TRUTH}
+# Beside these where there is noise, of `k` Brownian motions: `sigma`, and the two that `noise_divergences` gives.
+NOISE, DIV_D, DIV_DIV_D = "noise", "noise_divergences[0]", "noise_divergences[1]"
+SPREAD = {DIV_D: "d", DIV_DIV_D: ""}
 # States at which everything must be finite; fewer where a matrix `B` for each would fill the memory, or each is a simulation,
 # and some in any case.
 STATES, MOST_ENTRIES, STATES_OF_A_SIMULATOR, FEWEST_STATES = 4096, 2**22, 512, 16
@@ -28,7 +32,8 @@ FIRST_DESIGN = 11
 class Functions:
     """The functions of ``problem`` by name; ``simulator`` where each state may cost milliseconds.
 
-    ``name`` is the class as a command line has it, ``count`` the number of states for checks that need many.
+    ``name`` is the class as a command line has it, ``count`` the number of states for checks that need many, ``forms`` the
+    shapes of all there are and ``data`` of those that must be there.
     """
 
     def __init__(self, problem: Problem, simulator: bool) -> None:
@@ -38,6 +43,14 @@ class Functions:
         entries = problem.dim * problem.control_dim
         most = STATES_OF_A_SIMULATOR if simulator else STATES
         self.count = max(FEWEST_STATES, min(most, MOST_ENTRIES // entries))
+        self.forms, self.data = FORMS, DATA
+        first = self.called(problem.noise, self.states(FEWEST_STATES), NOISE)
+        self.noisy = first is not None
+        if self.noisy:
+            self.sizes["k"] = max(1, *first.shape[2:3]) if isinstance(first, Tensor) and first.ndim == 3 else 1
+            self.data = {**DATA, NOISE: "dk"}
+            # Those of a simulator are differences of its own.
+            self.forms = {**FORMS, **self.data, **({} if simulator else SPREAD)}
 
     def states(self, count: int, design: int = 0) -> Tensor:
         """Evenly spread states, ``(count, d)`` float64."""
@@ -46,6 +59,14 @@ class Functions:
     def exact_states(self, count: int, design: int) -> Tensor:
         """States that survive both precisions and a few periods to the bit (see `GRID`), ``(count, d)``."""
         return ((self.states(count, design) * (GRID // 2)).floor() * 2.0 + 1.0) / GRID
+
+    def require_silence(self, x: Tensor) -> None:
+        """Where there is no noise at some states there is none at ``x``."""
+        if not self.noisy and self.called(self.problem.noise, x.clone(), NOISE) is not None:
+            raise ProblemError(
+                f"noise of {self.name} gives None for some states and a matrix for others; it must give None always, or "
+                "always a matrix of shape (N, d, k), which may be 0."
+            )
 
     def ask(self, name: str, x: Tensor) -> Tensor:
         """As `given`, of a function that must give a tensor."""
@@ -58,15 +79,30 @@ class Functions:
 
         Raises `ProblemError` where it raises, changes ``x``, or gives another type, shape, precision or device.
         """
-        answer = self.called(getattr(self.problem, name), given := x.clone(), name)
+        answer = self.called(self.function(name), given := x.clone(), name)
         if not torch.equal(given, x):
             raise ProblemError(
                 f"{name} of {self.name} changes its argument x in place; it must leave it as it is (x = x.clone() first)."
             )
-        if answer is None and name not in DATA:
+        if answer is None and name not in self.data:
             return None
         self._require_form(name, answer, x)
         return answer
+
+    def function(self, name: str) -> Callable[[Tensor], Any]:
+        """The function ``name`` of the problem."""
+        if name not in SPREAD:
+            return getattr(self.problem, name)
+        return lambda x: None if (pair := self._divergence_pair(x)) is None else pair[name == DIV_DIV_D]
+
+    def _divergence_pair(self, x: Tensor):
+        pair = self.problem.noise_divergences(x)
+        if pair is not None and not (isinstance(pair, tuple | list) and len(pair) == 2):
+            raise ProblemError(
+                f"noise_divergences of {self.name} gave a {type(pair).__name__}, but must give two tensors, div D of shape "
+                "(N, d) and div div D of shape (N,), or None where they are not known."
+            )
+        return pair
 
     def called(self, function: Callable, x: Tensor, name: str):
         """What ``function``, the one called ``name``, gives at ``x``; whatever it raises as one sentence."""
@@ -81,8 +117,9 @@ class Functions:
             raise ProblemError(f"{name} of {self.name} raised {words(error)} at {at}{where}.") from None
 
     def _require_form(self, name: str, answer: object, x: Tensor) -> None:
-        wanted = (len(x), *(self.sizes[letter] for letter in FORMS[name]))
-        form = f"(N, {', '.join(FORMS[name])})".replace(", )", ",)")
+        letters = self.forms[name]
+        wanted = (len(x), *(self.sizes[letter] for letter in letters))
+        form = f"(N, {', '.join(letters)})".replace(", )", ",)")
         if not isinstance(answer, Tensor):
             kind = f"{type(answer).__module__}.{type(answer).__qualname__}".removeprefix("builtins.")
             raise ProblemError(
@@ -90,9 +127,10 @@ class Functions:
                 f"shape {form}; torch.as_tensor(.., dtype=x.dtype, device=x.device) makes one."
             )
         if tuple(answer.shape) != wanted:
-            sizes = ", ".join(f"{k} = {self.sizes[k]}" for k in FORMS[name])
+            sizes = ", ".join(f"{k} = {self.sizes[k]}" for k in letters)
             hint = f" with {sizes}" if sizes else ""
-            hint += " (control_dim is d unless super().__init__ is given another)" if "m" in FORMS[name] else ""
+            hint += " (control_dim is d unless super().__init__ is given another)" if "m" in letters else ""
+            hint += " (a column for each of k Brownian motions, as many at all states)" if "k" in letters else ""
             raise ProblemError(
                 f"{name} of {self.name} gave shape {tuple(answer.shape)} for states of shape {tuple(x.shape)}, but must give "
                 f"{form} = {wanted}{hint}."

@@ -9,7 +9,7 @@ from torch import Tensor
 from ocp_torch.errors import ProblemError
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.blame import place
-from ocp_torch.problems.checks.functions import DATA, Functions
+from ocp_torch.problems.checks.functions import Functions
 
 # Answers that differ by more than that part of the largest are not the same; rounding in single precision stays below.
 SAME = 1e-5
@@ -29,9 +29,9 @@ Answers = tuple[Tensor, dict[str, Tensor]]
 def require_purity(functions: Functions) -> Answers:
     """Ask the same states in another order, among others and alone; what was answered first is given for `require_still`."""
     x = functions.exact_states(COMPARED, DESIGN)
-    kept = {name: functions.ask(name, x) for name in DATA}
+    kept = {name: functions.ask(name, x) for name in functions.data}
     first = {name: values.clone() for name, values in kept.items()}
-    for name in reversed(DATA):
+    for name in reversed(functions.data):
         _require_same(functions, name, x, first[name], functions.ask(name, x.flip(0)).flip(0), OTHER_ROWS)
     for name, values in kept.items():
         _require_same(functions, name, x, first[name], values, OVERWRITES)
@@ -52,7 +52,7 @@ def require_still(functions: Functions, first: Answers) -> None:
 def require_differentiable(functions: Functions) -> None:
     """It can be called with states that need gradients: ascents to suprema differentiate by the state."""
     x = functions.states(DIFFERENTIATED, DIFFERENTIATED_DESIGN)
-    for name in DATA:
+    for name in functions.data:
         with torch.enable_grad():
             function = getattr(functions.problem, name)
             functions.called(lambda at, f=function: f(at.requires_grad_(True)), x.clone(), name)
@@ -62,7 +62,7 @@ def require_period(functions: Functions) -> None:
     """The same values a few whole periods away, in all coordinates at once, added without rounding."""
     x = functions.exact_states(min(TURNED, functions.count), TURNED_DESIGN)
     whole = torch.randint(LOWEST, HIGHEST + 1, x.shape, generator=fixed_generator()).to(x)
-    for name in DATA:
+    for name in functions.data:
         here = functions.ask(name, x)
         worst, change = _worst((here - functions.ask(name, x + whole)).abs())
         if not change <= SAME * float(here.abs().max()):

@@ -1,12 +1,14 @@
 """Values: finite everywhere, `f >= 0` and `mu0 >= 0`, `f` within its declared bound, and divergences that are some."""
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
 from ocp_torch.errors import ProblemError
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.blame import place
-from ocp_torch.problems.checks.functions import DATA, FORMS, Functions
+from ocp_torch.problems.checks.functions import DIV_D, DIV_DIV_D, NOISE, Functions
 
 # A part of the largest value that rounding may take a function below 0, or above its bound, by.
 ROUNDING = 1e-6
@@ -19,7 +21,9 @@ DESCENTS, STEPS = 16, 40
 # Designs of the states (see `functions.FIRST_DESIGN`).
 SPREAD, FACE, SIGN, DIVERGENCE = 3, 4, 6, 7
 # What a divergence is one of, and the states at which it is compared with differences of it.
-SOURCES, COMPARED = {"drift_divergence": "drift", "control_divergence": "control_matrix"}, 24
+D = "D = noise noise^T / 2"
+SOURCES = {"drift_divergence": "drift", "control_divergence": "control_matrix", DIV_D: D, DIV_DIV_D: DIV_D}
+COMPARED = 24
 # Steps of the differences. They are believed where both agree within this part of the largest divergence, and a claim that is
 # off by more than that part there is wrong; kinks and jumps at a minority of states are forgiven.
 DIFFERENCES, AGREE, WRONG = (1e-3, 2.5e-4), 0.01, 0.1
@@ -32,8 +36,8 @@ def require_finite(functions: Functions) -> None:
     for dtype, how in ((torch.float64, ""), (torch.float32, " in single precision")):
         spread = functions.states(functions.count, SPREAD).to(dtype).remainder(1.0)
         special = _special(functions).to(dtype)
-        for name in FORMS:
-            for x in (spread, special) if name in DATA else (spread[:FEWER_STATES],):
+        for name in functions.forms:
+            for x in (spread, special) if name in functions.data else (spread[:FEWER_STATES],):
                 values = functions.given(name, x)
                 if values is None:
                     continue
@@ -86,10 +90,12 @@ def _require_sign(functions: Functions, name: str, x: Tensor, hint: str) -> tupl
 def require_divergences(functions: Functions) -> None:
     """Raise where most of the divergences that central differences of two steps settle are claimed to be something else."""
     d, m = functions.problem.dim, functions.problem.control_dim
-    if functions.simulator or COMPARED * d * d * m > MOST_NUMBERS:
+    if functions.simulator or COMPARED * d * d * max(m, d * functions.noisy) > MOST_NUMBERS:
         return
     x = functions.exact_states(COMPARED, DIVERGENCE)
     for name, source in SOURCES.items():
+        if name not in functions.forms:
+            continue
         claimed = functions.given(name, x)
         if claimed is None:
             continue
@@ -110,11 +116,17 @@ def require_divergences(functions: Functions) -> None:
 
 def _differences(functions: Functions, source: str, x: Tensor, step: float) -> Tensor:
     """The divergence of each column, ``(N, columns)``, by central differences."""
+    ask = partial(_diffusion, functions) if source == D else partial(functions.ask, source)
     total = torch.zeros((), dtype=x.dtype)
     for i, move in enumerate(step * torch.eye(x.shape[1], dtype=x.dtype)):
-        change = (functions.ask(source, x + move) - functions.ask(source, x - move)) / (2.0 * step)
+        change = (ask(x + move) - ask(x - move)) / (2.0 * step)
         total = total + change.reshape(*x.shape, -1)[:, i]
     return total
+
+
+def _diffusion(functions: Functions, x: Tensor) -> Tensor:
+    sigma = functions.ask(NOISE, x)
+    return 0.5 * sigma @ sigma.mT
 
 
 def _listed(values: Tensor) -> str:

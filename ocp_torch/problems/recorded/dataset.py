@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -11,11 +10,10 @@ from torch import Tensor
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import MARGIN, Problem
+from ocp_torch.problems.recorded.implied import completed, same_everywhere
 from ocp_torch.problems.recorded.recording import Recording, read
 from ocp_torch.problems.samples import Samples
 
-# Matrices that differ by less, relative to 1 + their size, are the same.
-CONSTANT = 1e-9
 # The part of what is not held out that evaluations during training are made on.
 VALIDATION_PART = 0.1
 # Fewest samples of a part that anything is estimated from.
@@ -47,6 +45,7 @@ class Dataset(Problem):
     incidental = ("path",)
     state_cost, initial_density = _unknown("state cost"), _unknown("initial density")
     drift = drift_divergence = _unknown("drift")
+    noise = noise_divergences = _unknown("noise")  # type: ignore[assignment] # neither gives anything
 
     def __init__(
         self,
@@ -73,9 +72,7 @@ class Dataset(Problem):
             discount = numbers.get("discount") if discount is None else discount
             exponent = numbers.get("exponent", 2.0) if exponent is None else exponent
             control_limit = numbers.get("control_limit") if control_limit is None else control_limit
-            first = samples.B[:1]
-            same = float((samples.B - first).abs().max()) <= CONSTANT * (1.0 + float(first.abs().max()))
-            constant_matrix = first[0].tolist() if same else None
+            constant_matrix = samples.B[0].tolist() if same_everywhere(samples.B) else None
         if discount is None:
             raise InputError("problem.discount is missing: the file does not hold it; give problem.discount=...")
         super().__init__(dim, control_dim, discount, exponent, control_limit)  # type: ignore[arg-type] # refused there
@@ -103,14 +100,10 @@ class Dataset(Problem):
         return self._recording
 
     def _split(self, samples: Samples) -> None:
-        """The three parts; the divergences that are 0, of no drift and of a constant `B`, are known."""
+        """The three parts."""
         # The largest cost among the samples, with head-room: an estimate, and the certificate calls it one.
         self.state_cost_bound = MARGIN * float(samples.f.max())
-        zero = torch.zeros_like(samples.f)
-        if samples.div_a is None and not samples.a.any():
-            samples = replace(samples, div_a=zero)
-        if samples.div_B is None and self._B is not None:
-            samples = replace(samples, div_B=zero.unsqueeze(-1).expand(-1, self.control_dim))
+        samples = completed(samples)
         count = len(samples)
         held = round(self.held_out_part * count)
         chosen_by = max(FEWEST, round(VALIDATION_PART * (count - held)))
@@ -163,8 +156,14 @@ class Dataset(Problem):
         return not bool(self.recording.samples.a.any())
 
     @property
-    def gives_divergences(self) -> bool:
-        return self.training.div_a is not None and self.training.div_B is not None
+    def noisy(self) -> bool:
+        return self.training.noise is not None
+
+    @property
+    def unknown_divergences(self) -> str:
+        found = {"a": self.training.div_a, "B": self.training.div_B}
+        found |= {"D": self.training.div_D} if self.noisy else {}
+        return " and ".join(name for name, column in found.items() if column is None)
 
     def control_matrix(self, x: Tensor) -> Tensor:
         if self._B is None:

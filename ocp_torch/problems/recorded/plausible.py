@@ -61,6 +61,14 @@ def _require_distribution(path: Path, samples: Samples, given: bool) -> None:
     if off(samples.mu0, 1.0) > SURE:
         mean = float(samples.mean(samples.mu0))
         raise InputError(f"{path}: mu0 has mean {mean:.4g} over the torus, but a density must have mean 1.")
+    if samples.div_D is not None and samples.div_div_D is not None:
+        columns = {"div_div_D": samples.div_div_D, **{f"div_D[{i}]": c for i, c in enumerate(samples.div_D.T)}}
+        for name, values in columns.items():
+            if off(values, 0.0) > SURE:
+                mean = float(samples.mean(values))
+                raise InputError(
+                    f"{path}: {name} has mean {mean:.4g} over the torus, but a divergence must have mean 0."
+                )
     for i in range(samples.x.shape[1]):
         for k in FREQUENCIES:
             angle = 2.0 * torch.pi * k * samples.x[:, i]

@@ -1,8 +1,10 @@
 """Recorded samples of a problem as a file, NPZ or safetensors: read without running anything in it, and checked.
 
 Arrays: ``x (N, d)`` in `[0, 1)`, ``f (N,)``, ``a (N, d)``, ``B (N, d, m)``; optionally ``div_a (N,)``, ``div_B (N, m)``,
-``mu0 (N,)``, and ``density (N,)``, that of the distribution ``x`` was drawn from (uniform where it is left out). Optionally
-the numbers ``discount``, ``exponent`` and ``control_limit``. Samples must be independent draws.
+``mu0 (N,)``, and ``density (N,)``, that of the distribution ``x`` was drawn from (uniform where it is left out). Where there
+is noise ``noise (N, d, k)``, `sigma`, and optionally ``div_D (N, d)`` and ``div_div_D (N,)`` of `D = sigma sigma^T / 2`; they
+are 0 where `sigma` is the same at all samples. Optionally the numbers ``discount``, ``exponent`` and ``control_limit``.
+Samples must be independent draws.
 """
 
 import hashlib
@@ -22,7 +24,7 @@ from ocp_torch.problems.recorded.plausible import dependence_notes, samples_of
 from ocp_torch.problems.samples import Samples
 
 REQUIRED = {"x": "Nd", "f": "N", "a": "Nd", "B": "Ndm"}
-OPTIONAL = {"div_a": "N", "div_B": "Nm", "mu0": "N", "density": "N"}
+OPTIONAL = {"div_a": "N", "div_B": "Nm", "mu0": "N", "density": "N", "noise": "Ndk", "div_D": "Nd", "div_div_D": "N"}
 NUMBERS = ("discount", "exponent", "control_limit")
 KNOWN = (*REQUIRED, *OPTIONAL, *NUMBERS)
 SUFFIXES = (".npz", ".safetensors")
@@ -85,7 +87,7 @@ def write(path: str | Path, samples: Samples, numbers: dict[str, float | None], 
     path = Path(path)
     if path.suffix not in SUFFIXES:
         raise InputError(f"out is {str(path)!r}, but must be a file ending in {' or '.join(SUFFIXES)}.")
-    columns = {name: getattr(samples, name) for name in ("x", "f", "a", "B", "div_a", "div_B", "mu0")}
+    columns = {name: getattr(samples, name) for name in (*REQUIRED, *OPTIONAL) if name != "density"}
     columns["density"] = density
     arrays = {k: np.ascontiguousarray(v.detach().cpu().numpy()) for k, v in columns.items() if v is not None}
     arrays |= {k: np.asarray(v, dtype=np.float64) for k, v in numbers.items() if v is not None}
@@ -116,7 +118,14 @@ def _require_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
     x, B = arrays["x"], arrays["B"]
     if x.ndim != 2 or x.shape[1] < 1 or B.ndim != 3 or B.shape[2] < 1:
         raise InputError(f"{path}: x has shape {x.shape} and B {B.shape}, but they must have (N, d) and (N, d, m).")
-    sizes = {"N": len(x), "d": x.shape[1], "m": B.shape[2]}
+    sigma = arrays.get("noise", x[:, :, None])
+    if sigma.ndim != 3 or sigma.shape[2] < 1:
+        raise InputError(f"{path}: noise has shape {sigma.shape}, but must have (N, d, k).")
+    missing = [name for name in ("noise", "div_D", "div_div_D") if name not in arrays]
+    if "noise" in missing and len(missing) < 3 or len(missing) == 1:
+        together = "div_D and div_div_D go with each other and with noise, of which they are the divergences"
+        raise InputError(f"{path} lacks {', '.join(missing)}; {together}.")
+    sizes = {"N": len(x), "d": x.shape[1], "m": B.shape[2], "k": sigma.shape[2]}
     for name, form in {**REQUIRED, **OPTIONAL}.items():
         expected = tuple(sizes[letter] for letter in form)
         if name in arrays and arrays[name].shape != expected:

@@ -25,7 +25,8 @@ class Oracle:
     """The ``target`` of a `Simulator`, by name or the function itself, asked with ``workers`` processes: made only if it
     keeps to what is said there at a few states and across the seam, and held to it whenever it is asked.
 
-    ``driftless``: `None` stands for `a`; ``gives_mu0``: there is a fourth part; ``in_float32``: `f` is in single precision.
+    ``driftless``: `None` stands for `a`; ``gives_mu0``: there is a `mu0`; ``motions``: how many columns `sigma` has, 0 for no
+    noise; ``in_float32``: `f` is in single precision.
     """
 
     def __init__(self, target: str | Callable, dim: int, control_dim: int, workers: int = 1) -> None:
@@ -39,6 +40,7 @@ class Oracle:
         self._pool: Workers | None = None
         self._kept: tuple[Tensor, dict] | None = None
         self.one_by_one = self.driftless = self.gives_mu0 = self.in_float32 = False
+        self.motions, self._understood = 0, False
         self._understand()
         self._check_the_seam()
         if isinstance(target, str) and workers > 1:
@@ -81,13 +83,21 @@ class Oracle:
     def _shaped(self, answer: object, x: np.ndarray) -> dict[str, Tensor]:
         """The parts of ``answer`` by name, as float64 tensors; `InputError` where one is missing or misshapen."""
         count, d, m = len(x), self._dim, self._control_dim
-        if not isinstance(answer, tuple | list) or len(answer) not in (3, 4):
+        if not isinstance(answer, tuple | list) or len(answer) not in (3, 4, 5):
             raise InputError(
-                f"the oracle gave a {type(answer).__name__}, but must give f, a, B (and, if it likes, mu0)."
+                f"the oracle gave a {type(answer).__name__}, but must give f, a, B (and, if it likes, mu0, sigma or both)."
             )
-        forms = {"f": (count,), "a": (count, d), "B": (count, d, m), "mu0": (count,)}
+        forms: dict[str, tuple] = {"f": (count,), "a": (count, d), "B": (count, d, m)}
+        more = [part for part in answer[3:] if part is not None]
+        columns = _columns(more[-1]) if more else 0
+        if len(more) == 2 or (more and not columns):
+            forms["mu0"] = (count,)
+        if len(more) == 2 or columns:
+            forms["sigma"] = (count, d, self.motions or max(columns, 1))
+        if self._understood and ("mu0" in forms, "sigma" in forms) != (self.gives_mu0, self.motions > 0):
+            raise InputError(f"the oracle gave {', '.join(forms)} at x = {x[0].tolist()}, but other parts before.")
         found = {}
-        for (name, form), part in zip(forms.items(), answer, strict=False):
+        for (name, form), part in zip(forms.items(), (*answer[:3], *more), strict=True):
             try:
                 given = np.zeros(form) if name == "a" and part is None else np.asarray(part)
             except (TypeError, ValueError):
@@ -110,7 +120,8 @@ class Oracle:
         self.one_by_one = self._form(x.numpy())
         found = self.checked(x)
         raw = asked(self._function, x[:1].numpy(), self.one_by_one)
-        self.driftless, self.gives_mu0 = raw[1] is None, len(raw) == 4
+        self.driftless, self.gives_mu0 = raw[1] is None, "mu0" in found
+        self.motions, self._understood = found["sigma"].shape[2] if "sigma" in found else 0, True
         self.in_float32 = np.asarray(raw[0]).dtype == np.float32
         again, alone = self.checked(x), self.checked(x[2:3])
         for name, values in found.items():
@@ -157,3 +168,12 @@ class Oracle:
                         f"the oracle's {name} jumps by {float(change[worst]):.3g} where coordinate {i} passes from 1 to 0, "
                         f"at x = {after[worst].tolist()}, but it must have period 1 in each coordinate."
                     )
+
+
+def _columns(part: object) -> int:
+    """How many columns ``part`` has if it is a matrix for each state, as no density is; else 0."""
+    try:
+        shape = np.asarray(part).shape
+    except ValueError:  # rows of unlike lengths
+        return 0
+    return shape[2] if len(shape) == 3 else 0

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import require_flag
-from ocp_torch.maths.differences import STEPS, Differenced
+from ocp_torch.maths.differences import SECOND_STEPS, STEPS, Differenced, spread_divergences
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.oracle import Oracle
 
@@ -16,14 +16,16 @@ SCAN_FACTOR = 8
 
 class Simulator(Problem):
     """``target`` maps states, arrays ``(N, d)`` in `[0, 1)`, to `f` ``(N,)``, `a` ``(N, d)`` (or `None` for no drift) and `B`
-    ``(N, d, m)``, as NumPy arrays, and, if it likes, to the initial density `mu0` ``(N,)`` as well; or one state ``(d,)`` to
-    a number, ``(d,)`` and ``(d, m)``: which of the two is found out by asking.
+    ``(N, d, m)``, as NumPy arrays, and, if it likes, after these to the initial density `mu0` ``(N,)``, to the noise `sigma`
+    ``(N, d, k)``, or to both in this order; or one state ``(d,)`` to a number, ``(d,)``, ``(d, m)``, a number and ``(d, k)``:
+    which of the two is found out by asking.
 
     ``target`` is module:function, FILE.py:function or the function itself. Without ``differences`` there are no divergences
-    of `a` and `B`, and what needs them is left out; with them they come from central differences, which takes `2 d` more
-    calls a state wherever they are wanted. ``workers`` processes share each batch (the target must then be named, not
-    given). Raises `InputError`, with the state, where the function fails, gives another shape or a number that is not
-    finite, is not a function of the state alone, or jumps where a coordinate passes from 1 to 0.
+    of `a`, `B` and `D = sigma sigma^T / 2`, and what needs them is left out; with them they come from central differences,
+    which takes `2 d` more calls a state wherever they are wanted, and with noise `2 d (d + 1)` more than that. ``workers``
+    processes share each batch (the target must then be named, not given). Raises `InputError`, with the state, where the
+    function fails, gives another shape or a number that is not finite, is not a function of the state alone, or jumps where
+    a coordinate passes from 1 to 0.
     """
 
     incidental = ("target", "differences", "workers")
@@ -44,7 +46,8 @@ class Simulator(Problem):
         self.differences = require_flag("problem.differences", differences)
         self.workers = workers
         self._oracle = Oracle(target, self.dim, self.control_dim, workers)
-        self._step = STEPS[torch.float32 if self._oracle.in_float32 else torch.float64]
+        precision = torch.float32 if self._oracle.in_float32 else torch.float64
+        self._step, self._wide_step = STEPS[precision], SECOND_STEPS[precision]
 
     @property
     def scan_factor(self) -> int:
@@ -56,8 +59,12 @@ class Simulator(Problem):
         return self._oracle.driftless
 
     @property
-    def gives_divergences(self) -> bool:
-        return self.differences
+    def unknown_divergences(self) -> str:
+        return "" if self.differences else "a and B and D" if self.noisy else "a and B"
+
+    @property
+    def noisy(self) -> bool:
+        return self._oracle.motions > 0
 
     def _part(self, name: str, x: Tensor) -> Tensor:
         """One part of the answers; without differences an ascent follows the networks alone."""
@@ -76,11 +83,24 @@ class Simulator(Problem):
     def initial_density(self, x: Tensor) -> Tensor:
         return self._part("mu0", x) if self._oracle.gives_mu0 else torch.ones_like(x[:, 0])
 
+    def noise(self, x: Tensor) -> Tensor | None:
+        return self._part("sigma", x) if self.noisy else None
+
     def drift_divergence(self, x: Tensor) -> Tensor | None:
         return self._divergences(x)[0] if self.differences else None
 
     def control_divergence(self, x: Tensor) -> Tensor | None:
         return self._divergences(x)[1] if self.differences else None
+
+    @torch.no_grad()
+    def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
+        if not self.differences:
+            return None
+        at = _unit_cell(x)
+        if "spread" not in (kept := self._oracle.answers(at)):
+            ask = lambda y: self._oracle.checked(y.remainder(1.0))["sigma"]
+            kept["spread"] = spread_divergences(ask, at, kept["sigma"], self._wide_step)
+        return tuple(part.to(x) for part in kept["spread"])
 
     @torch.no_grad()
     def _divergences(self, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -19,7 +19,8 @@ class Arm(Linkage):
 
     ``lengths`` in metres, by default 1 / dim each; ``target`` `[x, y]`; ``obstacles`` a list of `[x, y, radius]`. The
     optimal flow contracts onto the configurations that reach the target: `mu*` is declared unbounded, and no `M` makes
-    `F_M` a bound, with a control limit or without, as the control is small there. Raises `InputError` for wrong arguments.
+    `F_M` a bound, with a control limit or without, as the control is small there. With ``joint_noise``, in rad/sqrt(s) for
+    all joints or each, or ``noise`` nothing is known of `mu*`. Raises `InputError` for wrong arguments.
     """
 
     def __init__(
@@ -35,8 +36,11 @@ class Arm(Linkage):
         discount: float = 1.0,
         exponent: float = 2.0,
         control_limit: float | None = None,
+        joint_noise: float | Sequence[float] = 0.0,
+        noise: float | Sequence[float] = 0.0,
     ) -> None:
-        super().__init__(dim, dim, discount, exponent, control_limit)
+        super().__init__(dim, dim, discount, exponent, control_limit, noise)
+        self.shake(joint_noise)
         self.pursue(2, target, obstacles, clearance, target_weight, obstacle_weight)
         self.speed = require_number("problem.speed", speed, above=0.0)
         equal = [1.0 / self.dim] * self.dim

@@ -22,7 +22,8 @@ class Dubins(PlanarVehicle):
     before; simulated performance and the Lagrangian bound speak of the learned, smooth controller and need no optimum.
     What is lost is the a-priori bound on `u*` (Proposition 2), for which a least-squares `alpha` stands, and knowledge
     of `mu*`. It is declared unbounded where the vehicle can turn faster than the discount forgets: the flow then gathers on
-    a circle about the target (an `inf` only keeps `F_M` out of the certificate).
+    a circle about the target (an `inf` only keeps `F_M` out of the certificate). With ``heading_noise`` in rad/sqrt(s),
+    ``position_noise`` in m/sqrt(s) or ``noise`` nothing is known of it.
     """
 
     def __init__(
@@ -38,11 +39,16 @@ class Dubins(PlanarVehicle):
         discount: float = 0.5,
         exponent: float = 2.0,
         control_limit: float | None = None,
+        heading_noise: float = 0.0,
+        position_noise: float = 0.0,
+        noise: float | Sequence[float] = 0.0,
     ) -> None:
-        super().__init__(3, 1, discount, exponent, control_limit)
+        super().__init__(3, 1, discount, exponent, control_limit, noise)
         self.pursue(2, target, obstacles, clearance, target_weight, obstacle_weight)
         self.drive(size, speed, turn_rate)
-        self.occupation_bound = math.inf if TURN * self.turn_rate > self.discount else None
+        self.shake(heading_noise, position_noise)
+        gathers = TURN * self.turn_rate > self.discount and not self.noisy
+        self.occupation_bound = math.inf if gathers else None
 
     def drift(self, x: Tensor) -> Tensor:
         return self.ahead(x)

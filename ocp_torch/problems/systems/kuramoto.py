@@ -21,12 +21,13 @@ class Kuramoto(Oscillators):
     `mean_i (1 - cos theta_i) / 2` to entrain, that is to bring all to phase 0.
 
     ``relative`` phases `y_i = x_i - x_n`, `i < n`, drop one dimension and lose nothing where the cost depends on
-    differences alone: it is the default to (de)synchronise, and refused to entrain. ``frequencies`` is a list, or null
-    for normal draws of deviation ``spread`` by ``seed``, shifted to mean 0; ``graph`` is complete, ring, random (by
+    differences alone: it is the default to (de)synchronise, and refused to entrain. ``frequencies`` is a list, or null for
+    normal draws of deviation ``spread`` by ``seed``, shifted to mean 0; ``graph`` is complete, ring, random (by
     ``probability`` and ``seed``), a file or a list of rows. The flow contracts onto the goal: `mu*` is declared unbounded,
-    also under a control limit (an `inf` only keeps `F_M` out of the certificate).
-    Where not all oscillators are controlled, assumption A2 of the paper fails (see `Dubins` for what then still holds).
-    Raises `InputError` for wrong arguments.
+    also under a control limit (an `inf` only keeps `F_M` out of the certificate); not with ``phase_noise``, in rad/sqrt(s)
+    for all oscillators or each, which moves all differences to the last one where that strays, or ``noise``, of
+    coordinates. Where not all oscillators are controlled, assumption A2 of the paper fails (see `Dubins` for what then
+    still holds). Raises `InputError` for wrong arguments.
     """
 
     goals = (*Oscillators.goals, ENTRAIN)
@@ -48,13 +49,15 @@ class Kuramoto(Oscillators):
         exponent: float = 2.0,
         seed: int = 0,
         control_limit: float | None = None,
+        phase_noise: float | Sequence[float] = 0.0,
+        noise: float | Sequence[float] = 0.0,
     ) -> None:
         self.oscillators = n = require_integer("problem.oscillators", oscillators, 2, maximum=512)
         self.relative = goal != ENTRAIN if relative is None else require_flag("problem.relative", relative)
         if self.relative and goal == ENTRAIN:
             raise InputError("problem.relative is true, but problem.goal = entrain asks for phases, not differences.")
         self.controlled = _subset(controlled, n)
-        super().__init__(n - self.relative, len(self.controlled), discount, exponent, control_limit)
+        super().__init__(n - self.relative, len(self.controlled), discount, exponent, control_limit, noise)
         self.aim(goal, weight)
         self.seed = require_integer("problem.seed", seed, 0)
         self.spread = require_number("problem.spread", spread, at_least=0.0)
@@ -66,10 +69,12 @@ class Kuramoto(Oscillators):
         self._adjacency = adjacency("problem.graph", graph, n, self.probability, self.seed)
         # Rows, not a file's name: what is saved with a controller must not depend on another file.
         self.graph = graph if graph in GRAPHS else self._adjacency.tolist()
-        B = torch.zeros(n, self.control_dim, dtype=torch.float64)
-        B[self.controlled, range(self.control_dim)] = self.strength / TURN
-        self._B = B[:-1] - B[-1] if self.relative else B
-        self.occupation_bound = math.inf
+        coordinates = torch.eye(n, dtype=torch.float64)
+        if self.relative:
+            coordinates = coordinates[:-1] - coordinates[-1]
+        self._B = self.strength / TURN * coordinates[:, self.controlled]
+        self.shake(phase_noise, coordinates)
+        self.occupation_bound = None if self.noisy else math.inf
 
     def phases(self, x: Tensor) -> Tensor:
         """In relative coordinates the last one is 0."""

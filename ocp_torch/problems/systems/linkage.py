@@ -2,11 +2,13 @@ r"""What arms of turning joints share, in the plane and in space: a tip that is 
 
 import math
 from abc import abstractmethod
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from ocp_torch.problems.systems.angles import to_radians, to_turns
+from ocp_torch.problems.constant_noise import one_or_each
+from ocp_torch.problems.systems.angles import TURN, to_radians, to_turns
 from ocp_torch.problems.systems.reaching import Reaching, bump
 
 
@@ -16,17 +18,24 @@ class Linkage(Reaching):
     `x_i` is the angle of joint `i` in turns, so that the state space is exactly the torus and there is no drift; `u = 1`
     turns a joint by ``speed`` turns per second. `p` is the tip, and `s` runs over ``points_per_link`` points of each link,
     where the bump `b_o` of an obstacle is 1 at its centre and 0 from ``clearance`` metres outside its surface on; all is
-    twice differentiable. A subclass gives `joints` and `jacobian`, sets ``speed``, and calls `pursue` and `stretch`.
+    twice differentiable. A subclass gives `joints` and `jacobian`, sets ``speed``, and calls `pursue`, `shake` and `stretch`.
     """
 
     points_per_link = 8
     speed: float  # turns per second at `u = 1`
 
+    def shake(self, joint_noise: float | Sequence[float]) -> None:
+        """Note how far a joint strays in a second, ``joint_noise`` in rad/sqrt(s): one for each joint, or one for all."""
+        each = one_or_each("problem.joint_noise", joint_noise, self.dim)
+        self.joint_noise = joint_noise
+        self.add_noise(torch.tensor(each, dtype=torch.float64).diag() / TURN)
+
     def stretch(self, length: float, shoulder: list[float]) -> None:
         """Note that the tip stays within ``length`` metres of the ``shoulder``, the first joint's place."""
         self.length, self.shoulder = length, shoulder
         self.bound_cost((math.hypot(*shoulder) + length + math.hypot(*self.target)) ** 2)
-        self.occupation_bound = math.inf
+        # Where a joint strays the flow does not gather on a point.
+        self.occupation_bound = None if self.noisy else math.inf
 
     @abstractmethod
     def joints(self, x: Tensor) -> Tensor:

@@ -1,9 +1,12 @@
 r"""What phase oscillators share: Kuramoto's order parameter, and goals and costs of synchrony made of it."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from ocp_torch.errors import require_choice, require_number, require_numbers
+from ocp_torch.problems.constant_noise import one_or_each
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.angles import TURN, to_radians, to_turns
 
@@ -11,7 +14,7 @@ SYNCHRONISE, DESYNCHRONISE, ENTRAIN = "synchronise", "desynchronise", "entrain"
 
 
 class Oscillators(Problem):
-    """Phases that pull at one another. A subclass gives the dynamics, and calls `aim` and `run_at`."""
+    """Phases that pull at one another. A subclass gives the dynamics, and calls `aim`, `run_at` and `shake`."""
 
     goals: tuple[str, ...] = (SYNCHRONISE, DESYNCHRONISE)
 
@@ -26,6 +29,13 @@ class Oscillators(Problem):
         self.coupling = require_number("problem.coupling", coupling)
         self.strength = require_number("problem.strength", strength, above=0.0)
         self._omega = torch.tensor(self.frequencies, dtype=torch.float64)
+
+    def shake(self, phase_noise: float | Sequence[float], coordinates: Tensor) -> None:
+        """Note how far a phase strays in a second, ``phase_noise`` in rad/sqrt(s): one for each of the phases, or one for
+        all. ``coordinates`` ``(d, n)`` makes states of phases in turns."""
+        each = one_or_each("problem.phase_noise", phase_noise, coordinates.shape[1])
+        self.phase_noise = phase_noise
+        self.add_noise(coordinates * torch.tensor(each, dtype=torch.float64) / TURN)
 
     def phases(self, x: Tensor) -> Tensor:
         """All phases in turns, ``(N, n)``."""

@@ -1,6 +1,7 @@
 r"""Swing up a pendulum by a torque at its pivot: the model and parameters of Gymnasium's Pendulum-v1, made periodic."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -30,7 +31,8 @@ class Pendulum(Problem):
     faithful for `|theta'| <= max_speed`; beyond (where Gymnasium clips the speed) the path in phase space is the same,
     but time slows down until it stands still at the seam, which is never crossed. `d = 2`, `m = 1`; angles in radians,
     velocities in rad/s, torque in N m, mass in kg, length in m. A2 of the paper fails: the angle is not controlled directly.
-    Raises `InputError` for wrong arguments.
+    ``torque_noise`` in N m sqrt(s) enters as the torque does, cut off like it, so that it does not cross the seam either;
+    ``noise``, of both coordinates, does. With either nothing is known of `mu*`. Raises `InputError` for wrong arguments.
     """
 
     def __init__(
@@ -45,8 +47,10 @@ class Pendulum(Problem):
         discount: float = 2.0,
         exponent: float = 2.0,
         control_limit: float | None = None,
+        torque_noise: float = 0.0,
+        noise: float | Sequence[float] = 0.0,
     ) -> None:
-        super().__init__(2, 1, discount, exponent, control_limit)
+        super().__init__(2, 1, discount, exponent, control_limit, noise)
         self.gravity = require_number("problem.gravity", gravity, at_least=0.0)
         self.mass = require_number("problem.mass", mass, above=0.0)
         self.length = require_number("problem.length", length, above=0.0)
@@ -59,6 +63,7 @@ class Pendulum(Problem):
             )
         self.max_torque = require_number("problem.max_torque", max_torque, above=0.0)
         self.torque_cost = require_number("problem.torque_cost", torque_cost, above=0.0)
+        self.torque_noise = require_number("problem.torque_noise", torque_noise, at_least=0.0)
         self._pull = 1.5 * self.gravity / self.length
         self._push = 3.0 * self.max_torque / (self.mass * self.length**2)
         self._scale = 0.5 / (self.torque_cost * self.max_torque**2)
@@ -67,7 +72,9 @@ class Pendulum(Problem):
         A = torch.tensor([[0.0, 2.0 * self.seam / TURN], [self._pull * TURN / (2.0 * self.seam), 0.0]]).double()
         B = torch.tensor([[0.0], [self._push / (2.0 * self.seam)]], dtype=torch.float64)
         Q = 2.0 * self._scale * torch.tensor([TURN**2, SPEED_COST * (2.0 * self.seam) ** 2], dtype=torch.float64).diag()
-        self.occupation_bound = occupation_bound_at_rest(A, B, Q, self.discount, self.exponent)
+        # Noise shakes it at the state of rest too.
+        at_rest = None if self.noisy else occupation_bound_at_rest(A, B, Q, self.discount, self.exponent)
+        self.occupation_bound = at_rest
 
     def _velocity(self, x: Tensor) -> Tensor:
         """`theta'` in [-seam, seam) rad/s, ``(N,)``."""
@@ -85,6 +92,11 @@ class Pendulum(Problem):
         """`d chi / d theta'`."""
         z = self._beyond(velocity)
         return -30.0 * (z * (1.0 - z)).square() * velocity.sign() / (self.seam - self.max_speed)
+
+    def _cut_bend(self, velocity: Tensor) -> Tensor:
+        """The second derivative of `chi`."""
+        z = self._beyond(velocity)
+        return -60.0 * z * (1.0 - z) * (1.0 - 2.0 * z) / (self.seam - self.max_speed) ** 2
 
     def _square(self, velocity: Tensor) -> Tensor:
         """`c = 2 int_0^v |v| chi dv`: `v^2` up to ``max_speed``, level at the seam."""
@@ -112,6 +124,27 @@ class Pendulum(Problem):
 
     def control_divergence(self, x: Tensor) -> Tensor:
         return (self._cut_slope(self._velocity(x)) * self._push).unsqueeze(-1)
+
+    @property
+    def _jolt(self) -> float:
+        """`sigma` of the torque noise in the second coordinate, where nothing is cut off."""
+        return self._push / self.max_torque * self.torque_noise / (2.0 * self.seam)
+
+    def noise(self, x: Tensor) -> Tensor | None:
+        even = super().noise(x)
+        if self.torque_noise == 0.0:
+            return even
+        jolt = self._jolt * self._cut(self._velocity(x))
+        column = torch.stack([torch.zeros_like(jolt), jolt], dim=-1).unsqueeze(-1)
+        return column if even is None else torch.cat([even, column], dim=-1)
+
+    def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Of `D_22 = jolt^2 chi^2 / 2`, the part that varies."""
+        velocity, stretch = self._velocity(x), 2.0 * self.seam
+        cut, slope, bend = self._cut(velocity), self._cut_slope(velocity), self._cut_bend(velocity)
+        first = self._jolt**2 * stretch * cut * slope
+        second = self._jolt**2 * stretch**2 * (slope.square() + cut * bend)
+        return torch.stack([torch.zeros_like(first), first], dim=-1), second
 
     def to_torus(self, physical: Tensor) -> Tensor:
         """Angles in radians and velocities in rad/s ``(N, 2)`` as states; raises `InputError` for a speed beyond the seam."""

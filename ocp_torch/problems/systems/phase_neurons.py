@@ -1,5 +1,7 @@
 r"""Spiking neurons reduced to their phases under one stimulus: break their synchrony, as deep brain stimulation should."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -19,9 +21,10 @@ class PhaseNeurons(Oscillators):
     ``coupling`` and ``strength`` are in rad/s, `u` is the stimulus in units of ``strength``. Cost: ``weight`` times `r^2` to
     desynchronise, `1 - r^2` to synchronise, `r` the order parameter.
 
-    ``frequencies`` is a list, or null for ``frequency`` times equally spaced factors from `1 - spread / 2` to
-    `1 + spread / 2`. The drift is not in the range of `B`, so the paper's assumption A2 fails; see `Dubins` for what then
-    still holds. Where all phases agree the stimulus cannot part them. Raises `InputError` for wrong arguments.
+    ``frequencies`` is a list, or null for ``frequency`` times equally spaced factors from `1 - spread / 2` to `1 + spread /
+    2`; ``phase_noise`` is in rad/sqrt(s), one for all neurons or each. The drift is not in the range of `B`, so the paper's
+    assumption A2 fails; see `Dubins` for what then still holds. Where all phases agree the stimulus cannot part them.
+    Raises `InputError` for wrong arguments.
     """
 
     def __init__(
@@ -38,9 +41,11 @@ class PhaseNeurons(Oscillators):
         discount: float = 0.7,
         exponent: float = 2.0,
         control_limit: float | None = None,
+        phase_noise: float | Sequence[float] = 0.0,
+        noise: float | Sequence[float] = 0.0,
     ) -> None:
         self.neurons = n = require_integer("problem.neurons", neurons, 2, maximum=512)
-        super().__init__(n, 1, discount, exponent, control_limit)
+        super().__init__(n, 1, discount, exponent, control_limit, noise)
         self.aim(goal, weight)
         self.response = require_choice("problem.response", response, (TYPE_1, TYPE_2))
         self.frequency = require_number("problem.frequency", frequency)
@@ -48,6 +53,7 @@ class PhaseNeurons(Oscillators):
         factors = 1.0 + self.spread * torch.linspace(-0.5, 0.5, n, dtype=torch.float64)
         given = (self.frequency * factors).tolist() if frequencies is None else frequencies
         self.run_at(given, n, coupling, strength)
+        self.shake(phase_noise, torch.eye(n, dtype=torch.float64))
 
     def drift(self, x: Tensor) -> Tensor:
         cosine, sine = self.circular(x)

@@ -16,7 +16,7 @@ class PlanarVehicle(Reaching):
     `f = target_weight r(x)^2 + obstacle_weight sum_o b_o(x)`, with the smooth periodic distance
     `r^2 = (size/pi)^2 (sin^2 pi(x_1 - g_1) + sin^2 pi(x_2 - g_2))` in metres from the target `g`, and bumps `b_o` that are 1
     at the centre of an obstacle and 0 from ``clearance`` metres outside its rim on. Positions are in metres, in [0, size).
-    A subclass calls `pursue` and `drive`.
+    A subclass calls `pursue`, `drive` and `shake`.
     """
 
     def drive(self, size: float, speed: float, turn_rate: float) -> None:
@@ -25,6 +25,14 @@ class PlanarVehicle(Reaching):
         self.speed = require_number("problem.speed", speed, above=0.0)
         self.turn_rate = require_number("problem.turn_rate", turn_rate, above=0.0)
         self.bound_cost(2.0 * (self.size / math.pi) ** 2)
+
+    def shake(self, heading_noise: float, position_noise: float) -> None:
+        """Note how far it strays in a second: ``heading_noise`` in rad/sqrt(s), and ``position_noise`` in m/sqrt(s) along
+        each axis of the plane."""
+        self.heading_noise = require_number("problem.heading_noise", heading_noise, at_least=0.0)
+        self.position_noise = require_number("problem.position_noise", position_noise, at_least=0.0)
+        slip = self.position_noise / self.size
+        self.add_noise(torch.tensor([slip, slip, self.heading_noise / TURN], dtype=torch.float64).diag())
 
     def heading(self, x: Tensor) -> Tensor:
         """The unit vector ahead, ``(N, 2)``."""

@@ -39,7 +39,8 @@ class RobotArm(Linkage):
     metres from their surface, along the lines from joint to joint.
 
     ``chain`` is the kinematics as numbers (`read_chain`), in place of ``urdf``: what a saved controller holds. `mu*` is
-    declared unbounded, as for `Arm`. Raises `InputError` for wrong arguments.
+    declared unbounded, as for `Arm`, unless there is ``joint_noise``, in rad/sqrt(s), or ``noise``. Raises `InputError` for
+    wrong arguments.
     """
 
     points_per_link = 4  # six joints and more: the cost of obstacles is most of the work
@@ -58,6 +59,8 @@ class RobotArm(Linkage):
         discount: float = 1.0,
         exponent: float = 2.0,
         control_limit: float | None = None,
+        joint_noise: float | Sequence[float] = 0.0,
+        noise: float | Sequence[float] = 0.0,
     ) -> None:
         if urdf is not None and chain is not None:
             raise InputError("problem.urdf and problem.chain are both given, but either alone is the kinematics.")
@@ -70,7 +73,8 @@ class RobotArm(Linkage):
             )
         self.chain = [require_numbers(f"problem.chain[{i}]", row, 15) for i, row in enumerate(given)]
         joints = len(self.chain) - 1
-        super().__init__(joints, joints, discount, exponent, control_limit)
+        super().__init__(joints, joints, discount, exponent, control_limit, noise)
+        self.shake(joint_noise)
         self.pursue(3, target, obstacles, clearance, target_weight, obstacle_weight)
         self.speed = require_number("problem.speed", speed, above=0.0)
         self.urdf, self.tip = None, None  # a saved controller needs no file

@@ -15,7 +15,8 @@ class Unicycle(PlanarVehicle):
     The kinematic model of a wheeled robot that cannot slide sideways (LaValle, *Planning Algorithms*, section 13.1.2):
     `d = 3`, `m = 2`, no drift. `u_1 = 1` is ``speed`` metres per second ahead, `u_2 = 1` is ``turn_rate`` turns per second.
     The cost is that of `PlanarVehicle`. Where the flow contracts onto the target line by line faster than the discount
-    forgets, which for `q = 2` is `2 target_weight speed^2 >= 2 discount^2`, `mu*` is declared unbounded.
+    forgets, which for `q = 2` is `2 target_weight speed^2 >= 2 discount^2`, `mu*` is declared unbounded; not with
+    ``heading_noise`` in rad/sqrt(s), ``position_noise`` in m/sqrt(s) or ``noise``.
     """
 
     def __init__(
@@ -31,13 +32,17 @@ class Unicycle(PlanarVehicle):
         discount: float = 1.0,
         exponent: float = 2.0,
         control_limit: float | None = None,
+        heading_noise: float = 0.0,
+        position_noise: float = 0.0,
+        noise: float | Sequence[float] = 0.0,
     ) -> None:
-        super().__init__(3, 2, discount, exponent, control_limit)
+        super().__init__(3, 2, discount, exponent, control_limit, noise)
         self.pursue(2, target, obstacles, clearance, target_weight, obstacle_weight)
         self.drive(size, speed, turn_rate)
+        self.shake(heading_noise, position_noise)
         # With V = p r^2 / 2 along the heading: p + (speed p)^2 / rho^2 = 2 target_weight, contraction speed^2 p / rho. The
         # control vanishes at the target, so that no limit changes any of it there.
-        fast = self.target_weight * self.speed**2 >= self.discount**2
+        fast = not self.noisy and self.target_weight * self.speed**2 >= self.discount**2
         self.occupation_bound = math.inf if fast and self.exponent == 2.0 else None
 
     def control_matrix(self, x: Tensor) -> Tensor:

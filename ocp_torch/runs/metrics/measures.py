@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.control.policies import Policy
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
@@ -25,11 +26,21 @@ LATE = 0.25  # the part of a trajectory that is its end
 
 @dataclass(frozen=True)
 class Path:
-    """``times`` ``(K,)`` in the problem's unit, ``states`` ``(K, N, d)``, and each discounted ``cost`` ``(N,)``."""
+    """``times`` ``(K,)`` in the problem's unit, ``states`` ``(K, N, d)``, and each discounted ``cost`` ``(N,)``; ``samples``
+    neighbours are draws of the noise from one start."""
 
     times: Tensor
     states: Tensor
     cost: Tensor
+    samples: int = 1
+
+    @property
+    def means(self) -> Tensor:
+        """The mean of the samples of each start, ``(K, N / samples, d)``: of the way they went, not of where they are on the
+        torus, where opposite states have none."""
+        moves = (self.states.diff(dim=0) + 0.5).remainder(1.0) - 0.5
+        ways = torch.cat([self.states[:1], self.states[:1] + moves.cumsum(dim=0)])
+        return ways.unflatten(1, (-1, self.samples)).mean(dim=2).remainder(1.0)
 
     def each(self, function: Callable[[Tensor], Tensor], late: bool = False) -> Tensor:
         """``function`` of all states, or of those of the last quarter of the time, as ``(K', N)``."""
@@ -38,8 +49,9 @@ class Path:
 
 
 @torch.no_grad()
-def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, steps: int) -> Path:
-    r"""From ``x0`` ``(N, d)`` for ``duration``, by RK4 with a control recomputed at each stage.
+def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, steps: int, samples: int = 1) -> Path:
+    r"""From ``x0`` ``(N, d)`` for ``duration``, by RK4 with a control recomputed at each stage; with noise ``samples``
+    paths from each start, by that and what the noise does in a step, which is the same for all controllers.
 
     The cost is `int_0^T rho e^{-rho t} (f + R(u)) dt` by the trapezoidal rule: good to a few digits, where the certificate's
     performance has an error bound.
@@ -50,6 +62,8 @@ def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, step
     times = h * torch.arange(steps + 1, dtype=x0.dtype)
     weight = rho * h * (-rho * times).exp()
     weight[0], weight[-1] = 0.5 * weight[0], 0.5 * weight[-1]
+    samples, generator = samples if problem.noisy else 1, fixed_generator()
+    x0 = x0.repeat_interleave(samples, dim=0)
     x, states = x0, [x0.remainder(1.0)]
     cost = torch.zeros_like(x0[:, 0])
     for k in range(steps):
@@ -59,9 +73,14 @@ def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, step
         v2 = velocity(x + 0.5 * h * v1)
         v3 = velocity(x + 0.5 * h * v2)
         v4 = velocity(x + h * v3)
-        x = (x + h / 6.0 * (v1 + 2.0 * v2 + 2.0 * v3 + v4)).remainder(1.0)
+        sigma = problem.noise(x)
+        x = x + h / 6.0 * (v1 + 2.0 * v2 + 2.0 * v3 + v4)
+        if sigma is not None:
+            drawn = torch.randn(len(x), sigma.shape[-1], dtype=x.dtype, generator=generator)
+            x = x + h**0.5 * torch.einsum("ndk,nk->nd", sigma, drawn)
+        x = x.remainder(1.0)
         states.append(x)
-    return Path(times, torch.stack(states), cost + weight[-1] * rate(x, policy(x)))
+    return Path(times, torch.stack(states), cost + weight[-1] * rate(x, policy(x)), samples)
 
 
 def admissible(problem: Problem, x: Tensor) -> Tensor:

@@ -11,6 +11,8 @@ from ocp_torch.runs.metrics.measures import Path, simulate
 from ocp_torch.runs.metrics.trial import random_starts
 from ocp_torch.runs.pictures.scenes import Scene, scene
 
+# With noise so many starts at most, and paths from each.
+NOISY_STARTS, SAMPLES = 3, 8
 # Time drawn, in units of 1 / rho, and frames of it.
 DURATION, FRAMES = 5.0, 160
 # Of a panel, in inches.
@@ -21,8 +23,9 @@ FRAMES_PER_SECOND, STRIDE, DPI = 12, 4, 60
 
 def _panels(problem: Problem, look: Scene, policy: Policy, seed: int) -> list[tuple[str, Path]]:
     """Titles and paths from random admissible starts: each apart, or all in one panel beside the same without control."""
-    x0 = random_starts(problem, look.starts, derive_seed(seed, Branch.PICTURES))
-    run = lambda each, starts: simulate(problem, each, starts, DURATION / problem.discount, FRAMES)
+    starts = min(look.starts, NOISY_STARTS) if problem.noisy else look.starts
+    x0 = random_starts(problem, starts, derive_seed(seed, Branch.PICTURES))
+    run = lambda each, starts: simulate(problem, each, starts, DURATION / problem.discount, FRAMES, SAMPLES)
     if look.apart:
         return [("", run(policy, start)) for start in x0.split(1)]
     return [("controlled", run(policy, x0)), ("no control", run(zero_policy(problem), x0))]

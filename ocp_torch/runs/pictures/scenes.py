@@ -51,14 +51,27 @@ def _broken(track: Tensor, jump: float) -> Tensor:
     return track
 
 
+def _tracks(path: Path, k: int) -> list[tuple[Tensor, dict[str, Any]]]:
+    """The states ``(k + 1, d)`` of each path up to frame ``k``, and how its line looks; with noise the means after them."""
+    several = path.samples > 1
+    looks = dict(linewidth=0.6, alpha=0.5) if several else dict(linewidth=1.2)
+    drawn = [(x[: k + 1], {"color": f"C{i // path.samples}", **looks}) for i, x in enumerate(path.states.unbind(1))]
+    means = path.means.unbind(1) if several else ()
+    return drawn + [(x[: k + 1], {"color": f"C{i}", "linewidth": 2.5}) for i, x in enumerate(means)]
+
+
 def draw_arm(problem: Linkage, axes: Any, path: Path, k: int) -> None:
-    """One trajectory: poses from light to dark, the way of the tip, target and obstacles; in the plane or in space."""
+    """One trajectory: poses from light to dark, the way of the tip, target and obstacles; in the plane or in space. With
+    noise the poses are those of the mean, and the way of each tip is drawn."""
     base = [0.0] * len(problem.shoulder)
     reach = 1.08 * max(problem.length, *(math.dist(problem.shoulder, place) for place in (problem.target, base)))
     limits = {f"{name}lim": (at - reach, at + reach) for name, at in zip("xyz", problem.shoulder, strict=False)}
     obstacles = _obstacles if len(base) == 2 else _balls
     obstacles(axes, problem.obstacles, problem.clearance)
-    poses = problem.joints(path.states[: k + 1, 0])
+    *others, (mean, _) = _tracks(path, k)
+    poses = problem.joints(mean)
+    for x, look in others:
+        axes.plot(*problem.joints(x)[:, -1].T, "-", **{**look, "color": "C1"})
     for j in range(0, k + 1, max(1, len(path.times) // GHOSTS)):
         axes.plot(*poses[j].T, "-", color="C0", alpha=0.15 + 0.35 * j / len(path.times))
     axes.plot(*poses[:, -1].T, "-", color="C1", linewidth=1.0)
@@ -70,12 +83,12 @@ def draw_arm(problem: Linkage, axes: Any, path: Path, k: int) -> None:
 def draw_vehicles(problem: PlanarVehicle, axes: Any, path: Path, k: int) -> None:
     """Trajectories in the periodic plane with their headings."""
     _obstacles(axes, problem.obstacles, problem.clearance, problem.size)
-    for i in range(path.states.shape[1]):
-        x = path.states[: k + 1, i]
+    some = torch.cat([torch.arange(0, k, max(1, len(path.times) // 16)), torch.tensor([k])])
+    for x, look in _tracks(path, k):
         track, ahead = problem.from_torus(x)[:, :2], problem.heading(x)
-        axes.plot(*_broken(track, 0.5 * problem.size).T, color=f"C{i}", linewidth=1.2)
-        some = torch.cat([torch.arange(0, k, max(1, len(path.times) // 16)), torch.tensor([k])])
-        axes.quiver(*track[some].T, *ahead[some].T, color=f"C{i}", scale=28, width=0.005, pivot="mid")
+        axes.plot(*_broken(track, 0.5 * problem.size).T, **look)
+        if "alpha" not in look:
+            axes.quiver(*track[some].T, *ahead[some].T, color=look["color"], scale=28, width=0.005, pivot="mid")
     axes.plot(*problem.target, "*", color="k", markersize=14)
     limits = {"xlim": (0, problem.size), "ylim": (0, problem.size)}
     axes.set(**limits, aspect="equal", xlabel="m", title=f"{path.times[k]:.2f}")
@@ -95,10 +108,10 @@ def draw_pendulums(problem: Pendulum, axes: Any, path: Path, k: int) -> None:
 
     for speed in (-problem.max_speed, problem.max_speed):
         axes.axhline(speed, color="0.7", linestyle=":")
-    for i in range(path.states.shape[1]):
-        track = problem.from_torus(path.states[: k + 1, i])
-        axes.plot(*_broken(track, math.pi).T, color=f"C{i}", linewidth=1.0)
-        axes.plot(*track[-1], "o", color=f"C{i}", markersize=4)
+    for x, look in _tracks(path, k):
+        track = problem.from_torus(x)
+        axes.plot(*_broken(track, math.pi).T, **look)
+        axes.plot(*track[-1], "o", color=look["color"], markersize=4)
     corner = axes.inset_axes((0.78, 0.76, 0.2, 0.22))
     angle = float(problem.from_torus(path.states[k])[0, 0])
     corner.add_patch(Wedge((0.0, 0.0), 0.08, 0.0, 360.0, color="k"))
