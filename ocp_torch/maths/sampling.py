@@ -105,7 +105,9 @@ class ImportanceSampler:
 
     Every ``every`` draws, ``pool`` states of the present density are to be scored (`pool`, `learn`). The part ``uniform``
     of the probability is uniform, so that no weight is above ``1 / uniform``. The pool is drawn apart from what trains:
-    given the boxes, batches are unbiased whatever the scores were.
+    given the boxes, weighted means over a batch are unbiased whatever the scores were (`Boxes.place`), as far as Sobol
+    points of one scrambling are: what was learnt from earlier ones knows them. The pool's states are evaluations of the
+    problem beside those of the batches.
     """
 
     def __init__(
