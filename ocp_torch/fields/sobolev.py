@@ -107,15 +107,24 @@ class SobolevFeatures(nn.Module):
         cosines, sines, amplitudes = self._waves(x)
         return torch.cat([torch.ones_like(x[..., :1]), amplitudes * cosines, amplitudes * sines], dim=-1)
 
-    def jets(self, x: Tensor) -> Tensor:
-        """The features and their `d` derivatives, ``(N, 1 + d, F)``."""
+    def jets(self, x: Tensor, sigma: Tensor | None = None) -> Tensor:
+        """The features and their `d` derivatives, ``(N, 1 + d, F)``; last, where there is noise ``sigma`` ``(N, d, k)``,
+        their curvature `D : hess`, ``(N, 2 + d, F)``."""
         cosines, sines, amplitudes = self._waves(x)
         values = torch.cat([torch.ones_like(x[:, :1]), amplitudes * cosines, amplitudes * sines], dim=-1)
         turned = torch.stack([-amplitudes * sines, amplitudes * cosines], dim=1)  # (N, 2, K)
         slopes = 2.0 * math.pi * self.frequencies.T  # (d, K)
         moved = (slopes[:, None] * turned[:, None]).flatten(2)  # (N, d, 2 K)
         derivatives = torch.cat([torch.zeros_like(x).unsqueeze(-1), moved], dim=-1)
-        return torch.cat([values.unsqueeze(1), derivatives], dim=1)
+        parts = [values.unsqueeze(1), derivatives]
+        if sigma is not None:
+            bent = -0.5 * self._driven(sigma)
+            parts.append(torch.cat([torch.zeros_like(bent[:, :1]), bent, bent], dim=-1).mul(values).unsqueeze(1))
+        return torch.cat(parts, dim=1)
+
+    def _driven(self, sigma: Tensor) -> Tensor:
+        """`2 w . D w (2 pi)^2` of each frequency, ``(N, K)``."""
+        return torch.einsum("wd,ndk->nwk", 2.0 * math.pi * self.frequencies, sigma).square().sum(dim=-1)
 
 
 class SobolevField(nn.Module):
@@ -176,8 +185,7 @@ class SobolevField(nn.Module):
         gradient = self.scale * 2.0 * math.pi * (turned @ self.features.frequencies)
         if sigma is None:
             return Jet(value, gradient)
-        driven = torch.einsum("wd,ndk->nwk", 2.0 * math.pi * self.features.frequencies, sigma)
-        bent = driven.square().sum(dim=-1) * (cosines * of_cosine + sines * of_sine)
+        bent = self.features._driven(sigma) * (cosines * of_cosine + sines * of_sine)
         return Jet(value, gradient, -0.5 * self.scale * bent.sum(dim=-1))
 
     @property

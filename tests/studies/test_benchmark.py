@@ -301,7 +301,9 @@ def test_a_recipe_in_small_gives_its_numbers_and_figures(name, quick):
     ticks = []
     history = carry_out(small(name), (0, 1), 8, ticks.append)
     assert sum(ticks) == 60
-    wanted = {"dual": {"F_M", "value"}, "primal": {"G", "density"}, "pd": {"F_M", "G", "J", "value", "density"}}[name]
+    wanted = {"dual": {"F_M", "value"}, "primal": {"G", "density"}, "pd": {"F_M", "G", "J", "value", "density"}}[
+        RECIPES[name].method
+    ]
     for numbers in history.numbers[60]:
         assert wanted <= set(numbers)
         assert numbers.get("F_M", -1.0) < 0.0 < min(numbers[n] for n in wanted - {"F_M"})
@@ -328,7 +330,8 @@ def test_the_exact_kernel_does_more_work_at_each_step_and_features_do_not():
     """Counted instead of timed: the numbers that enter one evaluation."""
     problem, constants = circle()
     from ocp_torch.fields.sobolev import SobolevFeatures
-    from ocp_torch.studies.kernel.expansions import BernoulliKernel, FeatureExpansion, KernelExpansion
+    from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
+    from ocp_torch.studies.kernel.expansions import FeatureExpansion, KernelExpansion
     from ocp_torch.studies.kernel.iterations import Iteration, step_sizes
 
     exact = Iteration(problem, "dual", constants, (0,), kernel=BernoulliKernel(2), capacity=60)
@@ -347,7 +350,7 @@ def test_the_exact_kernel_does_more_work_at_each_step_and_features_do_not():
 def test_a_whole_reproduction_in_small(tmp_path, monkeypatch, quick):
     for name in RECIPES:
         monkeypatch.setitem(RECIPES, name, small(name))
-    reproduce(check({"seeds": [0], "modes": 8, "exact_steps": {"dual": 10, "primal": 10, "pd": 10}}), tmp_path)
+    reproduce(check({"seeds": [0], "modes": 8, "exact_steps": dict.fromkeys(RECIPES, 10)}), tmp_path)
     made = {path.stem for path in (tmp_path / "figures").glob("*.png")}
     each = {f"{name}_{kind}" for name in RECIPES for kind in ("performance", "iterates")}
     assert made == each | {"mu_star", "cost_per_step"}
@@ -360,6 +363,6 @@ def test_a_whole_reproduction_in_small(tmp_path, monkeypatch, quick):
     [({"seeds": []}, "seeds"), ({"modes": 0}, "modes"), ({"exact_steps": {"dual": 0}}, "exact_steps")],
 )
 def test_wrong_fields_of_a_reproduction_are_refused(change, word):
-    config = {"seeds": [0], "modes": 8, "exact_steps": {"dual": 1, "primal": 1, "pd": 1}}
+    config = {"seeds": [0], "modes": 8, "exact_steps": dict.fromkeys(RECIPES, 1)}
     with pytest.raises(InputError, match=word):
         check({**config, **change})

@@ -16,7 +16,7 @@ from ocp_torch.runs.build import build_trainer
 from ocp_torch.steppers import schedule_maker
 from ocp_torch.studies.benchmark.contenders import OCCUPATION
 from ocp_torch.studies.benchmark.measure import Judge, relative
-from ocp_torch.studies.kernel.expansions import BernoulliKernel, bernoulli_polynomial
+from ocp_torch.studies.kernel.bernoulli import BernoulliKernel, bernoulli_polynomial
 from ocp_torch.studies.kernel.iterations import Iteration, step_sizes
 from ocp_torch.studies.kernel.rules import RULES, Datum
 from ocp_torch.studies.paper.runs import circle

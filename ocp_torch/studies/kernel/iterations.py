@@ -14,7 +14,8 @@ from ocp_torch.maths.sampling import UniformSampler
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
-from ocp_torch.studies.kernel.expansions import BernoulliKernel, FeatureExpansion, KernelExpansion
+from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
+from ocp_torch.studies.kernel.expansions import FeatureExpansion, KernelExpansion
 from ocp_torch.studies.kernel.rules import RULES, Datum
 
 # States whose data and features are computed together: vectorised, and small enough for the cache.
@@ -45,9 +46,10 @@ class Iteration:
         if features is not None and kernel is None:
             make: Callable = partial(FeatureExpansion, features.double())
         elif kernel is not None and features is None:
-            make = partial(KernelExpansion, kernel, problem.dim, capacity)
+            make = partial(KernelExpansion, kernel, problem.dim, problem.noisy, capacity)
         else:
             raise InputError("an iteration needs either features or a kernel.")
+        require_curvature(problem, features, kernel)
         seeds = tuple(seeds)
         self.problem, self.method, self.n, self.samples = problem, method, 0, 0
         self.rule = RULES[method](problem, constants)
@@ -87,6 +89,21 @@ class Iteration:
         return Fields({name: e.field(run, name == VALUE) for name, e in self.expansions.items()})
 
 
+def require_curvature(problem: Problem, features: SobolevFeatures | None, kernel: BernoulliKernel | None) -> None:
+    """Raise `InputError` unless `D:hess V(x)` is a continuous functional in the space of a noisy ``problem``: `s > 5/2`, or
+    `s > 2 + d/2` for the isotropic kernel."""
+    form = features or kernel
+    if form is None or not problem.noisy:
+        return
+    isotropic = features is not None and features.kernel == "isotropic"
+    needed = 2.0 + problem.dim / 2.0 if isotropic else 2.5
+    if form.regularity <= needed:
+        raise InputError(
+            f"regularity is {form.regularity:g}, but must be above {needed:g} for a problem with noise: "
+            "below, V in the space need not have second derivatives."
+        )
+
+
 @torch.no_grad()
 def stream(
     problem: Problem, seeds: tuple[int, ...], features: SobolevFeatures | None, divergences: bool
@@ -96,8 +113,9 @@ def stream(
     while True:
         x = torch.stack([sampler.draw(BLOCK) for sampler in samplers], dim=1).flatten(0, 1)
         samples = Samples.of(problem, x, divergences=divergences)
-        jets = None if features is None else features.jets(x)
+        jets = None if features is None else features.jets(x, samples.noise)
         columns: tuple[Any, ...] = (samples.x, samples.f, samples.a, samples.B, samples.mu0, samples.div_B, jets)
+        columns += (samples.noise,)
         arrays = [None if c is None else c.reshape(BLOCK, len(seeds), *c.shape[1:]).numpy() for c in columns]
         for i in range(BLOCK):
             row: list[Any] = [None if column is None else column[i] for column in arrays]

@@ -4,6 +4,9 @@ A *jet* holds a field's value and gradient at one state, ``(R, 1 + d, o)`` for `
 the reproducing property `V(x) = <V, Phi(x)>` and `d_i V(x) = <V, d_i Phi(x)>`; so the gradient in the space is a sum of
 `Phi(x)` and `d_i Phi(x)` with the coefficients a rule returns, in the direction of improvement (equations 7 and 12 and
 Proposition 9 of the paper). The closed forms are Lemmas 2 and 3, written through the speed `|u| = |w| / mu`.
+
+With noise `D:hess V(x) = <V, D:hess Phi(x)>` joins them, last: jets are ``(R, 2 + d, o)`` (the paper's remark in section
+4.3).
 """
 
 from abc import ABC, abstractmethod
@@ -30,13 +33,14 @@ class Datum(NamedTuple):
     B: np.ndarray  # (R, d, m)
     mu0: np.ndarray  # (R,)
     div_B: Any  # (R, m); None where no rule reads them
-    jets: Any  # (R, 1 + d, F); None without features
-    noise: Any = None
+    jets: Any  # (R, 1 + d, F), with noise (R, 2 + d, F); None without features
+    noise: Any = None  # (R, d, k) sigma; None where there is none
 
 
-def _scalar(jet: np.ndarray) -> Jet:
+def _scalar(jet: np.ndarray, dim: int) -> Jet:
     """That of a field with one output."""
-    return Jet(jet[:, 0, 0], jet[:, 1:, 0])
+    curvature = jet[:, 1 + dim, 0] if jet.shape[1] > 1 + dim else None
+    return Jet(jet[:, 0, 0], jet[:, 1 : 1 + dim, 0], curvature)
 
 
 class Rule(ABC):
@@ -44,12 +48,15 @@ class Rule(ABC):
 
     fields: tuple[str, ...]
     needs_divergences = False
+    takes_noise = False
 
     def __init__(self, problem: Problem, constants: Constants) -> None:
         if problem.control_limit is not None:
             raise InputError(
                 f"problem.control_limit is {problem.control_limit:g}, but the kernel methods know no limit; use networks."
             )
+        if problem.noisy and not self.takes_noise:
+            raise InputError("problem.noise is above 0, but of the kernel methods only dual knows noise; use networks.")
         self.rho, self.M, self.C_V, self.q = problem.discount, constants.M, constants.C_V, problem.exponent
         self.conjugate = self.q / (self.q - 1.0)
 
@@ -66,13 +73,16 @@ class Rule(ABC):
 
 
 class DualRule(Rule):
-    """Ascent on `V mu0 - M max(Q, 0)` (section 4.3): the sum of `(mu0 - M) Phi` and of `M d_i Phi (a + B u)_i / rho`."""
+    """Ascent on `V mu0 - M max(Q, 0)` (section 4.3): the sum of `(mu0 - M) Phi`, of `M d_i Phi (a + B u)_i / rho` and, with
+    noise, of `M D:hess Phi / rho`; in the last two and in `M Phi` only where `Q > 0`."""
 
     fields = (VALUE,)
+    takes_noise = True
 
     def __call__(self, datum: Datum, jets: Jets) -> Jets:
         jet = jets[VALUE]
-        generator, V = Generator(datum, self.rho), _scalar(jet)
+        dim = datum.x.shape[1]
+        generator, V = Generator(datum, self.rho), _scalar(jet, dim)
         p = generator.push(V)
         size = np.sqrt(np.square(p).sum(axis=1))
         u = p if self.q == 2.0 else (size ** (self.conjugate - 2.0))[:, None] * p
@@ -80,7 +90,8 @@ class DualRule(Rule):
         weight = np.where(slack > 0.0, self.M, 0.0)
         step = np.empty_like(jet)
         step[:, 0, 0] = datum.mu0 - weight
-        step[:, 1:, 0] = (weight / self.rho)[:, None] * (datum.a + np.matmul(datum.B, u[:, :, None])[:, :, 0])
+        step[:, 1 : 1 + dim, 0] = (weight / self.rho)[:, None] * (datum.a + np.matmul(datum.B, u[:, :, None])[:, :, 0])
+        step[:, 1 + dim :, 0] = (weight / self.rho)[:, None]
         return {VALUE: step}
 
 
@@ -116,7 +127,7 @@ class SaddleRule(Rule):
 
     def __call__(self, datum: Datum, jets: Jets) -> Jets:
         of_value, of_density = jets[VALUE], jets[CONTROL_DENSITY]
-        generator, V, w = Generator(datum, self.rho), _scalar(of_value), of_density[:, 0]
+        generator, V, w = Generator(datum, self.rho), _scalar(of_value, datum.x.shape[1]), of_density[:, 0]
         beta = generator.reduced_cost(V)
         size = np.sqrt(np.square(w).sum(axis=1))
         speed = np.maximum(size / self.M, self._free_speed(beta))

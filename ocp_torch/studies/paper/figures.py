@@ -7,7 +7,7 @@ from ocp_torch.control.policies import occupation_density, trained_policies
 from ocp_torch.problems import Circle
 from ocp_torch.runs.canvas import blank_figure
 from ocp_torch.studies.benchmark.contenders import OCCUPATION
-from ocp_torch.studies.paper.runs import Comparison, History, circle
+from ocp_torch.studies.paper.runs import Comparison, History, circle, truth
 
 DISCOUNTS = (0.5, 1.0, 1.5, 2.0, 4.0)
 LABELS = {
@@ -51,7 +51,7 @@ def evolution(history: History):
             if min(map(len, rows)) > 1:
                 where.fill_between(looks, list(map(min, rows)), list(map(max, rows)), color=f"C{k}", alpha=0.2)
     axis.axhline(1.0, color="k", linestyle=":", label="OPT")
-    axis.set(xscale="log", xlabel="n", title=f"{recipe.method}, section {recipe.section}: cost / OPT")
+    axis.set(xscale="log", xlabel="n", title=f"{recipe.name}, section {recipe.section}: cost / OPT")
     axis.set_ylim(0.4, 2.6 if "J" in recipe.numbers else 1.4)
     axis.legend(fontsize=8)
     distance.set(xscale="log", yscale="log", xlabel="n", title="distance to OPT, %")
@@ -62,13 +62,11 @@ def evolution(history: History):
 @torch.no_grad()
 def iterates(history: History):
     """What a method learns, for growing `n`, with the exact functions: `V` or `w` and the controller; all four for pd."""
-    problem, constants = circle()
+    problem, constants = circle(history.recipe.noise)
     kind, x = OCCUPATION[history.recipe.method], _grid()
-    u, mu = problem.exact_control(x), problem.exact_occupation(x)
-    assert u is not None  # the circle has its exact truth
-    assert mu is not None
+    V, u, mu = truth(history.recipe.noise).at(x)
     value, density = "controller from $\\bar V_n$", "controller $\\bar w_n / \\mu_n$"
-    exact = {"$\\bar w_n$": u[:, 0] * mu, "$\\bar V_n$": problem.exact_value(x), "$\\mu_n$": mu, value: u, density: u}
+    exact = {"$\\bar w_n$": u[:, 0] * mu, "$\\bar V_n$": V, "$\\mu_n$": mu, value: u, density: u}
 
     def learned(fields) -> dict[str, torch.Tensor]:
         policies = trained_policies(kind, problem, fields, constants)

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from ocp_torch.errors import InputError, require_choice, require_integer, require_section
 from ocp_torch.studies.benchmark.measure import median_and_spread
 from ocp_torch.studies.paper import figures
-from ocp_torch.studies.paper.runs import RECIPES, Comparison, History, carry_out, compare_with_exact
+from ocp_torch.studies.paper.runs import NOISE, RECIPES, Comparison, History, carry_out, compare_with_exact, truth
 
 log = logging.getLogger(__name__)
 
@@ -64,6 +64,7 @@ def report(histories: dict[str, History], comparisons: list[Comparison], seeds: 
     """The numbers as Markdown: what was found, beside what an independent re-implementation of the paper found."""
     lines = [
         f"Circle, rho = 2, M = 2, C_V = 2; regularity 2, {modes} modes; averages; seeds {', '.join(map(str, seeds))}.",
+        f"dual_noise: noise {NOISE:g}, regularity 3; OPT = {truth(NOISE).optimum:.9g}, and Perf, from grids.",
         "Per cent above (+) or below (-) OPT: median [smallest, largest] over seeds. The re-implementation's ranges are over "
         "three seeds of its own; a single pass depends on its samples, so that the two need not coincide.",
         "",

@@ -18,6 +18,8 @@ FEWEST_NODES = 8
 # that is affordable shows little.
 RATIO = {1: 2.0, 2: 2.0, 3: 1.5}
 FINEST = {1: 1024, 2: 192, 3: 40}
+# In one dimension with noise: layers as thin as the diffusion over the speed, and ten digits in a second.
+FINEST_WITH_NOISE = 4096
 # Index, weights and their copies, per entry of the interpolation matrix.
 BYTES_PER_ENTRY = 40
 # A function that changes by more, relative to its size, over one period has not period 1.
@@ -36,21 +38,22 @@ class Stencil:
 
 
 class Grid:
-    """``side`` nodes per coordinate of the `dim`-dimensional unit torus, at multiples of `h = 1 / side`; float64."""
+    """``side`` nodes per coordinate of the `dim`-dimensional unit torus, at multiples of `h = 1 / side`, all moved by
+    ``offset`` cells along each coordinate; float64."""
 
-    def __init__(self, dim: int, side: int) -> None:
-        self.dim, self.side = dim, side
+    def __init__(self, dim: int, side: int, offset: float = 0.0) -> None:
+        self.dim, self.side, self.offset = dim, side, offset
         self.count, self.spacing = side**dim, 1.0 / side
         self._strides = [side ** (dim - 1 - k) for k in range(dim)]
 
     def nodes(self) -> Tensor:
         """All nodes, ``(side^d, d)``, the last coordinate running fastest."""
-        line = torch.arange(self.side, dtype=torch.float64) / self.side
+        line = (torch.arange(self.side, dtype=torch.float64) + self.offset) / self.side
         return torch.cartesian_prod(*[line] * self.dim).reshape(-1, self.dim)
 
     def stencil(self, x: Tensor) -> Stencil:
         """The stencils at points ``(N, d)``, any reals."""
-        position = x * self.side
+        position = x * self.side - self.offset
         base = position.floor()
         t = (position - base).unsqueeze(-1)
         s, r, p = t - 1.0, t - 2.0, t + 1.0
@@ -83,14 +86,16 @@ class Grid:
         return torch.stack([slope(k) for k in range(self.dim)], dim=-1)
 
 
-def grid_sides(dim: int, side: int | None, memory: float) -> tuple[int, int, int]:
+def grid_sides(problem: Problem, side: int | None, memory: float) -> tuple[int, int, int]:
     """Nodes per coordinate of the three grids, the finest ``side`` (None: by dimension); ``memory`` in gigabytes."""
+    dim = problem.dim
     if dim > MOST_DIMENSIONS:
         raise InputError(
             f"problem.dim is {dim}, but a grid needs at most {MOST_DIMENSIONS} coordinates; beyond, certificates remain."
         )
     ratio = RATIO[dim]
-    finest = FINEST[dim] if side is None else require_integer("side", side, 1)
+    usual = FINEST_WITH_NOISE if dim == 1 and problem.noisy else FINEST[dim]
+    finest = usual if side is None else require_integer("side", side, 1)
     sides = round(finest / ratio**2), round(finest / ratio), round(finest)
     if sides[0] < FEWEST_NODES:
         least = round(FEWEST_NODES * ratio**2)
@@ -117,6 +122,9 @@ def require_solvable(problem: Problem, grid: Grid) -> None:
     shapes = {"state_cost": (), "drift": (d,), "control_matrix": (d, m), "initial_density": ()}
     probe = torch.rand(PROBED, d, generator=fixed_generator(), dtype=torch.float64)
     parts = probe, *grid.nodes().split(PIECE)
+    sigma = problem.noise(probe)
+    if sigma is not None:
+        shapes["noise"] = (d, sigma.shape[-1])
     for name, shape in shapes.items():
         function = getattr(problem, name)
         first = function(probe)

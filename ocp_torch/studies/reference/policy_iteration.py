@@ -1,19 +1,24 @@
-"""Policy iteration for the semi-Lagrangian scheme: improve the control at every node, evaluate it, and again.
+"""Policy iteration: improve the control at every node, evaluate it, and again.
 
-The minimum over `u` is taken over finitely many candidates, each judged by the whole right side of the scheme: the control
-now held; the closed-form minimiser `u = |s|^{q'-2} s`, `s = -B^T grad V / rho` (cut to the limit on the control, if there is
-one: mixtures of controls within a ball stay in it), at the midpoint of its path; and the same from the controls of
-neighbouring nodes, which carries a better branch across a kink.
+For the semi-Lagrangian scheme the minimum over `u` is taken over finitely many candidates, each judged by the whole right
+side of the scheme: the control now held; the closed-form minimiser `u = |s|^{q'-2} s`, `s = -B^T grad V / rho` (cut to the
+limit on the control, if there is one: mixtures of controls within a ball stay in it), at the midpoint of its path; and the
+same from the controls of neighbouring nodes, which carries a better branch across a kink.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.studies.reference.grid import Grid
+from ocp_torch.maths.supremum import batched
+from ocp_torch.problems.problem import Problem
+from ocp_torch.studies.reference.finite_differences import FiniteDifferences
+from ocp_torch.studies.reference.grid import PIECE, Grid
 from ocp_torch.studies.reference.semi_lagrangian import SemiLagrangian, minimiser, running_cost
 
 # Policy iteration takes some ten policies; more than so many go in circles.
@@ -39,30 +44,53 @@ PATIENCE = 1.5
 @dataclass(frozen=True)
 class GridSolution:
     """`V` ``(n,)`` and the controls `u` ``(n, m)`` held over a step, at the nodes of ``grid``. ``residual`` bounds the effect
-    on `V` of stopping early: the largest change one more policy makes, over `1 - beta`. ``defect`` is what `defect` gives."""
+    on `V` of stopping early: the largest change one more policy makes, over `1 - beta`. ``defect`` is what `defect` gives.
+    ``occupation`` ``(n,)`` is the density of the discounted time the policy spends, with noise."""
 
     grid: Grid
     value: Tensor
     control: Tensor
     residual: float
     defect: float
+    occupation: Tensor | None = None
+
+    def carried(self, grid: Grid) -> tuple[Tensor, Tensor]:
+        """Value and control at the nodes of another grid, the control from the nearest node."""
+        values, controls = [], []
+        for part in grid.nodes().split(PIECE):
+            stencil = self.grid.stencil(part)
+            values.append((stencil.cubic * self.value[stencil.index]).sum(dim=-1))
+            nearest = stencil.index.gather(1, stencil.linear.argmax(dim=1, keepdim=True)).squeeze(1)
+            controls.append(self.control[nearest])
+        return torch.cat(values), torch.cat(controls)
+
+    def mean(self, problem: Problem) -> float:
+        """`int V dmu0` by the rule of equal weights, which on a torus is the trapezoidal one."""
+        density = batched(problem.initial_density, self.grid.nodes(), PIECE)
+        return math.fsum((self.value * density).tolist()) / self.grid.count
 
 
-def solve(scheme: SemiLagrangian, value: Tensor, control: Tensor, relative: float) -> GridSolution:
+def solve(scheme: SemiLagrangian | FiniteDifferences, value: Tensor, control: Tensor, relative: float) -> GridSolution:
     """Policy iteration from ``value`` ``(n,)`` and ``control`` ``(n, m)`` until one more policy changes `V` by less than
     ``relative`` of the oscillation of `f`, or no longer gets closer."""
+    better: Callable[..., tuple[Tensor, Tensor]]
+    follow: Callable[..., Tensor]
+    if isinstance(scheme, FiniteDifferences):
+        better, follow = scheme.improve, scheme.evaluate
+    else:
+        better, follow = partial(improve, scheme), partial(evaluate, scheme)
     goal = relative * max(scheme.scale, 1e-300)
     residuals: list[float] = []
     best: tuple[Tensor, Tensor, float] | None = None
     for policies in range(1, MOST_POLICIES + 1):
-        control, right = improve(scheme, value, control)
+        control, right = better(value, control)
         residuals.append(float((right - value).abs().max()) / scheme.gain)
         if best is None or scheme.monotone or residuals[-1] <= best[2]:
             best = (value, control, residuals[-1])
         stuck = policies >= FIRST and min(residuals[-LAST:]) > STUCK * min(residuals[:-LAST])
         if residuals[-1] <= goal or (stuck and not scheme.monotone):
             break
-        value = evaluate(scheme, value, control, scheme.gain * min(EVALUATED * residuals[-1], goal))
+        value = follow(value, control, scheme.gain * min(EVALUATED * residuals[-1], goal))
     assert best is not None
     return GridSolution(scheme.grid, *best, defect(scheme, *best[:2]))
 
@@ -141,7 +169,7 @@ def solve_fixed_point(
     return torch.from_numpy(best)
 
 
-def defect(scheme: SemiLagrangian, value: Tensor, control: Tensor) -> float:
+def defect(scheme: SemiLagrangian | FiniteDifferences, value: Tensor, control: Tensor) -> float:
     """Median over the nodes of `R(u) + R*(s) - s . u >= 0`, `s = -B^T grad V / rho` midway along the path under `u`: how
     far the Hamilton-Jacobi-Bellman equation is from being met where `V` is smooth."""
     slope, gaps = scheme.grid.gradient(value), []

@@ -1,17 +1,18 @@
 """A reference for `V*` and `OPT` in one to three dimensions, from grids alone: no network, no objective, no certificate."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
 from ocp_torch.studies.reference.error import extrapolate, look_between
 from ocp_torch.studies.reference.grid import PIECE, Grid, grid_sides, require_solvable
 from ocp_torch.studies.reference.policy_iteration import GridSolution, solve
 from ocp_torch.studies.reference.semi_lagrangian import CLIP, SemiLagrangian, minimiser
+from ocp_torch.studies.reference.with_noise import error_of_jumps, moved_numbers, with_noise
 
 # The step moves a typical state by this many cells, and is at most this share of 1 / rho on the coarsest grid.
 CELLS, LONGEST = 1.0, 0.25
@@ -53,6 +54,12 @@ class Reference:
         """The controls of the finest grid, each held for one step, ``(side,) * d + (m,)``."""
         return self.solution.control.reshape(*self.value.shape, -1)
 
+    @property
+    def occupation(self) -> Tensor | None:
+        """The density `mu*` of the finest grid, ``(side,) * d``; `None` without noise."""
+        found = self.solution.occupation
+        return None if found is None else found.reshape(self.value.shape)
+
     def interpolate(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """`V` ``(N,)`` and `u = grad R*(-B^T grad V / rho)` ``(N, m)`` at states ``(N, d)``, any reals.
 
@@ -71,37 +78,47 @@ class Reference:
 
 
 def solve_reference(problem: Problem, side: int | None = None, memory: float = 4.0) -> Reference:
-    """Solve ``problem`` on three grids, the finest with ``side`` nodes per coordinate (None: 1024, 192, 40 by dimension).
+    """Solve ``problem`` on three grids, the finest with ``side`` nodes per coordinate (None: 1024, 192, 40 by dimension,
+    4096 in one with noise).
 
     ``memory`` in gigabytes is what the finest may take. Raises `InputError` for more than three dimensions, a grid that
     does not fit, functions that are not finite or not periodic, and a control cost other than `|u|^q / q`.
     """
-    sides = grid_sides(problem.dim, side, memory)
+    sides = grid_sides(problem, side, memory)
     with torch.no_grad():
         require_solvable(problem, Grid(problem.dim, sides[0]))
-        start, pace = _speed(problem, sides[0])
-        rise = float(start.value.max() - start.value.min())
-        solutions = []
-        for n in sides:
-            grid = Grid(problem.dim, n)
-            value, control = _carried(start, grid)
-            # The monotone scheme first: from a rough policy the clipped one may not settle.
-            rough = solve(SemiLagrangian(problem, grid, pace * grid.spacing), value, control, ROUGH)
-            scheme = SemiLagrangian(problem, grid, pace * grid.spacing, rise)
-            start = solve(scheme, rough.value, rough.control, TOLERANCE)
-            solutions.append(start)
-        estimates = tuple(_mean(problem, s) for s in solutions)
+        solutions, even = (with_noise if problem.noisy else _without_noise)(problem, sides)
+        start, moved = solutions[-1], moved_numbers(problem, solutions[0]) if problem.noisy else []
+        estimates = tuple(s.mean(problem) for s in solutions)
         fall, missing, unknown = look_between(problem, start.grid)
-        change = float((_carried(solutions[1], start.grid)[0] - start.value).abs().max())
+        change = float((solutions[1].carried(start.grid)[0] - start.value).abs().max())
     noise = max(s.residual + s.defect for s in solutions)
-    result = extrapolate([1.0 / n for n in sides], estimates, noise)
+    result = extrapolate([1.0 / n for n in sides], estimates, noise, even)
     error = result.error if unknown is None else None
     if error is not None:
         error = error + noise + fall + missing * float(start.value.abs().max())
+        if moved:
+            error += error_of_jumps(sides, estimates[0], result.optimum, moved)
     elif unknown is None:
         unknown = "the three grids do not approach evenly"
     unsettled = max(s.residual for s in solutions)
     return Reference(problem, result.optimum, error, result.order, sides, estimates, change, unsettled, start, unknown)
+
+
+def _without_noise(problem: Problem, sides: Sequence[int]) -> tuple[list[GridSolution], bool]:
+    """The solutions on grids of ``sides`` nodes a coordinate, and whether their error is known to be a series in `h^2`."""
+    start, pace = _speed(problem, sides[0])
+    rise = float(start.value.max() - start.value.min())
+    solutions = []
+    for n in sides:
+        grid = Grid(problem.dim, n)
+        value, control = start.carried(grid)
+        # The monotone scheme first: from a rough policy the clipped one may not settle.
+        rough = solve(SemiLagrangian(problem, grid, pace * grid.spacing), value, control, ROUGH)
+        scheme = SemiLagrangian(problem, grid, pace * grid.spacing, rise)
+        start = solve(scheme, rough.value, rough.control, TOLERANCE)
+        solutions.append(start)
+    return solutions, False
 
 
 def _speed(problem: Problem, coarsest: int) -> tuple[GridSolution, float]:
@@ -124,20 +141,3 @@ def _speed(problem: Problem, coarsest: int) -> tuple[GridSolution, float]:
         speed = max(float(g.abs().amax(dim=-1).square().mean().sqrt()), 1e-300)
         step = min(longest, CELLS * grid.spacing / speed)
     return rough, min(CELLS / speed, longest * coarsest)
-
-
-def _carried(solution: GridSolution, grid: Grid) -> tuple[Tensor, Tensor]:
-    """Value and control of ``solution`` at the nodes of another grid, the control from the nearest node."""
-    values, controls = [], []
-    for part in grid.nodes().split(PIECE):
-        stencil = solution.grid.stencil(part)
-        values.append((stencil.cubic * solution.value[stencil.index]).sum(dim=-1))
-        nearest = stencil.index.gather(1, stencil.linear.argmax(dim=1, keepdim=True)).squeeze(1)
-        controls.append(solution.control[nearest])
-    return torch.cat(values), torch.cat(controls)
-
-
-def _mean(problem: Problem, solution: GridSolution) -> float:
-    """`int V dmu0` by the rule of equal weights, which on a torus is the trapezoidal one."""
-    density = batched(problem.initial_density, solution.grid.nodes(), PIECE)
-    return math.fsum((solution.value * density).tolist()) / solution.grid.count

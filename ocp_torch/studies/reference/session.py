@@ -47,7 +47,7 @@ class ReferenceJob:
             require_unlinked(folder, ("figures",))
             self.figure = folder / "figures" / "reference.png"
         self.side, self.memory = config["side"], config["memory"]
-        sides = grid_sides(self.problem.dim, self.side, self.memory)
+        sides = grid_sides(self.problem, self.side, self.memory)
         require_solvable(self.problem, Grid(self.problem.dim, sides[0]))
         self.threads = require_integer("threads", config["threads"], 1, maximum=MOST_THREADS)
         self.file = None if config["save"] is None else _npz(str(config["save"]))
@@ -80,11 +80,14 @@ def _npz(name: str) -> Path:
 
 def save_reference(path: Path, reference: Reference) -> None:
     """Write ``optimum``, ``error`` (NaN where it is unknown), ``order``, ``sides``, ``estimates``, and of the finest grid
-    ``value`` ``(side,) * d`` and ``control`` ``(side,) * d + (m,)``, at the nodes `k / side`."""
+    ``value`` ``(side,) * d``, ``control`` ``(side,) * d + (m,)`` and with noise the density ``occupation`` ``(side,) * d``,
+    at the nodes `k / side`."""
     names = ("optimum", "error", "order", "sides", "estimates", "value", "control")
     arrays: dict[str, Any] = {name: getattr(reference, name) for name in names}
     if reference.error is None:
         arrays["error"] = np.nan
+    if reference.occupation is not None:
+        arrays["occupation"] = reference.occupation
 
     def write(temporary: Path) -> None:
         with temporary.open("wb") as file:
@@ -110,6 +113,8 @@ def reference_table(reference: Reference) -> str:
     order = "none (the three grids do not approach evenly)" if math.isnan(reference.order) else f"{reference.order:.2f}"
     change = f"changes by up to {reference.value_change:.2g} from the second grid to the finest"
     lines += [f"order    {order}", f"V        {change}"]
+    if reference.occupation is not None:
+        lines.append(f"mu*      up to {float(reference.occupation.max()):.5g} at the nodes of the finest grid")
     if reference.error is None:
         lines.append(f"warning: nothing is known of how far the optimum is from this: {reference.unknown}.")
         return "\n".join(lines)
