@@ -1,4 +1,5 @@
-"""Where training states come from: uniform, or scrambled Sobol points; and the evaluation points that never meet them.
+"""Where training states come from: uniform, scrambled Sobol points, or those placed where they count; and the evaluation
+points that never meet them.
 
 Points are always made on the CPU, so that the same seed gives the same states on every device.
 """
@@ -9,7 +10,8 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from ocp_torch.errors import InputError, require_integer
+from ocp_torch.errors import InputError, require_integer, require_number
+from ocp_torch.maths.boxes import Boxes, fitted
 from ocp_torch.maths.seeds import Branch, derive_seed
 
 # Points of one scrambling. Then another begins: a sequence ends, and resuming must draw again all points of the block so far.
@@ -98,6 +100,70 @@ class SobolSampler:
         self.count, self._start = require_integer("count of the checkpoint", state["count"], 0, maximum=2**62), -1
 
 
+class ImportanceSampler:
+    """Sobol points placed by a piecewise constant density (`Boxes`), which is fitted anew to scores again and again.
+
+    Every ``every`` draws, ``pool`` states of the present density are to be scored (`pool`, `learn`). The part ``uniform``
+    of the probability is uniform, so that no weight is above ``1 / uniform``. The pool is drawn apart from what trains:
+    given the boxes, weighted means over a batch are unbiased whatever the scores were (`Boxes.place`), as far as Sobol
+    points of one scrambling are: what was learnt from earlier ones knows them. The pool's states are evaluations of the
+    problem beside those of the batches.
+    """
+
+    def __init__(
+        self, dim: int, seed: int, dtype: torch.dtype, uniform: float = 0.5, every: int = 50, pool: int = 4096
+    ) -> None:
+        self.uniform = require_number("sampler.uniform", uniform, above=0.0, at_most=1.0)
+        self.every = require_integer("sampler.every", every, 1)
+        self.size = require_integer("sampler.pool", pool, 1, maximum=2**20)
+        self.dim, self.dtype, self.boxes, self.drawn = dim, dtype, Boxes.whole(dim), 0
+        self.points = SobolSampler(dim, seed, torch.float64)
+        self.generator = torch.Generator().manual_seed(derive_seed(seed, Branch.POOL))
+
+    def draw(self, count: int) -> Tensor:
+        """The next ``count`` states, ``(count, d)``."""
+        return self.draw_weighted(count)[0]
+
+    def draw_weighted(self, count: int) -> tuple[Tensor, Tensor]:
+        """They, and one over the density of each, ``(count,)``."""
+        self.drawn += 1
+        return self._rounded(self.boxes.place(self.points.draw(count)))
+
+    @property
+    def due(self) -> bool:
+        """Whether scores are wanted before the next draw."""
+        return self.drawn > 0 and self.drawn % self.every == 0
+
+    def pool(self) -> tuple[Tensor, Tensor]:
+        """States to score, and their weights."""
+        u = torch.rand(self.size, self.dim, dtype=torch.float64, generator=self.generator)
+        return self._rounded(self.boxes.place(u))
+
+    def learn(self, x: Tensor, weight: Tensor, score: Tensor) -> None:
+        """From now on draw by the density that suits ``score`` ``(N,)`` at the states ``x`` of a `pool`."""
+        self.boxes = fitted(x.cpu(), weight.cpu(), score.cpu(), self.uniform)
+
+    def _rounded(self, placed: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        return placed[0].to(self.dtype).remainder(1.0), placed[1].to(self.dtype)
+
+    def state_dict(self) -> dict:
+        boxes = {name: tensor.clone() for name, tensor in vars(self.boxes).items()}
+        return {
+            **self.points.state_dict(),
+            "drawn": self.drawn,
+            "generator": self.generator.get_state(),
+            "boxes": boxes,
+        }
+
+    def load_state_dict(self, state: dict) -> None:
+        """The way back from `state_dict`. Raises `InputError` where the boxes are no density."""
+        self.points.load_state_dict(state)
+        self.drawn = require_integer("drawn of the checkpoint", state["drawn"], 0, maximum=2**62)
+        self.generator.set_state(state["generator"])
+        self.boxes = Boxes(**state["boxes"])
+        self.boxes.require_density(self.dim)
+
+
 class RowSampler:
     """Rows of a recording, drawn independently and with replacement; ``digest`` is that of the recording."""
 
@@ -118,4 +184,4 @@ class RowSampler:
         self.generator.set_state(state["generator"])
 
 
-SAMPLERS = {"uniform": UniformSampler, "sobol": SobolSampler}
+SAMPLERS = {"uniform": UniformSampler, "sobol": SobolSampler, "importance": ImportanceSampler}

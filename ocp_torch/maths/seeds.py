@@ -39,6 +39,7 @@ class Branch(IntEnum):
     MASS = 22  # states for the mass of a density, the same in every run
     REFERENCE = 23  # states between the nodes of a reference grid, the same in every run
     BROWNIAN = 24  # paths of the noise; below, the rows they are for and how often their steps are halved
+    POOL = 28  # states that are scored to see where training states count
     AUDIT = 1000  # which trajectories are simulated again with finer steps
 
 

@@ -72,11 +72,11 @@ class Generator:
             if self.data.noise is not None:
                 raise TypeError("where there is noise the jet of V must have its curvature: take it by Generator.jet")
             return self.advection(V)
-        return self.advection(V) + V.curvature
+        return V.curvature if self.data.a is None else self.advection(V) + V.curvature
 
     def transport(self, V: Jet) -> Any:
         """`L^0 V / rho`, ``(N,)``; `None` where there is neither drift nor noise."""
-        return None if self.data.a is None else self.uncontrolled(V) / self.rho
+        return None if self.data.a is None and self.data.noise is None else self.uncontrolled(V) / self.rho
 
     def push(self, V: Jet) -> Any:
         """`-B^T grad V / rho`, ``(N, m)``, of which `grad R*` is the best control against `V` (Proposition 2)."""

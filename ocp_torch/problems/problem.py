@@ -41,6 +41,7 @@ class Lipschitz:
     drift: float | None = None
     control_matrix: float | None = None
     initial_density: float | None = None
+    noise: float | None = None
 
 
 class Problem(Reproducible):

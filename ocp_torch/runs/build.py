@@ -123,6 +123,10 @@ def build_trainer(config: dict) -> Trainer:
     given = {"dim": problem.dim, "seed": seed, "dtype": settings.torch_dtype}
     if problem.has_simulator:
         sampler = call(SAMPLERS[sampler_name], "sampler", section, **given)
+    elif sampler_name == "importance":
+        raise InputError(
+            "sampler.name is importance, but a data set has no data where it was not recorded; leave it out."
+        )
     elif settings.target_gap is not None:
         raise InputError("trainer.target_gap is set, but a data set has no simulation to see a gap by.")
     else:  # a data set has its own samples

@@ -9,10 +9,12 @@ from torch import Tensor
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.errors import InputError, require_number
 from ocp_torch.fields import VALUE, Fields
+from ocp_torch.maths.sampling import ImportanceSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.samples import Samples
+from ocp_torch.training.importance import scores
 
 # The part of a batch that is visited states, where no `M` is known and nobody said otherwise: more of them make the penalty
 # more exact, and leave fewer states for the integrals.
@@ -65,12 +67,25 @@ class Batches:
         if part is None:
             part = VISITED if self._possible and phase.constants.unbounded else 0.0
         count = min(int(part * self.size), self.size - 1)
-        places = self.sampler.draw(self.size - count).to(like.device)
         divergences = self.objective.needs_divergences(phase)
-        drawn = self.problem.samples(places, divergences=divergences)
+        if isinstance(self.sampler, ImportanceSampler):
+            drawn = self._weighted(self.sampler, self.size - count, phase, like, divergences)
+        else:
+            drawn = self.problem.samples(self.sampler.draw(self.size - count).to(like.device), divergences=divergences)
         if not self.problem.has_simulator:
             return drawn.to(like)
         return self._with_visited(drawn, count, like, divergences) if count else drawn
+
+    def _weighted(
+        self, sampler: ImportanceSampler, count: int, phase: Phase, like: Tensor, divergences: bool
+    ) -> Samples:
+        """``count`` states of ``sampler`` with their weights, after a look at a pool of states where one is due."""
+        at = lambda x: self.problem.samples(x.to(like.device), divergences=divergences)
+        if sampler.due:
+            x, weight = sampler.pool()
+            sampler.learn(x, weight, scores(self.objective, self.fields, at(x), phase, sampler.generator))
+        x, weight = sampler.draw_weighted(count)
+        return replace(at(x), weight=weight.to(like))
 
     def _with_visited(self, drawn: Samples, count: int, like: Tensor, divergences: bool) -> Samples:
         if self.states is None or len(self.states) != count:

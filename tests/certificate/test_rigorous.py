@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 
 from ocp_torch.certificate import CertificateSettings, Run, Trained, certify_fields, table
 from ocp_torch.certificate.lower.shifted import slack_function
+from ocp_torch.certificate.proof.activated import activate
 from ocp_torch.certificate.proof.activations import SERIES
 from ocp_torch.certificate.proof.cover import cell_models
 from ocp_torch.certificate.proof.enclosures import Enclosure, enclosure
-from ocp_torch.certificate.proof.models import Box, SmoothModel, absolute, power, reciprocal
-from ocp_torch.certificate.proof.network_model import activate, embed, network_model, product
+from ocp_torch.certificate.proof.models import Box, absolute, power, reciprocal
+from ocp_torch.certificate.proof.network_model import embed, network_model, product
 from ocp_torch.certificate.proof.rigorous import contradiction, obstacle, rigorous_lower_bound
-from ocp_torch.certificate.proof.taylor import TaylorModel
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.fields.mlp import ACTIVATIONS
@@ -28,70 +28,27 @@ from ocp_torch.maths.jets import jet
 from ocp_torch.problems import Circle, Lipschitz, Manufactured, Problem, Torus
 from ocp_torch.problems.constants import resolve_constants
 from support import zoo
+from support.cells import (
+    corners_and_inside,
+    flat,
+    grid,
+    holds,
+    layer_holds,
+    network,
+    perturbed_models,
+    random_box,
+)
 from support.honesty import BARE
 
 # Every problem of the zoo in at most two dimensions that encloses its data, and a few odd ones.
 TURN = 2.0 * math.pi
-LOW = [n for n in zoo.EXACT if zoo.build(n).dim <= 2]
+LOW = [*(n for n in zoo.EXACT if zoo.build(n).dim <= 2), "noisy 1-d", "noisy 2-d sigma(x)"]
 
 
-def network(dim: int, seed: int, **options) -> PeriodicMLP:
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        built = PeriodicMLP(
-            dim, **{"modes": 2, "waves": 2, "width": 12, "depth": 2, "shift": 0.1, "scale": 0.7, **options}
-        ).double()
-        built.embedding.mix(torch.tensor([[1.0, -2.0, 0.0], [1.0, 1.0, 1.0]])[:, :dim])
-        for module in built.modules():
-            if isinstance(module, torch.nn.Linear):
-                torch.nn.init.normal_(module.bias, std=0.5)
-        torch.nn.init.normal_(built.head.weight, std=0.3)
-    return built.requires_grad_(False)
-
-
-def random_box(dim: int, level: int, degree: int, seed: int, count: int = 24) -> Box:
-    """Cells of side `2^-level`, long in one coordinate for every other one."""
-    generator = torch.Generator().manual_seed(seed)
-    centre = (torch.randint(0, 2**level, (count, dim), generator=generator).double() + 0.5) / 2**level
-    half = torch.full_like(centre, 0.5 / 2**level)
-    half[::2, 0] *= 0.25
-    return Box(centre, half, degree)
-
-
-def corners_and_inside(box: Box, count: int = 40, seed: int = 0) -> torch.Tensor:
-    """Places `t` in `[-1, 1]^d`, ``(count, N, d)``: all corners, the centre, and random ones."""
-    dim = box.centre.shape[1]
-    t = 2.0 * torch.rand(count, *box.centre.shape, generator=torch.Generator().manual_seed(seed)).double() - 1.0
-    signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * dim).reshape(-1, 1, dim).double()
-    t[: len(signs)] = signs
-    t[len(signs)] = 0.0
-    return t
-
-
-def at(model: TaylorModel, t: torch.Tensor) -> torch.Tensor:
-    """The polynomial at places `t` ``(count, N, d)``: ``(count, N, ...)``."""
-    powers = torch.stack([(t ** t.new_tensor(a)).prod(dim=-1) for a in model.basis.exponents])
-    shaped = powers.reshape(*powers.shape, *[1] * (model.radius.dim() - 1))
-    return (shaped * model.coefficients.unsqueeze(1)).sum(dim=0)
-
-
-def holds(model: TaylorModel, truth: torch.Tensor, t: torch.Tensor) -> bool:
-    """``truth`` ``(count, N, ...)``, itself rounded, is within the radius of the model, and within its bounds."""
-    room = 1e-12 * (1.0 + truth.abs())
-    low, high = model.bounds()
-    inside = ((at(model, t) - truth).abs() <= model.radius + room).all()
-    return bool(inside and (truth >= low - room).all() and (truth <= high + room).all())
-
-
-def flat(function, box: Box, t: torch.Tensor) -> torch.Tensor:
-    x = box.centre + box.half * t
-    found = function(x.flatten(0, 1))
-    return found.reshape(*x.shape[:2], *found.shape[1:])
-
-
+@pytest.mark.parametrize("order", [6, pytest.param(8, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("name", ACTIVATIONS)
-def test_the_series_of_an_activation_are_its_derivatives_and_stay_below_their_ceilings(name):
-    order, activation = 6, ACTIVATIONS[name]()
+def test_the_series_of_an_activation_are_its_derivatives_and_stay_below_their_ceilings(name, order):
+    activation = ACTIVATIONS[name]()
     z = torch.linspace(-8.0, 8.0, 641, dtype=torch.float64)
     sigma = SERIES[type(activation)](order)
     series = sigma.series(z, order)
@@ -126,46 +83,35 @@ def test_a_network_and_its_gradient_lie_in_their_models(dim, degree, level, acti
     V = network(dim, seed, activation=activation, gated=gated, depth=depth)
     box = random_box(dim, level, degree, seed)
     t = corners_and_inside(box)
-    value, gradient = network_model(V, box)
-    assert holds(value, flat(V, box, t), t)
-    assert holds(gradient, flat(lambda x: jet(V, x).gradient, box, t), t)
+    found = network_model(V, box)
+    assert holds(found.value, flat(V, box, t), t)
+    assert holds(found.gradient, flat(lambda x: jet(V, x).gradient, box, t), t)
 
 
-def perturbed_models(degree: int, size: float, offset: float, slope: float, seed: int):
-    """A model in two variables, and at places ``t`` a function it holds, with its slopes: `P + offset + slope . t`."""
-    box = random_box(2, 3, degree, seed)
-    basis, generator = box.basis, torch.Generator().manual_seed(seed)
-    P = size * torch.randn(len(basis.exponents), len(box), 3, generator=generator).double()
-    P[0] = torch.randn(len(box), 3, generator=generator).double()
-    own = torch.full((len(box), 3), abs(slope)).double()
-    model = SmoothModel(P, torch.stack([abs(offset) + 2.0 * own, own, own]), basis)
-    t = corners_and_inside(box)
-    polynomial, slopes = model.models(torch.ones_like(box.half))
-    truth = at(polynomial, t) + offset + slope * t.sum(dim=-1, keepdim=True)
-    return model, t, truth, at(slopes, t) + slope
-
-
-REGIMES = [(0.3, 0.0, 0.0), (0.02, 0.0, 0.0), (1e-4, 0.1, 0.0), (0.1, 1e-2, 0.0), (1e-6, 0.0, 0.05), (0.1, -0.05, 0.05)]
-
-
-def layer_holds(found: SmoothModel, value, slopes, t) -> bool:
-    polynomial, derivative = found.models(torch.ones_like(t[0]))
-    inside = (at(polynomial, t) - value).abs() <= polynomial.radius + 1e-13
-    return bool(inside.all() and ((at(derivative, t) - slopes).abs() <= derivative.radius + 1e-13).all())
+# Sizes of the polynomial, and of what it leaves out of the value, slopes and second derivatives.
+REGIMES = [
+    (0.3, 0.0, 0.0, 0.0), (0.02, 0.0, 0.0, 0.0), (1e-4, 0.1, 0.0, 0.0), (0.1, 1e-2, 0.0, 0.0), (1e-6, 0.0, 0.05, 0.0),
+    (0.1, -0.05, 0.05, 0.0), (1e-6, 0.0, 0.0, 0.05), (0.1, 0.0, 0.05, -0.05)]  # fmt: skip
 
 
 @pytest.mark.parametrize("regime", REGIMES, ids=str)
-@pytest.mark.parametrize("degree", [1, 2, 4])
-def test_each_layer_alone_holds_what_its_radii_allow(regime, degree):
+@pytest.mark.parametrize(("degree", "curved"), [(1, False), (2, False), (4, False), (2, True), (3, True), (4, True)])
+def test_each_layer_alone_holds_what_its_radii_allow(regime, degree, curved):
     """Where one term of the radius is nearly all of it, so that none can be forgotten."""
+    outer = lambda a, b: a.unsqueeze(-1) * b.unsqueeze(-2)
     for seed in range(3):
-        model, t, h, dh = perturbed_models(degree, *regime, seed)
+        model, t, h, dh, ddh = perturbed_models(degree, *regime, seed, curved)
         for name, make in ACTIVATIONS.items():
-            slope = torch.func.vmap(torch.func.grad(make()))(h.flatten()).reshape(h.shape)
-            assert layer_holds(activate(model, make()), make()(h), slope.unsqueeze(-1) * dh, t), name
-        other, _, k, dk = perturbed_models(degree, *regime, seed + 100)
+            prime = torch.func.grad(make())
+            first, second = (torch.func.vmap(s)(h.flatten()).reshape(h.shape) for s in (prime, torch.func.grad(prime)))
+            bent = first[..., None, None] * ddh + second[..., None, None] * outer(dh, dh) if curved else None
+            assert layer_holds(activate(model, make()), make()(h), first.unsqueeze(-1) * dh, bent, t), name
+        other, _, k, dk, ddk = perturbed_models(degree, *regime, seed + 100, curved)
         slopes = dh * k.unsqueeze(-1) + h.unsqueeze(-1) * dk
-        assert layer_holds(product(model, other), h * k, slopes, t)
+        bent = None
+        if curved:
+            bent = ddh * k[..., None, None] + h[..., None, None] * ddk + outer(dh, dk) + outer(dk, dh)
+        assert layer_holds(product(model, other), h * k, slopes, bent, t)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 4])
@@ -174,10 +120,13 @@ def test_the_embedding_alone_holds(degree):
     for level in (1, 3, 6):
         box = random_box(2, level, degree, 0)
         t = corners_and_inside(box)
-        value, slopes = embed(box, embedding.waves(2)).models(box.half)
+        found = embed(box, embedding.waves(2), curved=True)
+        value, slopes = found.models(box.half)
         gradient = torch.func.vmap(torch.func.jacrev(embedding))
+        hessian = torch.func.vmap(torch.func.jacfwd(torch.func.jacrev(embedding)))
         assert holds(value, flat(embedding, box, t), t)
         assert holds(slopes, flat(gradient, box, t), t)
+        assert holds(found.hessian(box.half), flat(hessian, box, t), t)
 
 
 @pytest.mark.parametrize("degree", [2, 3, 4])
@@ -186,8 +135,8 @@ def test_radii_shrink_at_the_order_of_the_expansion(degree):
     radii = []
     for level in (7, 8):  # well above the floor of rounding
         box = random_box(2, level, degree, 0)
-        value, gradient = network_model(V, Box(box.centre, torch.full_like(box.half, 0.5 / 2**level), degree))
-        radii.append((float(value.radius.median()), float(gradient.radius.median())))
+        found = network_model(V, Box(box.centre, torch.full_like(box.half, 0.5 / 2**level), degree))
+        radii.append((float(found.value.radius.median()), float(found.gradient.radius.median())))
     (value, slope), (finer_value, finer_slope) = radii
     assert value / finer_value == pytest.approx(2.0 ** (degree + 1), rel=0.35)
     assert slope / finer_slope == pytest.approx(2.0**degree, rel=0.35)
@@ -199,7 +148,8 @@ def test_rounding_is_enclosed_on_the_smallest_cells(gated):
     V = network(2, 7, activation="tanh", gated=gated, width=32)
     box = random_box(2, 6, 3, 1)
     box = Box(box.centre, torch.full_like(box.half, 2.0**-32), 3)
-    value, gradient = network_model(V, box)
+    found = network_model(V, box)
+    value, gradient = found.value, found.gradient
     exact = lambda p: p.numpy().astype(np.longdouble)
     x = exact(box.centre)
     waves = np.array([[1, 0], [2, 0], [0, 1], [0, 2], [1, -2], [1, 1]], dtype=np.longdouble)
@@ -257,6 +207,15 @@ ODD = {
     "manufactured 2-d contrast": partial(Manufactured, dim=2, contrast=0.9, drift=1.0, seed=5),
     "manufactured 1-d q=1.7": partial(Manufactured, dim=1, exponent=1.7),
     "torus 2-d random 4": partial(Torus, dim=2, shear="random", seed=4),
+    "noisy torus 2-d": partial(Torus, dim=2, noise=[0.02, 0.005]),
+    "noisy manufactured 2-d": partial(
+        Manufactured,
+        noise=[0.02, 0.01],
+        exponent=1.5,
+        state_dependent_noise=True,
+        state_dependent_control=True,
+        initial_contrast=0.7,
+    ),
 }
 
 
@@ -295,10 +254,6 @@ def test_slack_and_integrand_lie_in_their_models(name):
     # The kinks of f are single states; the slack there is that of either side.
     assert holds(Q, flat(slack_function(problem, W), box, t), t)
     assert holds(initial, flat(lambda x: W(x) * problem.initial_density(x), box, t), t)
-
-
-def grid(dim: int, side: int) -> torch.Tensor:
-    return torch.cartesian_prod(*[(torch.arange(side).double() + 0.5) / side] * dim).reshape(-1, dim)
 
 
 CASES = [(n, options) for n in ("circle rho=4", "manufactured 1-d q=1.5") for options in

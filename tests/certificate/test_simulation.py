@@ -10,7 +10,7 @@ from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, si
 from ocp_torch.certificate.simulated.trajectories import backward_flow, settled_occupation
 from ocp_torch.maths.runge_kutta import discounted_integral, refined
 from ocp_torch.maths.sampling import evaluation_points
-from ocp_torch.problems import Problem
+from ocp_torch.problems import Pendulum, Problem
 from support import zoo
 
 TURN = 2.0 * math.pi
@@ -215,3 +215,12 @@ def test_a_standard_error_spares_halvings_and_hides_no_error(order):
     assert error <= bias
     assert noisy_error <= noisy_bias
     assert noisy_work < work if order == 1 else noisy_work <= work
+
+
+def test_with_noise_the_estimated_density_is_a_number_where_paths_scatter_widely():
+    """Beyond the cut-off of the pendulum's velocity paths grow by factors of all sizes: their mean shows no trend."""
+    problem = Pendulum(noise=1e-3)
+    policy = lambda x: 0.3 * torch.sin(2.0 * math.pi * x[:, :1])
+    found = settled_occupation(problem, policy, zoo.states(problem, 48))
+    assert bool(torch.isfinite(found).all())
+    assert bool((found >= 0.0).all())

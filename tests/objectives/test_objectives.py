@@ -46,6 +46,10 @@ class OtherUnits(Problem):
     def control_divergence(self, x):
         return TIME / self.control * self.inner.control_divergence(x)
 
+    def noise(self, x):
+        sigma = self.inner.noise(x)
+        return None if sigma is None else TIME**0.5 * sigma
+
     def initial_density(self, x):
         return self.inner.initial_density(x)
 
@@ -91,6 +95,7 @@ CASES = [
         "manufactured 3-d m=2 B(x) q=1.5",
         "swing",
         "limited 2-d q=1.5 B(x)",
+        "noisy 2-d sigma(x)",
     )
     for kind in KINDS
     if kind != "primal, closed" or name == "circle rho=2"

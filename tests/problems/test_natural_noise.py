@@ -10,6 +10,7 @@ from ocp_torch.maths.brownian import Grid, increments, path_integral
 from ocp_torch.maths.jets import diffusion_divergences
 from ocp_torch.problems import Arm, Dubins, Kuramoto, Pendulum, PhaseNeurons, RobotArm, Unicycle
 from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from support import zoo
 
@@ -156,3 +157,19 @@ def test_wrong_noise_is_refused_in_one_sentence(cls, arguments, message):
         cls(**arguments)
     assert str(caught.value).endswith(".")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["pendulum", "pendulum, both", "kuramoto", "neurons", "arm, both"])
+def test_generator_and_residual_are_adjoint_on_systems(name):
+    """`E[-V mu + (L^0 V mu + grad V . B w) / rho] = E[V (r - mu0)]` for random fields, with a cut-off too."""
+    problem, side = NOISY[name], 192
+    axis = torch.arange(side, dtype=torch.float64) / side
+    samples = Samples.of(problem, torch.cartesian_prod(axis, axis))
+    L = Generator.of(problem, samples)
+    V, log_mu = (zoo.rough_network(2, seed, size=0.3) for seed in (5, 6))
+    w = zoo.rough_network(2, seed=7, outputs=problem.control_dim)
+    with torch.no_grad():
+        (_, inflow), (mu, outflow) = L.control_inflow(w), L.occupation_outflow(log_mu)
+        charged = L.multiplier_term(L.jet(V), mu, w(samples.x)).mean()
+        given = (V(samples.x) * (inflow - outflow - samples.mu0)).mean()
+    torch.testing.assert_close(charged, given, rtol=1e-5, atol=1e-5)

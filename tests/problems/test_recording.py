@@ -209,6 +209,7 @@ def test_other_files_are_refused(tmp_path, plain):
     for override, sentence in (
         ("trainer.target_gap=0.1", "no simulation"),
         ("sampler.visited=0.2", "a data set has no data"),
+        ("sampler=importance", "a data set has no data"),
     ):
         assert sentence in outcome("problem=dataset", f"problem.path={plain}", "method=dual", override)
     for field, sentence in (("held_out=1.5", "held_out"), ("held_out=0.01", "too few"), ("discount=-1", "discount")):

@@ -33,6 +33,10 @@ WAYS = [
     (*METHODS[method], f"stepper={stepper}", f"sampler={SAMPLERS[k % 2]}", f"optimizer={OPTIMIZERS[k % 3]}")
     for k, (stepper, method) in enumerate(itertools.product(STEPPERS, METHODS))
 ]
+# Importance sampling, whose density is fitted anew before some of these steps and after others; also with noise.
+IMPORTANCE = ("sampler=importance", "sampler.every=2", "sampler.pool=200")
+WAYS += [(*METHODS[method], *IMPORTANCE) for method in ("dual", "primal, mu a network", "pd")]
+WAYS += [("method=dual", "problem.noise=0.02", "stepper=extragradient", "sampler.visited=0.3", *IMPORTANCE)]
 
 
 def maker(*overrides: str):

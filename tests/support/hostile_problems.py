@@ -150,6 +150,16 @@ class NoiseNumber(Good):
         self.noise = 0.1
 
 
+class NoiseBeside(Good):
+    """Of a number and of a method together, and arguments that are called as the method is."""
+
+    def __init__(self, noise=0.01) -> None:
+        Problem.__init__(self, dim=2, noise=noise)
+
+    def noise(self, x):
+        return torch.cat([super().noise(x), column()(self, x)], dim=-1)
+
+
 class MoodyNoise(Good):
     calls = 0
 
@@ -283,6 +293,7 @@ LEGAL = {
     "single inside": lambda: with_(state_cost=lambda self, x: 1.0 + torch.cos(TURN * x[:, 0].float()).to(x)),
     "no divergences": lambda: with_(drift_divergence=lambda self, x: None, control_divergence=lambda self, x: None),
     "noise": lambda: with_(noise=column()),
+    "noise beside a number": NoiseBeside,
     "noise of 0": lambda: with_(noise=column(0.0)),
     "noise of five motions": lambda: with_(noise=sigma(lambda s, x: s * torch.linspace(0.1, 1.0, 5, dtype=x.dtype))),
     "noise that jumps": lambda: with_(noise=sigma(lambda s, x: s * steps_of(None, x)[:, :, None])),

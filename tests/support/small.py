@@ -43,6 +43,7 @@ METHODS = {
     "primal, mu a network": ("method=primal", "method.occupation=network"),
     "pd": ("method=pd",),
     "pd, plain": ("method=pd", "method.augmentation=0"),
+    "pd, with noise": ("method=pd", "problem.noise=0.01", "sampler.visited=0.25"),
 }
 
 

@@ -4,7 +4,6 @@ To prove bounds for a class of your own, either give it a method ``enclosure(box
 function for it into ``enclosure.known``. A problem that states its `lipschitz` constants needs neither.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -15,11 +14,17 @@ from torch import Tensor
 
 from ocp_torch.certificate.proof.models import Box, absolute, power, reciprocal
 from ocp_torch.certificate.proof.taylor import ROUNDING, TaylorModel, upward
+from ocp_torch.certificate.proof.waves import (
+    gradient_model,
+    hessian_model,
+    matrix_model,
+    polynomial_model,
+    square_divergence_model,
+)
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.control_limit import LimitedCost
 from ocp_torch.problems.exact.manufactured import Manufactured
 from ocp_torch.problems.exact.torus import Torus
-from ocp_torch.problems.exact.trigonometric import DEPTH, TrigonometricPolynomial, WavyMatrix
 from ocp_torch.problems.problem import Lipschitz, Problem
 
 # Data evaluated at one state are taken to be right up to so much, relative to 1 + their size: 2^16 units in the last place
@@ -31,13 +36,13 @@ FEW_ROUNDINGS = 1e-12
 
 @dataclass(frozen=True)
 class Enclosure:
-    """Models over `N` cells; ``a`` is `None` where there is no drift."""
+    """Models over `N` cells; ``a`` is `None` where there is no drift, ``noise`` where there is none."""
 
     f: TaylorModel  # (N,)
     a: TaylorModel | None  # (N, d)
     B: TaylorModel  # (N, d, m)
     mu0: TaylorModel  # (N,)
-    noise: None = None
+    noise: TaylorModel | None = None  # (N, d, k)
 
 
 def lipschitz_enclosure(problem: Problem, box: Box) -> Enclosure | None:
@@ -48,15 +53,25 @@ def lipschitz_enclosure(problem: Problem, box: Box) -> Enclosure | None:
     diagonal = box.half.norm(dim=-1)
     models = {}
     for name, constant in vars(declared).items():
+        value: Tensor | None = getattr(problem, name)(box.centre)
+        if value is None:  # no noise
+            continue
         if getattr(type(problem), name) is getattr(Problem, name) and name not in vars(problem):
             constant = 0.0
         if constant is None:
             return None
-        value: Tensor = getattr(problem, name)(box.centre)
         reach = (constant * diagonal).reshape(-1, *[1] * (value.dim() - 1))
         models[name] = box.constant(value, (1.0 + FEW_ROUNDINGS) * reach + EVALUATION * (1.0 + value.abs()))
     drift = None if problem.driftless else models["drift"]
-    return Enclosure(models["state_cost"], drift, models["control_matrix"], models["initial_density"])
+    return Enclosure(
+        models["state_cost"], drift, models["control_matrix"], models["initial_density"], models.get("noise")
+    )
+
+
+def constant_noise(problem: Problem, box: Box) -> TaylorModel | None:
+    """`sigma` ``(N, d, d)`` of the argument ``noise`` of a problem; `None` where it is 0."""
+    sigma = Problem.noise(problem, box.centre)
+    return None if sigma is None else box.constant(sigma, ROUNDING * sigma)
 
 
 def power_conjugate(cost: PowerCost, p: TaylorModel) -> TaylorModel:
@@ -89,7 +104,7 @@ def torus_enclosure(problem: Torus, box: Box) -> Enclosure:
     far = s.size >= 1.0
     parts = square.where(~far, box.constant(torch.full_like(s.radius, 0.125), 0.125))
     B = box.constant(problem.A_inverse.to(box.centre).expand(len(box), d, d))
-    return Enclosure(parts.sum() * (1.0 / d), None, B, box.constant(1.0))
+    return Enclosure(parts.sum() * (1.0 / d), None, B, box.constant(1.0), constant_noise(problem, box))
 
 
 def manufactured_enclosure(problem: Manufactured, box: Box) -> Enclosure | None:
@@ -100,40 +115,26 @@ def manufactured_enclosure(problem: Manufactured, box: Box) -> Enclosure | None:
     rho, q, conjugate = problem.discount, problem.exponent, problem.control_cost.conjugate_exponent
     V0, slope = polynomial_model(problem.V0, box), gradient_model(problem.V0, box)
     mu, mu0 = polynomial_model(problem.mu, box), polynomial_model(problem.mu0, box)
-    stream = TaylorModel.stack([polynomial_model(h, box) for h in problem.stream])
-    closed_loop = (gradient_model(problem.phi, box) * rho + stream) * reciprocal(mu)[..., None]
+    flux = gradient_model(problem.phi, box) * rho + TaylorModel.stack(
+        [polynomial_model(h, box) for h in problem.stream]
+    )
+    sigma = constant_noise(problem, box) if problem.sigma is None else matrix_model(problem.sigma, box)
+    if sigma is not None:
+        D = (sigma[:, None] * sigma[None]).sum() * 0.5
+        flux = flux + (D * gradient_model(problem.mu, box)[None]).sum()
+        if problem.sigma is not None:
+            flux = flux + square_divergence_model(problem.sigma, box) * mu[..., None]
+    closed_loop = flux * reciprocal(mu)[..., None]
     B = matrix_model(problem.B, box)
     pull = (B * slope[..., None]).sum(dim=-2) * (-1.0 / rho)
     squares = (pull * pull).sum()
     u = pull if q == 2.0 else pull * power(squares, 0.5 * conjugate - 1.0)[..., None]
     cost = power(squares, 0.5 * conjugate) * (1.0 / q)
-    f = V0 - (slope * closed_loop).sum() * (1.0 / rho) - cost + problem.c
-    return Enclosure(f, closed_loop - (B * u[None]).sum(), B, mu0)
-
-
-def polynomial_model(p: TrigonometricPolynomial, box: Box) -> TaylorModel:
-    """`p` over ``box``, ``(N,)``."""
-    if len(p.waves) == 0:
-        return box.constant(p.constant)
-    waved = box.cosine(p.waves.to(box.centre), p.phases.to(box.centre))
-    return (waved * p.amplitudes.to(box.centre)).sum() + p.constant
-
-
-def gradient_model(p: TrigonometricPolynomial, box: Box) -> TaylorModel:
-    """`grad p` over ``box``, ``(N, d)``; the derivative of a cosine is the cosine a quarter turn on."""
-    turned = box.cosine(p.waves.to(box.centre), p.phases.to(box.centre) + 0.5 * math.pi)
-    slopes = 2.0 * math.pi * p.amplitudes.unsqueeze(-1) * p.waves
-    return (turned[..., None] * slopes.to(box.centre)).sum(dim=-2)
-
-
-def matrix_model(B: WavyMatrix, box: Box) -> TaylorModel:
-    """`B` over ``box``, ``(N, d, m)``."""
-    mean = B.mean.to(box.centre).expand(len(box), -1, -1)
-    if not B.varies:
-        return box.constant(mean)
-    waves = torch.nn.functional.one_hot(B.coordinate, len(B.mean)).to(box.centre).flatten(0, 1)
-    waved = box.cosine(waves, 2.0 * torch.pi * B.phase.to(box.centre).flatten())
-    return (waved * DEPTH + 1.0).reshape(*B.mean.shape) * mean
+    along = (slope * closed_loop).sum()
+    if sigma is not None:
+        along = along + (D * hessian_model(problem.V0, box)).sum().sum()
+    f = V0 - along * (1.0 / rho) - cost + problem.c
+    return Enclosure(f, closed_loop - (B * u[None]).sum(), B, mu0, sigma)
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,7 @@ class ByClass:
 # enclosure(problem, box): an `Enclosure` of the data of ``problem`` over the cells of ``box``, or `None` where it has none.
 enclosure = ByClass(
     "enclosure",
-    ("state_cost", "drift", "control_matrix", "initial_density"),
+    ("state_cost", "drift", "control_matrix", "initial_density", "noise"),
     known={Torus: torus_enclosure, Manufactured: manufactured_enclosure},
     default=lipschitz_enclosure,
 )

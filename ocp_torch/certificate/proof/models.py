@@ -73,38 +73,6 @@ def equal_cells(dim: int, side: int, degree: int) -> Box:
     return Box(centre, torch.full_like(centre, 0.5 / side), degree)
 
 
-@dataclass(frozen=True)
-class SmoothModel:
-    """A layer's values `h` and their slopes: `|h - P| <= r_0` and `|dh/dt_i - dP/dt_i| <= r_i` on each cell.
-
-    ``P`` ``(K, N, width)`` by the order of ``basis``; ``radii`` ``(1 + d, N, width)``: of `h`, then of each `dh/dt_i`.
-    """
-
-    P: Tensor
-    radii: Tensor
-    basis: Monomials
-
-    def slope(self, i: int) -> Tensor:
-        """The coefficients of `dP/dt_i`, ``(K, N, width)``."""
-        slope = torch.zeros_like(self.P)
-        for alpha, coefficient in zip(self.basis.exponents, self.P, strict=True):
-            if alpha[i]:
-                lowered = tuple(e - (n == i) for n, e in enumerate(alpha))
-                slope[self.basis.index[lowered]] = alpha[i] * coefficient
-        return slope
-
-    def models(self, half: Tensor) -> tuple[TaylorModel, TaylorModel]:
-        """`h` ``(N, width)`` and `grad_x h` ``(N, width, d)`` on cells of half-widths ``half``."""
-        slopes = []
-        for i in range(self.basis.dim):
-            # A quotient by a power of two, and the factors of `slope`, change nothing but the last bit.
-            h = half[:, i].unsqueeze(-1)
-            slope = self.slope(i) / h
-            radius = upward(self.radii[1 + i] / h + ROUNDING * slope.abs().sum(dim=0))
-            slopes.append(TaylorModel(slope, radius, self.basis))
-        return TaylorModel(self.P, self.radii[0], self.basis), TaylorModel.stack(slopes)
-
-
 def compose(g: TaylorModel, series: Sequence[Tensor], error: Tensor | float, top: Tensor) -> TaylorModel:
     r"""`s(g)`, from the Taylor coefficients ``series`` of `s` at the constant term of ``g``.
 

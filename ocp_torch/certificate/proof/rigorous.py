@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.lower.shifted import slack_function
-from ocp_torch.certificate.proof.cover import DEGREE, Cover
+from ocp_torch.certificate.proof.cover import Cover, degree
 from ocp_torch.certificate.proof.enclosures import EVALUATION, Enclosure, conjugate_model, enclosure
 from ocp_torch.certificate.proof.models import Box, equal_cells
 from ocp_torch.certificate.proof.network_model import is_known
@@ -66,10 +66,8 @@ def obstacle(problem: Problem, value: Field) -> str | None:
     """Why there can be no rigorous bound for ``value`` on ``problem``; `None` where there can."""
     if problem.dim > MOST_DIMENSIONS:
         return f"cells cover the torus in at most {MOST_DIMENSIONS} dimensions, and this problem has {problem.dim}"
-    if problem.noisy:
-        return "there is noise, and the models of V have no second derivatives"
     if not is_known(value):
-        return "V is not one of the package's own scalar networks"
+        return "V is not one of the package's own scalar networks or Sobolev fields"
     weights = [*value.parameters(), *value.buffers()]
     if not all(bool(torch.isfinite(w).all()) for w in weights):
         return "V has weights that are not finite"
@@ -78,7 +76,7 @@ def obstacle(problem: Problem, value: Field) -> str | None:
     if not enclosure.holds_for(problem) or not conjugate_model.holds_for(problem.control_cost):
         return "the problem's class changes its data, but not the enclosure it inherits"
     generator = fixed_generator()
-    box = equal_cells(problem.dim, SPOT_CELLS, DEGREE[problem.dim])
+    box = equal_cells(problem.dim, SPOT_CELLS, degree(problem))
     if enclosure(problem, box) is None:
         return "the problem gives neither an enclosure of its data nor their Lipschitz constants (lipschitz)"
     for size in SPOT_SIZES:
@@ -97,6 +95,11 @@ def contradiction(problem: Problem, box: Box, found: Enclosure, t: Tensor) -> st
     powers = torch.stack([(t ** t.new_tensor(alpha)).prod(dim=-1) for alpha in box.basis.exponents])
     models = {"state_cost": found.f, "control_matrix": found.B, "initial_density": found.mu0}
     models["drift"] = found.a or box.constant(torch.zeros_like(x))
+    sigma = problem.noise(x)
+    if sigma is not None or found.noise is not None:
+        if sigma is None or found.noise is None or found.noise.radius.shape != sigma.shape:
+            return "noise"
+        models["noise"] = found.noise
     for name, model in models.items():
         value = getattr(problem, name)(x)
         shaped = powers.reshape(*powers.shape, *[1] * (value.dim() - 1))
@@ -133,7 +136,7 @@ def rigorous_lower_bound(
     room = tolerance * max(float(initial.abs().mean()), LEAST_SIZE * float(cost.abs().mean()), 1e-300)
     if sampled_slack is None:
         sampled_slack = supremum(slack_function(problem, lambda x: theta * value(x)), points).value
-    first = equal_cells(problem.dim, FIRST_CELLS[problem.dim], DEGREE[problem.dim])
+    first = equal_cells(problem.dim, FIRST_CELLS[problem.dim], degree(problem))
     pieces = zip(first.centre.split(CHUNK), first.half.split(CHUNK), strict=True)
     pending, finished = Cover.join([Cover.of(problem, value, theta, *piece) for piece in pieces]), []
     count, goal = len(pending), sampled_slack + room

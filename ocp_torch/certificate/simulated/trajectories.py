@@ -124,7 +124,7 @@ def backward_flow(problem: Problem, policy: Policy) -> Dynamics:
 
 def settled_occupation(problem: Problem, policy: Policy, x: Tensor) -> Tensor:
     """`mu^u` ``(N,)`` along the `backward_flow`, as far back as it takes; infinite where the past adds ever more. With
-    noise the mean over `PATHS` paths, less twice its standard error.
+    noise the mean over `PATHS` paths, less twice its standard error: a lower estimate, which is finite.
 
     Where the flow contracts nearly as fast as the discount forgets, the integral settles slowly, and geometrically: what
     is left is extrapolated from the last pieces.
@@ -143,11 +143,14 @@ def settled_occupation(problem: Problem, policy: Policy, x: Tensor) -> Tensor:
         else:
             piece, state = discounted_integral(dynamics, state, rho, horizon, steps, wrap=False)
         means = piece.unflatten(0, (len(x), paths))
-        pieces.append(means.mean(dim=1) - (2.0 / math.sqrt(paths) * means.std(dim=1) if problem.noisy else 0.0))
+        error = 2.0 / math.sqrt(paths) * means.std(dim=1) if problem.noisy else torch.zeros_like(x[:, 0])
+        pieces.append((means.mean(dim=1) - error).clamp_min(0.0))
         # From here on the discount of the time that has passed is part of the factor.
         state = torch.cat([state[:, :-1].remainder(1.0), state[:, -1:] - PIECE], dim=-1)
         if bool((pieces[-1] <= SETTLED * summed(pieces)).all()):
             return summed(pieces)
+    if problem.noisy:  # the scatter of paths that grow for long shows any trend
+        return summed(pieces)
     before, last = summed(pieces[-4:-2]), summed(pieces[-2:])
     ratio = last / before.clamp_min(1e-300)
     rest = torch.where(ratio < 1.0, last * ratio / (1.0 - ratio), math.inf)

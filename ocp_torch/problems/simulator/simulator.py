@@ -22,10 +22,10 @@ class Simulator(Problem):
 
     ``target`` is module:function, FILE.py:function or the function itself. Without ``differences`` there are no divergences
     of `a`, `B` and `D = sigma sigma^T / 2`, and what needs them is left out; with them they come from central differences,
-    which takes `2 d` more calls a state wherever they are wanted, and with noise `2 d (d + 1)` more than that. ``workers``
-    processes share each batch (the target must then be named, not given). Raises `InputError`, with the state, where the
-    function fails, gives another shape or a number that is not finite, is not a function of the state alone, or jumps where
-    a coordinate passes from 1 to 0.
+    which takes `2 d` more calls a state wherever they are wanted, and with noise `2 d (d + 1)` more than that. ``noise`` is
+    that of `Problem`, beside `sigma`. ``workers`` processes share each batch (the target must then be named, not given).
+    Raises `InputError`, with the state, where the function fails, gives another shape or a number that is not finite, is
+    not a function of the state alone, or jumps where a coordinate passes from 1 to 0.
     """
 
     incidental = ("target", "differences", "workers")
@@ -40,8 +40,9 @@ class Simulator(Problem):
         control_limit: float | None = None,
         differences: bool = False,
         workers: int = 1,
+        noise: float | abc.Sequence[float] = 0.0,
     ) -> None:
-        super().__init__(dim, control_dim, discount, exponent, control_limit)
+        super().__init__(dim, control_dim, discount, exponent, control_limit, noise)
         self.target = target
         self.differences = require_flag("problem.differences", differences)
         self.workers = workers
@@ -60,11 +61,11 @@ class Simulator(Problem):
 
     @property
     def unknown_divergences(self) -> str:
-        return "" if self.differences else "a and B and D" if self.noisy else "a and B"
+        return "" if self.differences else "a and B and D" if self._oracle.motions else "a and B"
 
     @property
     def noisy(self) -> bool:
-        return self._oracle.motions > 0
+        return self.diffusion is not None or self._oracle.motions > 0
 
     def _part(self, name: str, x: Tensor) -> Tensor:
         """One part of the answers; without differences an ascent follows the networks alone."""
@@ -84,7 +85,11 @@ class Simulator(Problem):
         return self._part("mu0", x) if self._oracle.gives_mu0 else torch.ones_like(x[:, 0])
 
     def noise(self, x: Tensor) -> Tensor | None:
-        return self._part("sigma", x) if self.noisy else None
+        even = super().noise(x)
+        if not self._oracle.motions:
+            return even
+        own = self._part("sigma", x)
+        return own if even is None else torch.cat([even, own], dim=-1)
 
     def drift_divergence(self, x: Tensor) -> Tensor | None:
         return self._divergences(x)[0] if self.differences else None
@@ -94,6 +99,8 @@ class Simulator(Problem):
 
     @torch.no_grad()
     def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
+        if not self._oracle.motions:
+            return torch.zeros_like(x), torch.zeros_like(x[:, 0])
         if not self.differences:
             return None
         at = _unit_cell(x)

@@ -1,0 +1,33 @@
+"""Whether the optimal flow gathers mass at a state of rest, by the linear system and the quadratic cost around it."""
+
+import math
+
+import torch
+from torch import Tensor
+
+# A contraction this close to rho, relative to it, counts as one that reaches it, so that rounding decides nothing.
+ROUNDING = 1e-9
+
+
+def optimal_contraction(A: Tensor, B: Tensor, Q: Tensor, rho: float) -> float:
+    r"""How fast the optimal flow of `dx/dt = A x + B u` for `rho int e^{-rho t} (x'Qx + |u|^2) / 2 dt` loses volume.
+
+    ``A`` and ``Q`` are ``(d, d)``, ``B`` ``(d, m)``. The closed loop is `F - BB'P + rho/2` with `F = A - rho/2` and `P` the
+    stabilising solution of `F'P + PF - PBB'P + Q = 0`, and the eigenvalues of `F - BB'P` are the stable half of those of the
+    Hamiltonian matrix, which come in pairs `+-lambda` (Laub, 1979). So its trace needs no `P`.
+    """
+    d = len(A)
+    F = A - 0.5 * rho * torch.eye(d, dtype=A.dtype)
+    hamiltonian = torch.cat([torch.cat([F, -B @ B.T], dim=1), torch.cat([-Q, -F.T], dim=1)])
+    return 0.5 * float(torch.linalg.eigvals(hamiltonian).real.abs().sum()) - 0.5 * rho * d
+
+
+def occupation_bound_at_rest(A: Tensor, B: Tensor, Q: Tensor, rho: float, exponent: float) -> float | None:
+    r"""`math.inf` if the optimal flow contracts volume at rate `rho` or more at a state of rest with `f = 0`, else `None`.
+
+    There mass gathers as fast as the discount forgets it, and `mu*` is unbounded; otherwise nothing is known. ``A`` and
+    ``B`` are the linear dynamics, ``Q`` the Hessian of `f`. For `q < 2` the control vanishes faster than linearly. A limit on
+    the control changes nothing: near the state of rest the control is small.
+    """
+    contraction = optimal_contraction(A, B, Q, rho) if exponent == 2.0 else -float(A.trace())
+    return math.inf if contraction >= rho * (1.0 - ROUNDING) else None
