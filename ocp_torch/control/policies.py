@@ -68,7 +68,7 @@ def occupation_density(kind: str | None, problem: Problem, fields: Fields, const
         return cost.primal_occupation(w, samples.f, constants.C_V, inflow)
 
     def saddle(x: Tensor) -> Tensor:
-        generator = Generator.of(problem, Samples.of(problem, x, divergences=False))
+        generator = Generator.of(problem, Samples.live(problem, x))
         beta = generator.reduced_cost(generator.jet(fields.value))
         return cost.saddle_occupation(fields.control_density(x), beta, constants.M)
 

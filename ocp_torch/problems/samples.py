@@ -56,6 +56,15 @@ class Samples:
             div_div_D=div_div_D,
         )
 
+    @classmethod
+    def live(cls, problem: "Problem", x: Tensor) -> "Samples":
+        """``problem`` at states ``x`` as what is differentiated in `x` needs it: with derivatives where ``x`` has any, and
+        without start and divergences."""
+        one = torch.ones_like(x[:, 0])
+        with torch.set_grad_enabled(x.requires_grad and torch.is_grad_enabled()):
+            f, a, B, noise = problem.state_cost(x), problem.drift(x), problem.control_matrix(x), problem.noise(x)
+        return cls(x, f, a, B, one, one, noise=noise)
+
     def __len__(self) -> int:
         return self.x.shape[0]
 

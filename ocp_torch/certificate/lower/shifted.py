@@ -147,11 +147,7 @@ def slack_function(problem: Problem, value: Field):
     """`x -> Q(x)` for the whole torus, differentiable in `x` where the problem is."""
 
     def slack(x: Tensor) -> Tensor:
-        one = torch.ones_like(x[:, 0])
-        # `Samples.of` gives data without derivatives: only suprema over `x` want any.
-        with torch.set_grad_enabled(x.requires_grad and torch.is_grad_enabled()):
-            f, a, B, noise = problem.state_cost(x), problem.drift(x), problem.control_matrix(x), problem.noise(x)
-            generator = Generator.of(problem, Samples(x, f, a, B, one, one, noise=noise))
+        generator = Generator.of(problem, Samples.live(problem, x))
         return generator.hjb_slack(generator.jet(value))
 
     return slack
