@@ -158,7 +158,7 @@ def _curve(title: str, x: Tensor, values: dict[str, Tensor]) -> Figure:
 
 def _map(title: str, x: Tensor, panels: dict[str, Tensor]) -> Figure:
     stride = MAP_POINTS // 16
-    some = lambda t: t[:, :2].reshape(MAP_POINTS, MAP_POINTS, 2)[::stride, ::stride].unbind(-1)
+    some = lambda t: t[:, :2].reshape(MAP_POINTS, MAP_POINTS, 2)[::stride, ::stride].transpose(0, 1).unbind(-1)
     # A control of several components is drawn as its size, with arrows for its first two.
     sizes = {label: v.norm(dim=-1) if v.shape[1] > 1 else v[:, 0] for label, v in panels.items()}
     low = min(float(s.nan_to_num(nan=torch.inf).min()) for s in sizes.values())

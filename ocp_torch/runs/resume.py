@@ -1,5 +1,6 @@
 """What a resumed run is made of: its own configuration, and what the command line may change in it."""
 
+import contextlib
 import copy
 from collections.abc import Iterable
 from pathlib import Path
@@ -23,17 +24,13 @@ FIXED = ("problem", "method", "model", "averaging", "sampler", "seed", "optimize
 
 def find_run(composed: dict, roots: Iterable[Path]) -> Path | None:
     """The last run below ``roots`` of the configuration ``composed`` that has a checkpoint to go on from."""
-    found: dict[Path, float] = {}
-    for root in roots:
-        for depth in ("", "*/", "*/*/", "*/*/*/"):
-            for file in root.glob(f"{depth}checkpoints/{LAST}"):
-                folder = file.parent.parent
-                try:
-                    if same(saved_configuration(folder), composed):
-                        found[folder] = file.stat().st_mtime
-                except (InputError, OSError):
-                    continue
-    return max(found, key=lambda folder: found[folder], default=None)
+    depths = ("", "*/", "*/*/", "*/*/*/")
+    files = [file for root in roots for depth in depths for file in root.glob(f"{depth}checkpoints/{LAST}")]
+    for file in sorted(files, key=lambda file: file.stat().st_mtime, reverse=True):
+        with contextlib.suppress(InputError, OSError):
+            if same(saved_configuration(file.parent.parent), composed):
+                return file.parent.parent
+    return None
 
 
 def same(one: dict, other: dict) -> bool:
