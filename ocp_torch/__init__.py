@@ -1,7 +1,6 @@
 """Controllers for control-affine problems on the torus, with a certificate of how far from optimal they can be."""
 
-from ocp_torch.control.controller import Controller
-from ocp_torch.control.loading import load_controller
+from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.problems import PROBLEMS, Circle, Dataset, Manufactured, Problem, Simulator, Torus
 from ocp_torch.problems.control_cost import PowerCost

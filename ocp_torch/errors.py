@@ -1,11 +1,9 @@
 """What a user is told when an input is wrong: one sentence with the field, the value and what would be right."""
 
-from __future__ import annotations
-
 import difflib
 import inspect
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 # A sentence that quotes more has nothing more to say; and a run that has more to warn of was not written by a run.
 LONGEST, MOST_NOTES = 2000, 200
@@ -106,6 +104,14 @@ def require_number(
     if outside:
         raise InputError(f"{name} is {number:g}, but must be {wanted}.")
     return number
+
+
+def require_numbers(name: str, value: object, count: int | None = None, above: float | None = None) -> list[float]:
+    """``value`` as a list of finite floats, ``count`` of them and each ``above`` a number where given; else `InputError`."""
+    if isinstance(value, str) or not isinstance(value, Sequence) or (count is not None and len(value) != count):
+        wanted = "a list of" + (f" {count}" if count is not None else "") + " numbers"
+        raise InputError(f"{name} is {shown(value)}, but must be {wanted}.")
+    return [require_number(f"{name}[{i}]", v, above=above) for i, v in enumerate(value)]
 
 
 def require_flag(name: str, value: object) -> bool:

@@ -6,13 +6,13 @@ import hydra
 from omegaconf import DictConfig
 
 from ocp_torch.cli.launch import job, launch
-from ocp_torch.studies.benchmark.contest import build, contest
+from ocp_torch.studies.benchmark.contest import Contest
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="benchmark")
 def main(config: DictConfig) -> None:
-    job(build, contest, config)
+    job(Contest, Contest.run, config)
 
 
 if __name__ == "__main__":
-    launch(main, "benchmark", build, contest)
+    launch(main, "benchmark", Contest, Contest.run)

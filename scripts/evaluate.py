@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
 
 from ocp_torch.cli.launch import job, launch
-from ocp_torch.runs.evaluate import Recertification, recertification
+from ocp_torch.runs.evaluate import recertification
 
 
-def evaluate(made: Recertification, folder: Path) -> None:
-    made.run()
+def evaluate(recertify: Callable, folder: Path) -> None:
+    recertify()
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="evaluate")

@@ -8,17 +8,17 @@ import hydra
 from omegaconf import DictConfig
 
 from ocp_torch.cli.launch import job, launch
-from ocp_torch.runs.record import Recorder, recorder
+from ocp_torch.runs.record import arguments, record
 
 
-def record(made: Recorder, folder: Path) -> None:
-    made.run()
+def write(asked: dict, folder: Path) -> None:
+    record(**asked)
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="record")
 def main(config: DictConfig) -> None:
-    job(recorder, record, config)
+    job(arguments, write, config)
 
 
 if __name__ == "__main__":
-    launch(main, "record", recorder, record)
+    launch(main, "record", arguments, write)

@@ -8,7 +8,7 @@ import hydra
 from omegaconf import DictConfig
 
 from ocp_torch.cli.launch import job, launch
-from ocp_torch.studies.reference.session import ReferenceJob, reference_job
+from ocp_torch.studies.reference.session import ReferenceJob
 
 
 def refer(made: ReferenceJob, folder: Path) -> None:
@@ -17,8 +17,8 @@ def refer(made: ReferenceJob, folder: Path) -> None:
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="reference")
 def main(config: DictConfig) -> None:
-    job(reference_job, refer, config)
+    job(ReferenceJob, refer, config)
 
 
 if __name__ == "__main__":
-    launch(main, "reference", reference_job, refer)
+    launch(main, "reference", ReferenceJob, refer)

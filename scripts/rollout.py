@@ -8,7 +8,7 @@ import hydra
 from omegaconf import DictConfig
 
 from ocp_torch.cli.launch import job, launch
-from ocp_torch.gym.rollout import RolloutJob, rollout_job
+from ocp_torch.gym.rollout import RolloutJob
 
 
 def rollout(made: RolloutJob, folder: Path) -> None:
@@ -17,8 +17,8 @@ def rollout(made: RolloutJob, folder: Path) -> None:
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="rollout")
 def main(config: DictConfig) -> None:
-    job(rollout_job, rollout, config)
+    job(RolloutJob, rollout, config)
 
 
 if __name__ == "__main__":
-    launch(main, "rollout", rollout_job, rollout)
+    launch(main, "rollout", RolloutJob, rollout)

@@ -10,8 +10,7 @@ import hydra  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
 
 from ocp_torch.cli.launch import job, launch  # noqa: E402
-from ocp_torch.runs.run import train  # noqa: E402
-from ocp_torch.runs.training_run import training_run  # noqa: E402
+from ocp_torch.runs.run import train, training_run  # noqa: E402
 
 
 @hydra.main(version_base="1.3", config_path="../configs", config_name="train")

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from functools import wraps
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TYPE_CHECKING, cast
 
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.estimate import Estimate
@@ -20,11 +18,10 @@ if TYPE_CHECKING:
 # that performance.
 LOWER, UPPER, PERFORMANCE = "lower", "upper", "perf_lower"
 
-T = TypeVar("T")
-
 
 class Bound(ABC):
-    """One bound, without any state: whatever it computes that others share, or that takes long, the `Context` keeps.
+    """One bound, without any state: what it computes that others share is a property of the `Context`, and what takes long
+    the context keeps in its `results`.
 
     A new bound is a subclass in a file of its own and one line in `ocp_torch.certificate.bounds.BOUNDS`. ``name`` and
     ``side`` (`LOWER`, `UPPER` or `PERFORMANCE`) say where `certificate.json` has it, ``label`` what tables call it.
@@ -63,21 +60,8 @@ class Bound(ABC):
         return []
 
 
-def once(compute: Callable[[Context], T]) -> Callable[[Context], T]:
-    """``compute``, a function of a context, such that the context keeps its result: for what a bound needs in several of its
-    methods. Parts that several bounds share are properties of the context."""
-
-    @wraps(compute)
-    def kept(context: Context) -> T:
-        if compute not in context.results:
-            context.results[compute] = compute(context)
-        return context.results[compute]
-
-    return kept
-
-
 def recorded(context: Context) -> RecordedContext:
-    """``context``, for bounds that apply only where it is `recorded`: no other kind is."""
+    """``context``, for bounds that apply only where it is `recorded`."""
     return cast("RecordedContext", context)  # its module imports bounds, so that its class cannot be asked for here
 
 

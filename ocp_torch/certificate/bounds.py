@@ -1,9 +1,6 @@
 """The bounds of a certificate, listed once: gaps, tables, files and the benchmark's columns follow from this list."""
 
-from __future__ import annotations
-
 from ocp_torch.certificate.bound import Bound
-from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.lower.penalised import PenalisedDual, RecordedDual
 from ocp_torch.certificate.lower.rigorous import Rigorous
 from ocp_torch.certificate.lower.shifted import Shifted
@@ -12,7 +9,6 @@ from ocp_torch.certificate.upper.lagrangian import Lagrangian, LagrangianBelow
 from ocp_torch.certificate.upper.minimised import MinimisedPrimal
 from ocp_torch.certificate.upper.penalised import PenalisedPrimal
 from ocp_torch.certificate.upper.recorded import RecordedPrimal
-from ocp_torch.problems.needs import Need
 
 # In the order of `certificate.json`. Two of one name and side are variants of which only one applies to a context. A bound
 # of one's own: `BOUNDS.append(Mine())`, before anything is certified.
@@ -34,8 +30,3 @@ BOUNDS: list[Bound] = [
 def on(side: str) -> dict[str, Bound]:
     """The bounds on ``side`` by name, one of each, in the order of the list."""
     return {bound.name: bound for bound in BOUNDS if bound.side == side}
-
-
-def needs(name: str, assumptions: Assumptions) -> tuple[Need, ...]:
-    """What the bound ``name`` rests on; nothing for simulations, the truth, and names that nobody listed."""
-    return next((bound.needs(assumptions) for bound in BOUNDS if bound.name == name), ())

@@ -1,18 +1,20 @@
-"""The certificate: bounds, performances, standard errors and what they rest on."""
-
-from __future__ import annotations
+"""The certificate: bounds, performances, standard errors and what they rest on; and the gaps between the sides of it."""
 
 import json
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ocp_torch.certificate import bounds
+from ocp_torch.certificate.bounds import BOUNDS
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.estimate import CONFIDENCE, Estimate, known, known_of
-from ocp_torch.certificate.gap import best, relative_gap, share
-from ocp_torch.certificate.run import Run
-from ocp_torch.certificate.schema import to_dict
+from ocp_torch.certificate.report import to_dict
+from ocp_torch.certificate.settings import Run
 from ocp_torch.problems.needs import GUESSED, Need
+
+# A side of a gap: the name of the bound, and the far end of its interval.
+Side = tuple[str, float]
 
 
 @dataclass(frozen=True)
@@ -44,8 +46,8 @@ class Certificate:
     refuted: frozenset[str] = frozenset()
 
     def needs(self, name: str) -> tuple[Need, ...]:
-        """What the bound ``name`` rests on."""
-        found = bounds.needs(name, self.assumptions)
+        """What the bound ``name`` rests on; nothing for simulations, the truth, and names that nobody listed."""
+        found = next((bound.needs(self.assumptions) for bound in BOUNDS if bound.name == name), ())
         return tuple(replace(need, holds=False) if need.name in self.refuted else need for need in found)
 
     def counts(self, name: str) -> bool:
@@ -63,28 +65,24 @@ class Certificate:
         return self.assumptions.problem_holds and self.contradiction is None
 
     @property
-    def best_lower(self) -> tuple[str, float] | None:
+    def best_lower(self) -> Side | None:
         """The lower bound that counts with the highest lower end of its interval, and that end."""
         return self._highest(self.counts)
 
     @property
-    def best_upper(self) -> tuple[str, float] | None:
+    def best_upper(self) -> Side | None:
         """The bound on the controller handed out that counts with the lowest upper end, and that end; no simulation."""
-        usable = lambda name: self.counts(name) and self.speaks.get(name, True)
-        return best(min, {n: self._ends(e)[1] for n, e in known_of(self.upper).items() if usable(n)})
+        return self._lowest(self.upper, lambda name: self.counts(name) and self.speaks.get(name, True))
 
     @property
-    def best_perf(self) -> tuple[str, float] | None:
+    def best_perf(self) -> Side | None:
         """The controller handed out and the upper end of its simulated performance, bias included, if that counts."""
-        name = self.controller
-        return None if name is None or not self.stands else (name, self._ends(known_of(self.perf)[name])[1])
+        return self._handed_out if self.stands else None
 
     @property
     def controller(self) -> str | None:
         """The controller that all this is about: the ``subject``, or the one with the smallest simulated performance."""
-        mine = lambda name: self.subject is None or name == self.subject
-        found = best(min, {n: self._ends(e)[1] for n, e in known_of(self.perf).items() if mine(n)})
-        return None if found is None else found[0]
+        return None if self._handed_out is None else self._handed_out[0]
 
     @property
     def gap(self) -> dict:
@@ -107,8 +105,8 @@ class Certificate:
         lower, perf = self.best_lower, self.best_perf
         if lower is None or perf is None:
             return None
-        values = known_of(self.lower)[lower[0]].value, known_of(self.perf)[perf[0]].value
-        return relative_gap(*((name, value) for (name, _), value in zip((lower, perf), values, strict=True)))
+        (low, _), (high, _) = lower, perf
+        return relative_gap((low, known_of(self.lower)[low].value), (high, known_of(self.perf)[high].value))
 
     @property
     def suboptimality(self) -> dict:
@@ -135,12 +133,9 @@ class Certificate:
     @property
     def share(self) -> dict:
         """The part of what control can gain over doing nothing that is certainly achieved, by both upper sides."""
-        zero = self.baseline.get("zero")
-        least = self._ends(zero)[0] if known(zero) else None
-        return {
-            "certified": share(self.best_lower, self.best_upper, least),
-            "simulated": share(self.best_lower, self.best_perf, least),
-        }
+        zero, lower = self.baseline.get("zero"), self.best_lower
+        least = zero.interval(self.confidence)[0] if known(zero) else None
+        return {"certified": share(lower, self.best_upper, least), "simulated": share(lower, self.best_perf, least)}
 
     @property
     def hold(self) -> bool:
@@ -151,16 +146,38 @@ class Certificate:
         return self.assumptions.hold and all(need.holds for need in needs) and self.contradiction is None
 
     def to_dict(self) -> dict:
-        """What `certificate.json` holds (`ocp_torch.certificate.schema`)."""
+        """What `certificate.json` holds."""
         return to_dict(self)
 
     def save(self, path: Path) -> None:
         """Write `certificate.json`."""
         path.write_text(json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
 
-    def _ends(self, estimate: Estimate) -> tuple[float, float]:
-        return estimate.interval(self.confidence)
+    @property
+    def _handed_out(self) -> Side | None:
+        return self._lowest(self.perf, lambda name: self.subject is None or name == self.subject)
 
-    def _highest(self, usable) -> tuple[str, float] | None:
-        """The lower bound with the highest lower end among those that are ``usable``."""
-        return best(max, {n: self._ends(e)[0] for n, e in known_of(self.lower).items() if usable(n)})
+    def _highest(self, usable: Callable[[str], bool]) -> Side | None:
+        """The lower bound with the highest lower end among those that are ``usable``, and that end."""
+        ends = [(name, e.interval(self.confidence)[0]) for name, e in known_of(self.lower).items() if usable(name)]
+        return max(ends, key=lambda side: side[1], default=None)
+
+    def _lowest(self, estimates: dict[str, Estimate | None], usable: Callable[[str], bool]) -> Side | None:
+        """That of ``estimates`` with the lowest upper end among those that are ``usable``, and that end."""
+        ends = [(name, e.interval(self.confidence)[1]) for name, e in known_of(estimates).items() if usable(name)]
+        return min(ends, key=lambda side: side[1], default=None)
+
+
+def relative_gap(lower: Side | None, upper: Side | None) -> float | None:
+    """Relative to the lower bound; `None` where that is not positive, or where the two cross, as errors may make them."""
+    if lower is None or upper is None or lower[1] <= 0.0 or upper[1] < lower[1]:
+        return None
+    return (upper[1] - lower[1]) / lower[1]
+
+
+def share(lower: Side | None, upper: Side | None, zero: float | None) -> float | None:
+    """`1 - (upper - lower) / (zero - lower)`, for ``zero`` the least that doing nothing may cost; `None` where unknown."""
+    if lower is None or upper is None or zero is None or upper[1] < lower[1]:
+        return None
+    gain = zero - lower[1]
+    return 1.0 - (upper[1] - lower[1]) / gain if gain > 0.0 and math.isfinite(gain) else None

@@ -1,30 +1,33 @@
-"""The one certifier: it asks the listed bounds what they say of a context, and puts that into a certificate."""
-
-from __future__ import annotations
+"""The one certifier: it asks the listed bounds what they say of a context, and whether they contradict each other."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
 
+import torch
 from torch import nn
 
 from ocp_torch.certificate.bound import LOWER, PERFORMANCE, UPPER, Bound
 from ocp_torch.certificate.bounds import BOUNDS
 from ocp_torch.certificate.certificate import Certificate
-from ocp_torch.certificate.checks.contradictions import examined
-from ocp_torch.certificate.checks.tails import notes_on
 from ocp_torch.certificate.context import Context
-from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.estimate import Estimate, known_of
 from ocp_torch.certificate.external.controller import ControllerContext
 from ocp_torch.certificate.external.dataset import RecordedContext
-from ocp_torch.certificate.progress import Progress, silent
-from ocp_torch.certificate.run import Run
-from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.certificate.trained import Trained, require_finite
-from ocp_torch.certificate.trained_context import TrainedContext
+from ocp_torch.certificate.settings import CertificateSettings, Progress, Run, silent
+from ocp_torch.certificate.trained import FieldsContext, Trained, TrainedContext
 from ocp_torch.control.policies import Policy
+from ocp_torch.errors import InputError
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.constants import Constants
+from ocp_torch.problems.needs import GUESSED
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.recorded.dataset import Dataset
+
+# Bounds contradict each other where their intervals at this joint level are apart,
+LEVEL = 0.999
+# and by more than so much of their size: equal numbers differ in the last digits of float64 and of what was given.
+ROUNDING = 1e-9
 
 
 def certify(context: Context) -> Certificate:
@@ -34,29 +37,33 @@ def certify(context: Context) -> Certificate:
     evaluated = lambda side: {bound.name: shown(bound, context) for bound in bounds if bound.side == side}
     _ = context.posed  # first of all: functions that are not finite are refused here
     lower = evaluated(LOWER)
-    perf, zero = context.perf, context.zero  # before the upper side, which is of the best of them
+    simulated, zero = context.simulated  # before the upper side, which is of the best of them
     upper, perf_lower = evaluated(UPPER), evaluated(PERFORMANCE)
     sides = {LOWER: lower, UPPER: upper, PERFORMANCE: perf_lower}
     certificate = Certificate(
         run=context.run,
-        exact=context.exact,
+        exact=context.problem.exact_optimum,
         lower=lower,
         upper=upper,
-        perf=perf,
+        perf=dict.fromkeys(context.listed) | {name: found.perf for name, found in simulated.items()},
         baseline={"zero": zero},
         assumptions=context.assumptions,
         warnings=[
             *context.constants.warnings,
-            *context.check_notes,
+            *context.checked.warnings,
             *context.notes,
             *(note for bound in bounds for note in bound.notes(context, sides[bound.side][bound.name])),
-            *notes_on(upper | lower),
+            *(
+                f"a few sampled states carry {name}: its interval is widened by {estimate.bias:.2g}."
+                for name, estimate in (upper | lower).items()
+                if estimate is not None and estimate.bias
+            ),
             *context.remarks,
         ],
         searches=list(dict.fromkeys(line for bound in bounds for line in bound.searches(context))),
         speaks={bound.name: bound.speaks(context) for bound in bounds if bound.side == UPPER},
         confidence=context.settings.confidence,
-        subject=context.subject,
+        subject=context.kind if context.recorded or context.external else None,
         perf_lower=perf_lower,
     )
     return examined(certificate)
@@ -68,6 +75,41 @@ def shown(bound: Bound, context: Context) -> Estimate | None:
     return estimate if estimate is not None and bound.valid(context) else None
 
 
+def examined(certificate: Certificate) -> Certificate:
+    """``certificate``, where a lower bound on `OPT` is above an upper one by more than their errors without anything that
+    counts. A guess that is shown to be wrong in this way is dropped, with a warning, and the rest stands."""
+    if not certificate.stands:
+        return certificate
+    truth = {} if certificate.exact is None else {"OPT": Estimate(certificate.exact, 0.0)}
+    # Whatever any controller costs, doing nothing included, OPT does not exceed it.
+    above = {n: e for n, e in known_of(certificate.upper).items() if certificate.counts(n)}
+    above |= {f"Perf ({n})": e for n, e in known_of(certificate.perf | certificate.baseline).items()}
+    lower = known_of(certificate.lower)
+    below = {n: e for n, e in lower.items() if certificate.counts(n)}
+    sound = [*product(below.items(), (above | truth).items()), *product(truth.items(), above.items())]
+    supposed = {n: e for n, e in lower.items() if certificate.conditional(n)}
+    guessed = [*product(supposed.items(), (above | truth).items())]
+    level = 1.0 - (1.0 - LEVEL) / max(1, len(sound) + len(guessed))
+    apart = lambda under, over: under.interval(level)[0] > over.interval(level)[1] + ROUNDING * abs(over.value)
+    for (low, under), (high, over) in sound:
+        if apart(under, over):
+            needs = [need for name in (low, high) for need in certificate.needs(name)]
+            conditions = " or not ".join(dict.fromkeys(need.condition for need in needs))
+            doubts = f"either not {conditions}, or " if conditions else ""
+            sentence = (
+                f"nothing is certified: {low} = {under.value:.6g}, a lower bound, contradicts {high} = {over.value:.6g}, an "
+                f"upper one; {doubts}the problem's functions or constants are not what they are said to be."
+            )
+            return replace(certificate, contradiction=sentence, warnings=[sentence, *certificate.warnings])
+    for (low, under), (high, over) in guessed:
+        if apart(under, over):
+            condition = " and ".join(need.condition for need in certificate.needs(low))
+            note = f"{low} = {under.value:.6g} is above {high} = {over.value:.6g}: it is not so that {condition}."
+            wrong = {need.name for need in certificate.needs(low) if need.basis == GUESSED}
+            return replace(certificate, refuted=certificate.refuted | wrong, warnings=[*certificate.warnings, note])
+    return certificate
+
+
 def certify_fields(
     problem: Problem,
     trained: Trained,
@@ -77,20 +119,12 @@ def certify_fields(
     progress: Progress = silent,
 ) -> Certificate:
     """The certificate of ``trained`` fields, on states that no training sampler draws, or on samples that were held out.
-
-    The name of each part is given to ``progress`` as it begins. Raises `InputError` where weights are not finite.
-    """
-    require_finite(trained.fields)
-    context: Context
-    if isinstance(problem, Dataset):
-        context = RecordedContext(
-            problem=problem, constants=constants, settings=settings, run=run, progress=progress, trained=trained
-        )
-    else:
-        context = TrainedContext(
-            problem=problem, constants=constants, settings=settings, run=run, progress=progress, trained=trained
-        )
-    return certify(context)
+    Raises `InputError` where weights are not finite."""
+    for name, network in trained.fields.networks.items():
+        if not all(bool(torch.isfinite(p).all()) for p in network.parameters()):
+            raise InputError(f"the network for {name} holds weights that are not finite; there is nothing to certify.")
+    kind: type[FieldsContext] = RecordedContext if isinstance(problem, Dataset) else TrainedContext
+    return certify(kind(problem, constants, settings, run, progress, trained=trained))
 
 
 def certify_policy(
@@ -104,18 +138,6 @@ def certify_policy(
     progress: Progress = silent,
 ) -> Certificate:
     """The certificate of any ``policy``; with ``value`` (float64), any `V`, also how far from optimal it is at most.
-
-    ``network`` makes the networks for `V^u` and `mu^u`; the name of each part is given to ``progress`` as it begins. Raises
-    `InputError` where the policy fails.
-    """
-    context = ControllerContext(
-        problem=problem,
-        constants=constants,
-        settings=settings,
-        run=run,
-        progress=progress,
-        policy=policy,
-        value=value,
-        network=network,
-    )
-    return certify(context)
+    ``network`` makes the networks for `V^u` and `mu^u`. Raises `InputError` where the policy fails."""
+    shared = problem, constants, settings, run, progress
+    return certify(ControllerContext(*shared, policy=policy, value=value, network=network))

@@ -1,6 +1,9 @@
-"""Numbers with their uncertainty: means over independent randomised point sets."""
+r"""Numbers with their uncertainty: means over independent randomised point sets, and how to take noise off them.
 
-from __future__ import annotations
+Plane waves integrate to 0 over the torus exactly, so what a fit to them explains may go: `int g = E[g - sum_k c_k phi_k]`
+for every choice of `c`, with `phi_k` cosines and sines of `2 pi k . x`, `k != 0`. The waves are those that stand out in `g`.
+Each half of the sets is averaged with the coefficients that fit the other half best, so that the fit leaves no bias.
+"""
 
 import math
 from dataclasses import dataclass
@@ -12,20 +15,23 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import require_integer, require_number
+from ocp_torch.fields.waves import STATES, standardised, waves_of
 from ocp_torch.maths.mixtures import Mixture
+from ocp_torch.maths.sums import summed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.starts import evaluation_distribution
 
 # How often an interval covers the truth where nobody asks for another level.
 CONFIDENCE = 0.95
+# Waves in a fit, and states evaluated at once.
+WAVES, CHUNK = 96, 8192
 
 
 @cache
 def t_factor(level: float, degrees: int) -> float:
-    """The `t` with `P(|T| <= t) = level` for Student's `T` of so many ``degrees`` of freedom: how many standard errors lie
-    on each side of a mean of ``degrees + 1`` replicates. Raises `InputError` unless ``level`` is in (0, 1) and ``degrees`` at
-    least 1."""
+    """The `t` with `P(|T| <= t) = level` for Student's `T` of so many ``degrees`` of freedom, at least 1, and a ``level`` in
+    (0, 1), else `InputError`: how many standard errors lie on each side of a mean of ``degrees + 1`` replicates."""
     require_number("level", level, above=0.0, at_most=1.0 - 1e-9)
     require_integer("degrees", degrees, 1)
     from scipy.special import stdtrit  # takes a third of a second to import, and only certificates need it
@@ -48,7 +54,7 @@ class Estimate:
     replicates: int = 0
 
     @classmethod
-    def of(cls, replicates: list[float], bias: float | None = None, controller: str | None = None) -> Estimate:
+    def of(cls, replicates: list[float], bias: float | None = None, controller: str | None = None) -> "Estimate":
         """Mean and standard error of independent ``replicates``."""
         values = np.asarray(replicates, dtype=np.float64)
         se = float(values.std(ddof=1) / math.sqrt(len(values)))
@@ -63,11 +69,6 @@ class Estimate:
         """The upper end of the interval at `CONFIDENCE`: what an upper side may claim."""
         return self.interval(CONFIDENCE)[1]
 
-    @property
-    def below(self) -> float:
-        """The lower end of the interval at `CONFIDENCE`."""
-        return self.interval(CONFIDENCE)[0]
-
     def half_width(self, level: float) -> float:
         """Half of the confidence interval at ``level``: Student's t times the standard error, and all of the bias."""
         factor = t_factor(level, self.replicates - 1) if self.replicates > 1 else 0.0
@@ -78,13 +79,11 @@ class Estimate:
         half = self.half_width(level)
         return self.value - half, self.value + half
 
-    def to_dict(self, level: float | None = None) -> dict:
-        """JSON form, with the interval at ``level`` if one is given; fields that do not apply are left out."""
-        extra: dict[str, float | str | list[float]]
+    def to_dict(self, level: float) -> dict:
+        """JSON form, with the interval at ``level``; fields that do not apply are left out."""
         extra = {k: v for k, v in (("bias", self.bias), ("controller", self.controller)) if v is not None}
-        if level is not None:
-            extra |= {"half_width": self.half_width(level), "interval": list(self.interval(level))}
-        return {"value": self.value, "se": self.se, **extra}
+        interval = {"half_width": self.half_width(level), "interval": list(self.interval(level))}
+        return {"value": self.value, "se": self.se, **extra, **interval}
 
 
 def known(estimate: Estimate | None) -> TypeGuard[Estimate]:
@@ -111,3 +110,40 @@ def replicated_samples(
 def integral(samples: Samples, integrand: Tensor) -> float:
     """The weighted mean of ``integrand`` as a number."""
     return float(samples.mean(integrand))
+
+
+def integrals(states: list[Tensor], values: list[Tensor], weights: list[Tensor] | None = None) -> list[float]:
+    """The mean of each of ``values`` ``(N,)`` over its set of ``states`` ``(N, d)``, with the noise of plane waves taken off
+    where the states are uniform; else ``weights`` ``(N,)`` are one over their density, and no wave explains a narrow peak."""
+    if weights is not None and any(bool((w != 1.0).any()) for w in weights):
+        return [float((w * v).mean()) for w, v in zip(weights, values, strict=True)]
+    plain = [float(v.mean()) for v in values]
+    if len(states) < 2:
+        return plain
+    some = slice(0, max(1, STATES // len(states)))
+    functions = standardised(torch.cat([v[some] for v in values]))
+    waves = waves_of(torch.cat([x[some] for x in states]), functions, WAVES).to(states[0])
+    if not len(waves):
+        return plain
+    moments = [_moments(x, v, waves) for x, v in zip(states, values, strict=True)]
+    fits = [_fit(moments[1 - half :: 2]) for half in (0, 1)]
+    explained = [float(fits[i % 2] @ sums[1:] / sums[0]) for i, (sums, *_) in enumerate(moments)]
+    return [p - e for p, e in zip(plain, explained, strict=True)]
+
+
+def _moments(x: Tensor, v: Tensor, waves: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Sums of `(1, phi)`, of `phi phi^T` with the constant, and of `(1, phi) v` over one set."""
+    count = 1 + 2 * len(waves)
+    gram, right = v.new_zeros(count, count), v.new_zeros(count)
+    for part, value in zip(x.split(CHUNK), v.split(CHUNK), strict=True):
+        angles = 2.0 * math.pi * (part @ waves.T)
+        phi = torch.cat([torch.ones_like(part[:, :1]), angles.cos(), angles.sin()], dim=1)
+        gram, right = gram + phi.T @ phi, right + phi.T @ value
+    return gram[0], gram, right
+
+
+def _fit(moments: list[tuple[Tensor, Tensor, Tensor]]) -> Tensor:
+    """Least-squares coefficients of the waves, beside a constant."""
+    gram, right = summed(g for _, g, _ in moments), summed(r for *_, r in moments)
+    ridge = 1e-10 * gram[0, 0] * torch.eye(len(gram), dtype=gram.dtype)
+    return torch.linalg.solve(gram + ridge, right)[1:]

@@ -1,13 +1,57 @@
-"""A certificate as a table for the terminal, and in words."""
+"""A certificate as `certificate.json` holds it, by a stable schema, and that as a table for the terminal, and in words."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from ocp_torch.certificate import bounds
 from ocp_torch.certificate.bound import LOWER, PERFORMANCE, UPPER
-from ocp_torch.certificate.run import LONGEST_NAME
+from ocp_torch.certificate.estimate import Estimate, known
+from ocp_torch.certificate.settings import LONGEST_NAME
 from ocp_torch.errors import visible
+from ocp_torch.problems.needs import GUESSED
+
+if TYPE_CHECKING:
+    from ocp_torch.certificate.certificate import Certificate
+
+SCHEMA = 2
+
+
+def to_dict(certificate: Certificate) -> dict:
+    """The schema of ``certificate``, ready for JSON: what does not apply is null."""
+    one = lambda e: e.to_dict(certificate.confidence) if known(e) else None
+    below = certificate.perf_lower
+
+    def bound(name: str, estimate: Estimate | None) -> dict | None:
+        """Also what it rests on, whether it counts, and what it supposes where a guess may be right."""
+        if not known(estimate):
+            return None
+        needs = certificate.needs(name)
+        supposed = [need.condition for need in needs if need.basis == GUESSED] if certificate.conditional(name) else []
+        return {
+            **estimate.to_dict(certificate.confidence),
+            "rests_on": {need.name: need.basis for need in needs},
+            "counts": certificate.counts(name) and certificate.speaks.get(name, True),
+            **({"if": " and ".join(supposed)} if supposed else {}),
+        }
+
+    return {
+        "schema": SCHEMA,
+        **vars(certificate.run),
+        "exact": certificate.exact,
+        "confidence": certificate.confidence,
+        "controller": certificate.controller,
+        **{side: {n: bound(n, e) for n, e in getattr(certificate, side).items()} for side in (LOWER, UPPER)},
+        **{group: {n: one(e) for n, e in getattr(certificate, group).items()} for group in ("perf", "baseline")},
+        "gap": certificate.gap,
+        "share": certificate.share,
+        "suboptimality": certificate.suboptimality,
+        **({PERFORMANCE: {name: one(e) for name, e in below.items()}} if below else {}),
+        "assumptions": {**certificate.assumptions.to_dict(), "hold": certificate.hold},
+        "contradiction": certificate.contradiction,
+        "warnings": list(certificate.warnings),
+    }
 
 
 def table(certificate: dict, searches: Sequence[str] = ()) -> str:
@@ -30,7 +74,8 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
     def rows(side: str, order=list) -> None:
         for kind, listed in order(bounds.on(side).items()):
             found = certificate[side].get(kind)
-            row(f"{side}: {listed.label}{standing(found or {})}", found)
+            counts = found is None or found.get("counts", True)
+            row(f"{side}: {listed.label}{'' if counts else ', if' if 'if' in found else ', not used'}", found)
 
     rows(LOWER)
     if exact is not None:
@@ -49,16 +94,12 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
             part = f", {100 * share[kind]:.2f}% of the gain over doing nothing" if share[kind] is not None else ""
             lines.append(f"gap, {kind}: {100.0 * gap[kind]:.4f}%{part}")
     if gap.get("conditional") is not None:
-        lines.append(f"gap, if {supposed(certificate)}: {100.0 * gap['conditional']:.4f}%, which rests on a guess")
+        guesses = dict.fromkeys(visible(b["if"]) for b in certificate["lower"].values() if b and "if" in b)
+        lines.append(f"gap, if {' and '.join(guesses)}: {100.0 * gap['conditional']:.4f}%, which rests on a guess")
     lines += in_words(certificate)
     lines += searches
     lines += [f"warning: {visible(warning)}" for warning in certificate["warnings"]]
     return "\n".join(lines)
-
-
-def standing(bound: dict) -> str:
-    """What its row adds to the name of a bound (as a dict of the schema): nothing where it counts."""
-    return "" if bound.get("counts", True) else ", if" if "if" in bound else ", not used"
 
 
 def in_words(certificate: dict) -> list[str]:
@@ -74,8 +115,3 @@ def in_words(certificate: dict) -> list[str]:
     taken = "".join(f", taking {sentence}" for sentence in map(visible, found.get("takes", ())))
     sure = percent(certificate["confidence"])
     return [f"the controller is {' and '.join(parts)} worse than the optimum ({sure} sure of the sampling{taken})"]
-
-
-def supposed(certificate: dict) -> str:
-    """What the lower bounds of a certificate (as a dict of its schema) that rest on guesses suppose."""
-    return " and ".join(dict.fromkeys(visible(b["if"]) for b in certificate["lower"].values() if b and "if" in b))

@@ -1,20 +1,53 @@
-"""How much is spent on a certificate, and how sure its intervals are."""
+"""What is asked of a certificate: of which run, how much is spent on it and how sure it is; and whether it can be had."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from ocp_torch.certificate.estimate import CONFIDENCE
 from ocp_torch.certificate.upper.policy_evaluation import StageSettings
-from ocp_torch.errors import require_choice, require_flag, require_integer, require_number
+from ocp_torch.errors import InputError, require_choice, require_flag, require_integer, require_number, visible
+from ocp_torch.files.limits import require_memory
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 
-# However few the states of a certificate, its problem is scanned as if there were so many: a feature that is missed is one
-# that every bound misses.
-LEAST_SCANNED = 2**17
+# Of the name of a problem or a method, in characters: a longer one would break tables.
+LONGEST_NAME = 120
 # How performance deals with the infinite horizon: stop late and bound the rest, or stop at an exponential time.
 TRUNCATED, RANDOM = "truncated", "random"
+# Bytes of a number; and numbers that a simulated trajectory and a state of the occupation's supremum have in memory at once,
+# at least, per coordinate of states and controls: those of a Runge-Kutta step.
+DOUBLE, AT_ONCE = 8, 4
+
+# Told the name of each part of a certificate as it begins; and for those who do not want to know.
+Progress = Callable[[str], None]
+silent: Progress = lambda part: None
+
+
+@dataclass(frozen=True)
+class Run:
+    """Which run; ``step`` and ``samples``, the states drawn, are those of its end, 0 where nothing was trained."""
+
+    problem: str
+    method: str
+    seed: int = 0
+    step: int = 0
+    samples: int = 0
+    train_seconds: float = 0.0
+    stopped: str = "steps"  # why training ended: steps, target_gap, max_seconds, not_finite or failed
+
+    @classmethod
+    def read(cls, certificate: dict) -> "Run":
+        """What ``certificate``, as a file has it, says. Raises `InputError` where it does not say it, or absurdly."""
+        said = {name: certificate[name] for name in cls.__dataclass_fields__ if name in certificate}
+        for name in ("problem", "method", *({"stopped"} & said.keys())):
+            if not isinstance(said.get(name), str):
+                raise InputError("the controller's certificate does not say which problem and method it is of.")
+            said[name] = visible(said[name], LONGEST_NAME)
+        for name in {"seed", "step", "samples"} & said.keys():
+            require_integer(f"{name} of the certificate", said[name], 0, maximum=2**63)
+        if "train_seconds" in said:
+            require_number("train_seconds of the certificate", said["train_seconds"], at_least=0.0)
+        return cls(**said)
 
 
 @dataclass(frozen=True)
@@ -34,22 +67,38 @@ class CertificateSettings:
     stage: StageSettings = field(default_factory=StageSettings)  # the fit to the closed loop
 
     def __post_init__(self) -> None:
-        require_integer("certificate.points", self.points, 1)
-        require_integer("certificate.replicates", self.replicates, 2)
-        require_integer("certificate.trajectories", self.trajectories, 0)
-        require_integer("certificate.ascents", self.ascents, 1)
+        least = {"points": 1, "replicates": 2, "trajectories": 0, "ascents": 1, "occupation_states": 0}
+        for name, minimum in least.items():
+            require_integer(f"certificate.{name}", getattr(self, name), minimum)
         if self.mollify is not None:
             require_flag("certificate.mollify", self.mollify)
-        require_integer("certificate.occupation_states", self.occupation_states, 0)
         require_flag("certificate.rigorous", self.rigorous)
         require_number("certificate.confidence", self.confidence, above=0.0, at_most=0.999999)
         require_number("certificate.tolerance", self.tolerance, above=0.0)
         require_choice("certificate.horizon", self.horizon, (TRUNCATED, RANDOM))
 
-    def scanned(self, problem: Problem) -> int:
-        """How many states the data of ``problem`` are scanned at for narrow features."""
-        return problem.scan_factor * max(self.points * self.replicates, LEAST_SCANNED)
-
     def searches(self, constants: Constants) -> bool:
         """Whether the bound without `M` is sought among functions made of `V` too, for a problem of these ``constants``."""
         return constants.needs_no_M if self.mollify is None else self.mollify
+
+
+def require_possible(problem: Problem, settings: CertificateSettings, trains_value: bool = True) -> None:
+    """Raise `InputError`, before anything is trained, where ``settings`` ask for more memory than there is, or for a proof
+    that there is none of."""
+    d, m, replicates = problem.dim, problem.control_dim, settings.replicates
+    if settings.rigorous:
+        # A proof is loaded only where one is asked for.
+        from ocp_torch.certificate.proof.rigorous import MOST_DIMENSIONS
+
+        if d > MOST_DIMENSIONS or not trains_value:
+            why = f"d = {d}" if d > MOST_DIMENSIONS else "no V that the proof could speak of"
+            raise InputError(
+                "certificate.rigorous is true, but a bound is proved for a trained V in at most "
+                f"{MOST_DIMENSIONS} dimensions, and here there is {why}; leave it false."
+            )
+    sample = DOUBLE * (2 * d + 2)  # x, f, a and mu0; a constant B takes no room
+    moving = DOUBLE * AT_ONCE * (d + m)
+    each = {"replicates": sample, "points": replicates * sample, "trajectories": replicates * moving}
+    for name, size in {**each, "occupation_states": moving, "ascents": moving}.items():
+        require_memory(f"certificate.{name}", getattr(settings, name), size)
+    require_memory("certificate.stage.batch", settings.stage.batch, sample)

@@ -1,6 +1,4 @@
-"""What training hands over to a certificate, known everywhere or on recorded samples alone."""
-
-from __future__ import annotations
+"""What training hands over to a certificate, and what its bounds share: nothing here knows how the fields were trained."""
 
 import copy
 from collections.abc import Callable
@@ -11,13 +9,28 @@ from typing import TypeVar
 import torch
 from torch import nn
 
+from ocp_torch.certificate.checks.observed import Observed, observe
+from ocp_torch.certificate.checks.tails import sharpened
+from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.context import Context
-from ocp_torch.control.policies import Policy, trained_policies
-from ocp_torch.errors import InputError
+from ocp_torch.certificate.simulated.performance import Candidate
+from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
+from ocp_torch.certificate.upper.penalised import DensityBounds, density_bounds
+from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
+from ocp_torch.control.policies import Density, Policy, admissible_density, occupation_density, trained_policies
 from ocp_torch.fields.fields import Fields
 from ocp_torch.maths.jets import Field
+from ocp_torch.problems.samples import Samples
+
+# States of each set at which the density is looked at for places without mass.
+LOOKED_AT = 4096
 
 M = TypeVar("M", bound=nn.Module)
+
+
+def in_float64(fields: M) -> M:
+    """A frozen float64 copy on the CPU: what every bound is computed with."""
+    return copy.deepcopy(fields).to("cpu").double().requires_grad_(False).eval()
 
 
 @dataclass(frozen=True)
@@ -29,23 +42,13 @@ class Trained:
     network: Callable[..., nn.Module]
 
 
-def in_float64(fields: M) -> M:
-    """A frozen float64 copy on the CPU: what every bound is computed with."""
-    return copy.deepcopy(fields).to("cpu").double().requires_grad_(False).eval()
-
-
-def require_finite(fields: Fields) -> None:
-    """Raises `InputError` where weights are not: no number computed from them would mean anything."""
-    for name, network in fields.networks.items():
-        if not all(bool(torch.isfinite(p).all()) for p in network.parameters()):
-            raise InputError(f"the network for {name} holds weights that are not finite; there is nothing to certify.")
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FieldsContext(Context):
     """The context of trained fields: what certificates of them share, wherever the problem is known."""
 
     trained: Trained
+
+    listed = ("value", "density")
 
     @property
     def occupation(self) -> str | None:
@@ -64,3 +67,102 @@ class FieldsContext(Context):
     def policies_of(self, fields: Fields) -> dict[str, Policy]:
         """The controllers that the trained ``fields`` give, in their precision, by name."""
         return trained_policies(self.occupation, self.problem, fields, self.constants)
+
+    @cached_property
+    def policies(self) -> dict[str, Policy]:
+        return self.policies_of(self.fields)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrainedContext(FieldsContext):
+    """Up to two controllers, from `V` and from `w / mu`: both are simulated, and the better one is handed out."""
+
+    divergent = "J, G and the Lagrangian bound"
+
+    @cached_property
+    def posed(self) -> WellPosed:
+        return check_problem(self.problem, self.few if self.value is None else self.wide)
+
+    @property
+    def candidates(self) -> dict[str, Candidate]:
+        initial = None if self.sampled_value is None else self.sampled_value.initial
+        return {name: Candidate(policy, self.value, initial) for name, policy in self.policies.items()}
+
+    @cached_property
+    def kind(self) -> str:
+        """The controller with the lower performance, or the first where none is known."""
+        known = {name: found.perf.above for name, found in self.simulated[0].items() if found.perf.finite}
+        return min(known, key=known.__getitem__, default=next(iter(self.policies)))
+
+    @property
+    def has_densities(self) -> bool:
+        """Whether there is a trained `w`, of which a divergence is known."""
+        return self.fields.control_density is not None and self.problem.gives_divergences
+
+    @cached_property
+    def densities(self) -> DensityBounds | None:
+        return sharpened(self.densities_on, self.problem, self.few, self.seed) if self.has_densities else None
+
+    def densities_on(self, sets: list[Samples]) -> DensityBounds:
+        """`J` and `G` of the trained `w` and `mu` on ``sets``."""
+        w = admissible_density(self.occupation, self.problem, self.fields, self.constants)
+        return density_bounds(self.problem, w, self._mu, sets, self.constants.C_V)
+
+    @cached_property
+    def _mu(self) -> Density:
+        return occupation_density(self.occupation, self.problem, self.fields, self.constants)
+
+    @cached_property
+    def _fit(self) -> tuple[ClosedLoopBounds | None, list[str]]:
+        """The bounds of `mu` fitted to the closed loop of the controller handed out, or a warning that says why not."""
+        if not self.settings.stage.steps:
+            return None, []
+        kind = self.kind  # before this part is announced: it may have to be simulated
+        self.progress("closed-loop fit")
+        if not self.problem.gives_divergences:
+            return None, ["no upper bound without simulation: this problem gives no divergences of a and B."]
+        problem, trained, policy = self.problem, self.trained, self.policies_of(self.trained.fields)[kind]
+        how = self.constants, self.settings.stage, self.seed
+        try:
+            fitted = in_float64(fit_closed_loop(problem, policy, trained.fields, trained.network, *how))
+        except ArithmeticError as error:
+            return None, [f"the certification stage failed: {error}"]
+        V = self.sampled_value
+        value, initial = (fitted.value, None) if V is None else (V.value, V.initial)
+        return self.bounds_of(self.policies[kind], value, fitted.log_occupation, initial), []
+
+    @property
+    def fitted(self) -> ClosedLoopBounds | None:
+        return self._fit[0]
+
+    @cached_property
+    def observed(self) -> Observed:
+        found = self.simulated[0].get(self.kind)
+        self.progress("assumptions")
+        usable = found if found is not None and found.perf.finite else None
+        states = self.settings.occupation_states
+        return observe(self.problem, self.policies[self.kind], usable, self.few, states)
+
+    @property
+    def notes(self) -> list[str]:
+        notes = list(self._fit[1])
+        with torch.no_grad():
+            empty = (bool((self._mu(samples.x[:LOOKED_AT]) <= 0.0).any()) for samples in self.few)
+            if self.kind == "density" and self.densities is not None and any(empty):
+                what = "where w / mu is not regular: J and G may miss what it costs there"
+                notes.insert(0, f"mu is 0 at sampled states, {what}.")
+        return notes
+
+    @property
+    def remarks(self) -> list[str]:
+        """What a user should know of the controllers themselves."""
+        found, zero = self.simulated
+        notes = [
+            f"the performance of the controller from {name} is not finite; it is left out."
+            for name, simulated in found.items()
+            if not simulated.perf.finite
+        ]
+        known = [simulated.perf.above for simulated in found.values() if simulated.perf.finite]
+        if known and zero is not None and min(known) > zero.above:
+            notes.append("the best controller is worse than doing nothing.")
+        return notes

@@ -1,7 +1,5 @@
 """From a command line to a configuration, with Hydra; whatever Hydra has against it becomes one sentence."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,6 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ocp_torch.cli.explain import CHECKOUT, CONFIGS, explain
-from ocp_torch.cli.required import require_places, require_sections
 from ocp_torch.errors import InputError
 from ocp_torch.runs.configuration import next_subfolder
 from ocp_torch.runs.resume import find_run, resumed_configuration
@@ -54,7 +51,7 @@ def with_own_defaults(config_name: str, overrides: list[str]) -> list[str]:
     if not any(o.startswith("problem._target_=") for o in bare):
         return overrides
     found: list[str] = []
-    grouped = _has_problem_group(config_name)
+    grouped = any(group == "problem" and choice for group, choice in _file(config_name)[0])
     for given, field in zip(overrides, bare, strict=True):
         if grouped and (field.startswith("problem=") or given == NO_CHOICE):
             continue
@@ -65,56 +62,60 @@ def with_own_defaults(config_name: str, overrides: list[str]) -> list[str]:
 
 
 @cache
-def _has_problem_group(config_name: str) -> bool:
-    file: Any = OmegaConf.to_container(OmegaConf.load(CONFIGS / f"{config_name}.yaml"))
-    return any(isinstance(choice, dict) and choice.get("problem") for choice in file.get("defaults", []))
+def _file(config_name: str) -> tuple[list[tuple[str, Any]], list[str]]:
+    """Of a configuration file of ours: the groups with their choices, and the fields at its top."""
+    file: Any = OmegaConf.to_container(OmegaConf.load(CONFIGS / f"{config_name}.yaml"), resolve=False)
+    chosen = [item for entry in file.pop("defaults", []) if isinstance(entry, dict) for item in entry.items()]
+    return chosen, list(file)
 
 
 def composed(config_name: str, overrides: list[str], roots: tuple[Path, ...] = ()) -> dict:
-    """What a command of the configuration ``config_name`` is given, as plain data. `roots`: see `run_data`.
-
-    Raises `InputError`, in one sentence, for whatever Hydra or OmegaConf has against it.
-    """
+    """What a command of the configuration ``config_name`` is given: `configuration` and `run_data`, with its ``roots``."""
     overrides = with_own_defaults(config_name, overrides)
-    return run_data(plain(configuration(config_name, overrides), config_name, overrides), overrides, roots)
+    return run_data(configuration(config_name, overrides)[1], overrides, roots)
 
 
-def configuration(config_name: str, overrides: list[str]) -> DictConfig:
-    """The composed configuration with Hydra's own part, `hydra`. Raises `InputError`."""
-    require_places(parsed(overrides))
+def configuration(config_name: str, overrides: list[str], whole: bool = True) -> tuple[DictConfig, dict]:
+    """The composed configuration with Hydra's own part, and without that part as plain data (see `resolved`).
+
+    Raises `InputError` where it cannot be composed, or a group or field of ``config_name`` is left out or has no place.
+    """
+    own = any(o.key_or_group == "problem._target_" and not o.is_delete() for o in parsed(overrides))
+    for override in parsed(overrides):
+        name = override.key_or_group
+        # Defaults stand in the configuration alone; only a class of a user's own may do without the problem's.
+        needed = not name.startswith(("hydra", "problem.", "experiment")) and not (own and name == "problem")
+        if override.is_delete() and needed:
+            raise InputError(f"~{name} leaves out {name}, which is needed; set it to another value instead.")
     try:
         with initialize_config_dir(str(CONFIGS), job_name=config_name, version_base="1.3"):
-            return compose(config_name, overrides, return_hydra_config=True)
-    except (HydraException, OmegaConfBaseException, ValueError, TypeError) as error:
-        raise _told(error, config_name, overrides) from None
+            config = compose(config_name, overrides, return_hydra_config=True)
+        data = resolved(config, whole)
+    except InputError:
+        raise
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(explain(error, config_name, overrides)) from None
+    except (
+        ValueError,
+        TypeError,
+    ) as error:  # for some slips Hydra has no exception of its own, nor says where they are
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise InputError(f"{' '.join(overrides)} cannot be composed: {reason}.") from None
     finally:
         GlobalHydra.instance().clear()
-
-
-def plain(config: DictConfig, config_name: str, overrides: list[str], whole: bool = True) -> dict:
-    """``config`` as nested plain data without Hydra's own part, interpolations resolved. Raises `InputError` where a group or
-    field of ``config_name`` has no place in it, or, if it has to be ``whole``, no value."""
-    try:
-        data = resolved(config, whole)
-    except (OmegaConfBaseException, ValueError, TypeError) as error:
-        raise _told(error, config_name, overrides) from None
-    return require_sections(data, config_name)
+    chosen, fields = _file(config_name)
+    groups = [(key.partition("@")[2] or key).split(".")[0] for key, choice in chosen if choice is not None]
+    for name in (*groups, *fields):
+        if name not in data and not name.startswith(("hydra", "override ")):
+            raise InputError(f"{name} is missing; give {name}=... on the command line.")
+    return config, data
 
 
 def resolved(config: DictConfig, whole: bool = True) -> dict:
-    """``config`` as plain data without Hydra's own part; OmegaConf raises where it cannot be resolved or is not ``whole``."""
+    """``config`` without Hydra's part, resolved to plain data; OmegaConf raises where that cannot be, or is not ``whole``."""
     own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     data: Any = OmegaConf.to_container(own, resolve=True, throw_on_missing=whole)
     return data
-
-
-def _told(error: Exception, config_name: str, overrides: list[str]) -> InputError:
-    if isinstance(error, InputError):
-        return error
-    if isinstance(error, HydraException | OmegaConfBaseException):
-        return InputError(explain(error, config_name, overrides))
-    # Hydra has no exception of its own for some slips, and does not say where they are.
-    return InputError(f"{' '.join(overrides)} cannot be composed: {' '.join(str(error).split()).rstrip('.')}.")
 
 
 def run_data(data: dict, overrides: list[str], roots: tuple[Path, ...] = ()) -> dict:
@@ -129,6 +130,4 @@ def run_data(data: dict, overrides: list[str], roots: tuple[Path, ...] = ()) -> 
     if data.get("resume") == "auto":
         run = find_run(data, (*roots, OUTPUTS))
         data = {**data, "resume": str(run) if run else None}
-    if data.get("resume") is not None:
-        data = resumed_configuration(data, named)
-    return data
+    return data if data.get("resume") is None else resumed_configuration(data, named)

@@ -1,7 +1,5 @@
 """Hydra's and OmegaConf's own words as one sentence, with what would be right."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from functools import cache
@@ -16,7 +14,6 @@ from ocp_torch.errors import nearest
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 CONFIGS = CHECKOUT / "configs"
-EXTRAS = {"hydra/launcher": "parallel"}  # Hydra's plugin groups -> the extra that installs them
 
 
 def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -> str:
@@ -25,10 +22,8 @@ def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -
     unknown = re.search(r"Could not find '([\w./-]+)/([^'/]*)'", text)
     if isinstance(error, MissingConfigException) and unknown:
         group, choice = unknown.groups()
-        if group in EXTRAS:
-            return (
-                f"{group} is {choice!r}, which is not installed; pip install -e '.[{EXTRAS[group]}]' brings joblib's."
-            )
+        if group == "hydra/launcher":
+            return f"{group} is {choice!r}, which is not installed; pip install -e '.[parallel]' brings joblib's."
         known = choices(group)
         return f"{group} is {choice!r}, but must be one of {', '.join(known)}{nearest(choice, known)}."
     override = re.search(r"Could not override '([\w.@/-]+)'", text)
@@ -60,8 +55,7 @@ def choices(group: str) -> list[str]:
 
 def field_hint(field: str, config_name: str, overrides: Iterable[str]) -> str:
     """A bracket with the nearest field of the chosen groups, or, where none is near, with all that the group has."""
-    chosen = tuple(o for o in overrides if is_choice(o))
-    known = known_fields(config_name, chosen)
+    known = known_fields(config_name, tuple(o for o in overrides if is_choice(o)))
     group, _, last = field.rpartition(".")
     below = [k.removeprefix(f"{group}.") for k in known if group and k.startswith(f"{group}.")]
     names = sorted(n for n in below if "." not in n and not n.startswith("_"))

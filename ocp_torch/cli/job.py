@@ -1,7 +1,5 @@
 """One job, alone or of a sweep: it leaves nothing in the process, and its end is told in a sentence."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import multiprocessing
@@ -23,12 +21,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from ocp_torch.cli.compose import resolved, run_data
-from ocp_torch.cli.folders import settled
 from ocp_torch.cli.outcome import Record, fail, failed
 from ocp_torch.errors import InputError
+from ocp_torch.files.reading import require_unlinked
 from ocp_torch.problems.blame import blamed
 from ocp_torch.problems.commands import quoted
-from ocp_torch.training.signals import Preempted
+from ocp_torch.runs.configuration import adopt, locate
+from ocp_torch.training.checkpoint import LAST
+from ocp_torch.training.stopping import Preempted
 
 log = logging.getLogger(__name__)
 
@@ -40,15 +40,41 @@ def job(check: Callable[[dict], object], work: Callable[..., object], config: Di
     this = Job(hydra, Path(hydra.runtime.output_dir))
     with this.outcome():
         data = run_data(resolved(config), list(hydra.overrides.task), roots=(this.folder,))
-        this.folder = settled(this.folder, data, make=hydra.output_subdir is not None)
+        if hydra.output_subdir is not None:
+            this.folder = settled(this.folder, data)
         work(check(data), this.folder)
+
+
+def settled(folder: Path, data: dict) -> Path:
+    """The folder that a job of a sweep works in: Hydra's fresh ``folder``, or that of the run it goes on with."""
+    if data.get("resume") is None:
+        require_fresh(folder)
+        return folder
+    own = locate(Path(data["resume"]))[0]
+    if own is None or own.resolve() == folder.resolve():
+        return folder
+    require_unlinked(own)
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, logging.FileHandler):
+            handler.close()  # it opens its file again at the next line
+            handler.baseFilename = str((own / Path(handler.baseFilename).name).absolute())
+    adopt(folder, own)
+    return own
+
+
+def require_fresh(folder: Path) -> None:
+    """Raise `InputError` when ``folder`` holds a run that a new one would overwrite."""
+    if (folder / "checkpoints" / LAST).exists():
+        raise InputError(
+            f"{folder} holds a run already; go on with it by resume={folder}, or give another hydra.run.dir."
+        )
 
 
 @dataclass
 class Job:
-    """What Hydra says of a job, and the folder it works in."""
+    """A job by Hydra's own part of its configuration, and the folder it works in."""
 
-    hydra: Any  # Hydra's own part of the configuration
+    hydra: Any
     folder: Path
 
     @property
@@ -70,9 +96,9 @@ class Job:
             error = blamed(error) or error
             if isinstance(error, SystemExit):
                 raise
-            if not self.sweeping and isinstance(error, InputError):
-                fail(str(error))
             if not self.sweeping:
+                if isinstance(error, InputError):
+                    fail(str(error))
                 raise
             if not isinstance(error, InputError):
                 log.debug("%s", traceback.format_exc())
@@ -94,17 +120,17 @@ class Job:
 @contextlib.contextmanager
 def isolated():
     """Leave the process as it was: no job of a sweep finds another one's threads, precision or random numbers."""
-    dtype, threads, gradients = torch.get_default_dtype(), torch.get_num_threads(), torch.is_grad_enabled()
-    states = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
+    dtype, threads = torch.get_default_dtype(), torch.get_num_threads()
     path, folder = list(sys.path), os.getcwd()
+    states = np.random.get_state(), random.getstate()  # noqa: NPY002
+    gradients = torch.set_grad_enabled(torch.is_grad_enabled())
     try:
-        yield
+        with torch.random.fork_rng(devices=()), gradients:
+            yield
     finally:
         torch.set_default_dtype(dtype)
         torch.set_num_threads(threads)
-        torch.set_grad_enabled(gradients)
-        torch.set_rng_state(states[0])
-        np.random.set_state(states[1])  # noqa: NPY002
-        random.setstate(states[2])
+        np.random.set_state(states[0])  # noqa: NPY002
+        random.setstate(states[1])
         sys.path[:] = path
         os.chdir(folder)

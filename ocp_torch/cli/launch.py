@@ -1,38 +1,40 @@
 """The way in: a command is checked before anything is written, and whatever is wrong with it is told in one sentence."""
 
-from __future__ import annotations
-
 import logging
 import os
 import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-from ocp_torch.cli.compose import composed, parsed, register_resolvers, with_own_defaults
-from ocp_torch.cli.explain import CHECKOUT, CONFIGS, known_fields
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from torch.optim import Optimizer
+
+from ocp_torch.cli.compose import composed, configuration, parsed, register_resolvers, run_data, with_own_defaults
+from ocp_torch.cli.explain import CHECKOUT, CONFIGS, explain, is_choice, known_fields
 from ocp_torch.cli.job import isolated, job
 from ocp_torch.cli.outcome import INTERRUPTED, Record, fail, failures
 from ocp_torch.cli.single import carry_out, checked, require_places_to_write
-from ocp_torch.cli.startup import spare_imports
-from ocp_torch.cli.sweeps import check_sweep
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, require_flag, require_section, shown
 from ocp_torch.files.reading import require_unlinked
 from ocp_torch.problems.commands import ForeignProblem
-from ocp_torch.training.signals import Preempted
+from ocp_torch.training.stopping import Preempted
 
 __all__ = ["CHECKOUT", "CONFIGS", "composed", "fail", "isolated", "job", "known_fields", "launch", "register_resolvers"]
 
 ASKS = ("--help", "-h", "--info", "-i", "--cfg", "-c", "--hydra-help", "--version", "--shell-completion", "-sc")
 SWEEPS = ("-m", "--multirun", "hydra.mode=MULTIRUN")
+MOST_TRIED = 8  # jobs of a sweep that are tried for one value
+# The first optimiser of a process imports PyTorch's compiler, to tell it to leave these methods alone: 1.3 s of CPU.
+LEFT_ALONE = ("add_param_group", "state_dict", "load_state_dict", "zero_grad")
+# `pytorch_optimizer` does without tensors that are spread over machines where it finds none: 0.5 s of CPU.
+DISTRIBUTED = ("torch.distributed.tensor", "torch.distributed._tensor")
 
 
-def launch(
-    entry: Callable,
-    config_name: str,
-    check: Callable[[dict], object],
-    work: Callable[..., object],
-) -> None:
+def launch(entry: Callable, config_name: str, check: Callable[[dict], object], work: Callable[..., object]) -> None:
     """Run the command line: ``work(check(data), folder)``, where ``data`` is the composed configuration ``config_name``.
 
     ``check`` refuses what is wrong, and builds what the work is done on, before any folder is made; a single run works on
@@ -74,11 +76,84 @@ def sweep(entry: Callable, config_name: str, overrides: list[str], check: Callab
     """Run the jobs of a sweep, once each of them might run. Raises `InputError` that names those that failed."""
     require_places_to_write(overrides, "hydra.sweep.dir")
     check_sweep(config_name, overrides, check)
-    root = next((o.value() for o in parsed(overrides) if o.key_or_group == "hydra.sweep.dir"), None)
-    if root is not None:
+    for root in (o.value() for o in parsed(overrides) if o.key_or_group == "hydra.sweep.dir"):
         require_unlinked(Path(str(root)), "*")
     with failures() as failed:
         entry()
         names = failed()
     if names:
         raise InputError(f"{len(names)} job(s) of the sweep failed: {'; '.join(names)}.")
+
+
+def check_sweep(config_name: str, overrides: list[str], check: Callable[[dict], object]) -> None:
+    """Raise `InputError` where a job of the sweep would not even compose, every value of every field, one at a time; or
+    where ``check`` lets none through that has a value of some kind: words are, and numbers by their sign. What the problem
+    makes of numbers, a sweep may be there to find out."""
+    try:
+        jobs = BasicSweeper.split_arguments(parsed(overrides), None)[0]
+    except HydraException as error:
+        raise InputError(explain(error, config_name)) from None
+    is_hydras = lambda override: override.startswith(("hydra.", "hydra/"))
+    defaults: dict[tuple, dict] = {}
+    for one in dict.fromkeys(o for each in jobs for o in each):
+        first = [o for o in next(each for each in jobs if one in each) if not is_hydras(o)]
+        chosen = [o for o in first if is_choice(o) or o.lstrip("+").startswith("problem._target_=")]
+        if (key := tuple(chosen)) not in defaults:
+            defaults[key] = configuration(config_name, chosen, whole=False)[1]
+        require_kinds(configuration(config_name, first)[1], defaults[key])
+    ours = [[o for o in each if not is_hydras(o)] for each in jobs]
+    for one in representatives(parsed(overrides)):
+        refusals: list[InputError] = []
+        tried = [each for each in ours if one in each][:MOST_TRIED]
+        for each in tried:
+            try:
+                check(run_data(configuration(config_name, each)[1], each))
+                break
+            except InputError as error:
+                refusals.append(error)
+        if tried and len(refusals) == len(tried):
+            raise refusals[0]
+    # Hydra's own settings are the same for every job.
+    configuration(config_name, [o for o in jobs[0] if is_hydras(o)], whole=False)
+
+
+def representatives(overrides: list[Override]) -> list[str]:
+    """One override for each kind of value that is swept over: each word, and numbers of each type and sign."""
+    found: dict[tuple, str] = {}
+    for override in overrides:  # but fields of the problem and `resume`, which are left to the jobs
+        name = override.key_or_group
+        if not override.is_sweep_override() or name.startswith(("hydra", "problem.", "resume")) or is_choice(name):
+            continue
+        for one in BasicSweeper.split_arguments([override], None)[0]:
+            value: Any = parsed(one)[0].value()
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            found.setdefault((name, type(value), value > 0 if number else str(value)), one[0])
+    return list(found.values())
+
+
+def require_kinds(data: Any, default: Any, name: str = "") -> None:
+    """Raise `InputError` where a number, a flag or a group of fields of ``default`` is something else in ``data``."""
+    if isinstance(default, dict):
+        for key in default.keys() & require_section(name, data).keys():
+            require_kinds(data[key], default[key], f"{name}.{key}".lstrip("."))
+    elif isinstance(default, bool):
+        require_flag(name, data)
+    elif isinstance(default, int | float) and not (isinstance(data, int | float) and not isinstance(data, bool)):
+        raise InputError(f"{name} is {shown(data)}, but must be a number.")
+
+
+def spare_imports() -> None:
+    """Spare this process, a command's own, PyTorch's compiler, until somebody compiles, and distributed tensors in the
+    optimisers. Where PyTorch is made differently nothing happens, and the process starts as slowly as any other."""
+    for name in LEFT_ALONE:
+        method = getattr(getattr(Optimizer, name, None), "__wrapped__", None)
+        if method is not None and not hasattr(method, "__dynamo_disable"):
+            method.__dynamo_disable = method  # what `torch._disable_dynamo` looks for before it imports the compiler
+    hidden = [name for name in DISTRIBUTED if name not in sys.modules]
+    modules: dict[str, Any] = sys.modules
+    modules.update(dict.fromkeys(hidden))  # an import of what is None there fails
+    try:
+        import pytorch_optimizer  # noqa: F401
+    finally:
+        for name in hidden:
+            del sys.modules[name]

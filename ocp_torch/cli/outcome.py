@@ -1,7 +1,5 @@
 """How a command ends: in one sentence and a status, or in the names of the jobs of a sweep that failed."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

@@ -1,8 +1,10 @@
 """A single run: checked while nothing is written, and what was built for that is what then runs, in this process."""
 
-from __future__ import annotations
-
+import contextlib
+import errno
+import os
 import re
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,20 +17,21 @@ from hydra.core.utils import run_job
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from ocp_torch.cli.compose import configuration, parsed, plain, run_data
+from ocp_torch.cli.compose import configuration, parsed, run_data
 from ocp_torch.cli.explain import CONFIGS
-from ocp_torch.cli.folders import fresh_folder, require_fresh, require_writable
-from ocp_torch.cli.job import Job
+from ocp_torch.cli.job import Job, require_fresh
 from ocp_torch.errors import InputError, shown
 from ocp_torch.files.reading import require_unlinked
 from ocp_torch.problems.blame import blamed
 from ocp_torch.runs.configuration import locate
 
+# Where a checkpoint that lies in no run's folder goes on, as in configs/train.yaml, by the name of its problem and method.
+FRESH = "${{checkout:outputs}}/{}_{}/${{now:%Y-%m-%d_%H-%M-%S-%f}}"
+
 
 @dataclass(frozen=True)
 class Checked:
-    """A command that nothing is known against: its configuration, Hydra's part and the run's folder in it, and what the
-    check built."""
+    """A command that nothing is known against: its configuration, with Hydra's part, and what the check ``made``."""
 
     config_name: str
     config: DictConfig
@@ -43,18 +46,17 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
     require_places_to_write(arguments, "hydra.run.dir")
     given = {o.key_or_group: o.value() for o in parsed(arguments) if not o.is_sweep_override() and not o.is_delete()}
     own = Path(str(given["hydra.run.dir"])) if "hydra.run.dir" in given else None
-    config = configuration(config_name, arguments)
+    config, data = configuration(config_name, arguments)
     try:
-        data = run_data(plain(config, config_name, arguments), arguments, roots=(own,) if own else ())
+        data = run_data(data, arguments, roots=(own,) if own else ())
         going_on = data.get("resume") is not None
         folder = locate(Path(data["resume"]))[0] if going_on else own
         if folder is not None:
             require_unlinked(folder)
         made = check(data)
     except OSError as error:  # a name that no file can have, a device that gives nothing
-        blame = blamed(error)
         named = f"{shown(str(error.filename))} cannot be used" if error.filename else "a file cannot be used"
-        raise blame or InputError(f"{named}: {error.strerror or error}.") from None
+        raise blamed(error) or InputError(f"{named}: {error.strerror or error}.") from None
     except (Exception, SystemExit) as error:
         told: InputError | None = blamed(error)
         if told is None and isinstance(error, SystemExit):  # somebody's module would end the run without a word
@@ -63,17 +65,35 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
     if own is not None and "resume" in data and not going_on:
         require_fresh(own)
     if going_on:
-        place = str(folder) if folder is not None else fresh_folder(data) if own is None else str(own)
+        fresh = FRESH.format(str(data["problem"]["_target_"]).rpartition(".")[2].lower(), data["method"]["name"])
+        place = next((str(given) for given in (folder, own) if given is not None), fresh)
         with read_write(config):
             OmegaConf.update(config, "hydra.run.dir", place)
     return Checked(config_name, config, made)
 
 
 def require_places_to_write(arguments: list[str], name: str) -> None:
-    """Raise `InputError` where nothing can be written to the folder that ``name`` is given as."""
+    """Raise `InputError` unless files can be written to the folder that ``name`` is given as; leaves nothing behind."""
     for value in (o.value() for o in parsed(arguments) if o.key_or_group == name and not o.is_sweep_override()):
         # What is only known later, such as the time, is below what can be looked at now.
-        require_writable(name, Path(re.split(r"[^/]*\$\{", str(value))[0]))
+        folder = Path(re.split(r"[^/]*\$\{", str(value))[0])
+        made: list[Path] = []
+        try:
+            if len(os.fsencode(folder.absolute())) >= os.pathconf("/", "PC_PATH_MAX"):
+                raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
+            for part in (*reversed(folder.absolute().parents), folder.absolute()):
+                if not part.exists():
+                    part.mkdir()
+                    made.append(part)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"{name} is {shown(str(folder))}, where nothing can be written: {reason}.") from None
+        finally:
+            for part in reversed(made):
+                with contextlib.suppress(OSError):
+                    part.rmdir()
 
 
 def carry_out(command: Checked, work: Callable[..., object]) -> None:

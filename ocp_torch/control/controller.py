@@ -1,24 +1,31 @@
-"""A trained controller as a function of the state, and as a file."""
-
-from __future__ import annotations
+"""A trained controller as a function of the state, and as a file, of which nothing is run and nothing is believed that it
+does not hold."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import overload
+from typing import TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.control.policies import trained_policies
-from ocp_torch.errors import InputError
-from ocp_torch.fields import Fields
-from ocp_torch.files.storage import save_tensors
+from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, trained_policies
+from ocp_torch.errors import InputError, notes
+from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, MODELS, VALUE, Fields
+from ocp_torch.files.limits import require_held, require_modest_problem
+from ocp_torch.files.storage import finite, load_tensors, save_tensors
 from ocp_torch.problems import PROBLEMS, Problem
+from ocp_torch.problems.checks.check import check_once
+from ocp_torch.problems.commands import ForeignProblem, current_name, current_section, made_by, naming
 from ocp_torch.problems.constants import Constants
 
 # Of `controller.safetensors`; raised when an older version could not read what is written.
 SCHEMA = 1
+# What the file holds of a controller just as it is.
+PLAIN = ("model", "occupation", "kind", "certificate", "config")
+FIELDS = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION)
+# Controls are given as what the states are.
+States = TypeVar("States", Tensor, np.ndarray)
 
 
 @dataclass
@@ -42,15 +49,9 @@ class Controller:
         self._policy = trained_policies(self.occupation, self.problem, self.fields, self.constants)[self.kind]
         self._like = next(self.fields.parameters())
 
-    @overload
-    def __call__(self, x: Tensor) -> Tensor: ...
-    @overload
-    def __call__(self, x: np.ndarray) -> np.ndarray: ...
-    def __call__(self, x: Tensor | np.ndarray) -> Tensor | np.ndarray:
-        """Controls ``(N, m)`` at states ``(N, d)``: any reals, wrapped to the torus; NumPy in gives NumPy out.
-
-        Raises `InputError` for another shape.
-        """
+    def __call__(self, x: States) -> States:
+        """Controls ``(N, m)`` at states ``(N, d)``: any reals, wrapped to the torus; NumPy in gives NumPy out. Raises
+        `InputError` for another shape."""
         states = torch.as_tensor(x)
         if states.ndim != 2 or states.shape[1] != self.problem.dim:
             raise InputError(f"x has shape {tuple(states.shape)}, but must have shape (N, {self.problem.dim}).")
@@ -68,12 +69,8 @@ class Controller:
             "problem": {"name": problem_name(self.problem), "parameters": plain_parameters(self.problem.parameters)},
             "dtype": str(self._like.dtype).removeprefix("torch."),
             "fields": list(self.fields.networks),
-            "model": self.model,
             "bounds": asdict(self.constants),
-            "occupation": self.occupation,
-            "kind": self.kind,
-            "certificate": self.certificate,
-            "config": self.config,
+            **{name: getattr(self, name) for name in PLAIN},
         }
         save_tensors(Path(path), dict(self.fields.state_dict()), metadata)
 
@@ -90,3 +87,102 @@ def plain_parameters(parameters: dict) -> dict:
     loading."""
     listed = {k: list(v) if isinstance(v, tuple) else v for k, v in parameters.items()}
     return {k: v for k, v in listed.items() if isinstance(v, bool | int | float | str | list | type(None))}
+
+
+def load_controller(path: str | Path, problem: Problem | None = None, device: str = "cpu") -> Controller:
+    """Load a controller saved by a run; no code in the file is run.
+
+    A controller of one of the package's problems rebuilds it from its parameters; one of a user's own problem needs that
+    ``problem``, made with the same arguments. Raises `InputError` when the file is missing, damaged, of a newer schema, or
+    does not fit the problem.
+    """
+    path = Path(path)
+    tensors, metadata = load_tensors(path)
+    schema = metadata.get("schema")
+    if not isinstance(schema, int) or schema > SCHEMA:
+        raise InputError(f"{path} has schema {schema!r}, but this version of ocp_torch reads up to {SCHEMA}.")
+    try:
+        return _rebuilt(path, tensors, metadata, problem, device)
+    except (KeyError, TypeError, AttributeError, RuntimeError, ValueError, ArithmeticError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path} does not describe a controller ({type(error).__name__}: {error}).") from None
+
+
+def _rebuilt(path: Path, tensors: dict, metadata: dict, problem: Problem | None, device: str) -> Controller:
+    if metadata["occupation"] not in (None, CLOSED, SADDLE, NETWORK):
+        raise InputError(f"{path} names the unknown occupation {metadata['occupation']!r}.")
+    _require_run(path, metadata["certificate"], metadata["config"])
+    saved = metadata["problem"]
+    if problem is None:
+        if saved["name"] not in PROBLEMS:
+            section = _section(saved, metadata["config"])
+            raise ForeignProblem(
+                f"{path} belongs to the problem {str(saved['name'])[:80]!r}, which is not part of ocp_torch, or calls a "
+                f"function of yours; pass it: load_controller(path, problem={made_by(section)}).",
+                naming(section),
+            )
+        require_modest_problem(path, saved["parameters"], "pass it: load_controller(path, problem=...)")
+        problem = PROBLEMS[saved["name"]](**saved["parameters"])
+    elif saved["name"] in PROBLEMS and problem_name(problem) != saved["name"]:
+        raise InputError(f"{path} belongs to the problem {saved['name']!r}, not to {problem_name(problem)!r}.")
+    else:
+        check_once(problem)
+    model, names = metadata["model"], metadata["fields"]
+    if len(names) > len(FIELDS) or not set(names) <= set(FIELDS) or len(set(names)) < len(names):
+        known = ", ".join(FIELDS)
+        raise InputError(f"{path} names the fields {names!r:.80}, but must name some of {known}, each once.")
+    require_held(path, model, sum(t.numel() for t in tensors.values()))
+    if model["name"] not in MODELS:
+        raise InputError(f"{path} names the unknown model {model['name']!r}; known are {', '.join(MODELS)}.")
+    network, options = MODELS[model["name"]], {k: v for k, v in model.items() if k != "name"}
+    outputs = {CONTROL_DENSITY: problem.control_dim}  # the other fields are scalar
+    build = lambda: Fields({n: network(dim=problem.dim, outputs=outputs.get(n), **options) for n in names})
+    with torch.device("meta"):
+        # Shapes first, without memory: a crafted size must not be allocated before it is refused.
+        shapes = {name: t.shape for name, t in build().state_dict().items()}
+    if shapes != {name: t.shape for name, t in tensors.items()}:
+        fit = f"its weights are not those of its model on a problem of dimension {problem.dim}"
+        raise InputError(f"{path} does not fit: {fit}.")
+    _require_same_arguments(path, problem, saved["parameters"])
+    dtype = metadata["dtype"]
+    if dtype not in ("float32", "float64"):
+        raise InputError(f"{path} has dtype {dtype!r}, but must have float32 or float64.")
+    if other := {str(t.dtype).removeprefix("torch.") for t in tensors.values()} - {dtype}:
+        raise InputError(f"{path} holds weights of type {', '.join(sorted(other))}, but must hold {dtype} alone.")
+    if not all(torch.isfinite(t).all() for t in tensors.values()):
+        raise InputError(f"{path} holds weights that are not finite.")
+    with torch.random.fork_rng(devices=[]):
+        fields = build().to(dtype=getattr(torch, dtype))
+    fields.load_state_dict(tensors)
+    fields = fields.to(device).requires_grad_(False)
+    constants = Constants(**{**metadata["bounds"], "warnings": notes(metadata["bounds"]["warnings"])})
+    return Controller(problem, fields, constants, **{name: metadata[name] for name in PLAIN})
+
+
+def _section(saved: dict, config: dict) -> dict:
+    """The problem of a run as its configuration names it, or as its parameters do where that is of something else."""
+    section = current_section(config.get("problem"))
+    target = str(section.get("_target_")) if isinstance(section, dict) else ""
+    name = str(current_name(saved["name"], config.get("problem")))
+    same = target.rpartition(".")[2].lower() == name.rpartition(".")[2]
+    return section if same else saved["parameters"]
+
+
+def _require_same_arguments(path: Path, problem: Problem, saved: dict) -> None:
+    """Raise `InputError` where ``problem`` is not made as that of the run was."""
+    given = finite(plain_parameters(problem.parameters))
+    for name in given.keys() & saved.keys() - set(problem.incidental):
+        if given[name] != saved[name]:
+            raise InputError(
+                f"problem.{name} is {given[name]!r}, but the run of {path} has {repr(saved[name])[:80]}; a controller is "
+                "loaded with the problem it was trained for."
+            )
+
+
+def _require_run(path: Path, certificate: object, config: object) -> None:
+    """What `evaluate` reads of the run is made of groups of fields."""
+    below = lambda group, name: group.get(name) or {} if isinstance(group, dict) else None
+    effort = below(config, "certificate")
+    if not all(isinstance(g, dict) for g in (certificate, effort, below(effort, "stage"), below(config, "trainer"))):
+        raise InputError(f"{path} does not describe the run it came from.")

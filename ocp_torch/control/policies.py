@@ -1,7 +1,5 @@
 """Controllers as functions of the state: from `V` alone, from `w / mu`, or zero; and the densities `mu` they need."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch
@@ -38,12 +36,9 @@ class ValuePolicy:
 
 def admissible_density(kind: str | None, problem: Problem, fields: Fields, constants: Constants) -> Field:
     """`w` of trained fields, within what a limit on the control allows: `mu` of Lemma 2 leaves room for any `w` already."""
-    w = fields.control_density
-    return (
-        w
-        if kind == CLOSED
-        else problem.control_cost.admissible(w, occupation_density(kind, problem, fields, constants))
-    )
+    if kind == CLOSED:
+        return fields.control_density
+    return problem.control_cost.admissible(fields.control_density, occupation_density(kind, problem, fields, constants))
 
 
 def density_policy(control_density: Field, occupation: Density, cost: PowerCost) -> Policy:

@@ -1,7 +1,5 @@
 """Periodic embeddings of the torus."""
 
-from __future__ import annotations
-
 import math
 
 import torch

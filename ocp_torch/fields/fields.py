@@ -1,7 +1,5 @@
 """The networks that represent `V`, `w` and, where needed, `log mu`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -28,7 +26,7 @@ class Fields(nn.Module):
         self.networks = nn.ModuleDict(networks)
 
     @classmethod
-    def build(cls, problem: Problem, names: Iterable[str], network: NetworkFactory, seed: int) -> Fields:
+    def build(cls, problem: Problem, names: Iterable[str], network: NetworkFactory, seed: int) -> "Fields":
         """Fresh networks for ``names`` in the units of ``problem``, initialised from ``seed`` alone.
 
         An embedding with room for them gets the problem's `prominent_waves`.

@@ -1,7 +1,5 @@
 """Smooth multilayer perceptrons on a periodic embedding."""
 
-from __future__ import annotations
-
 import copy
 from math import inf
 
@@ -101,7 +99,7 @@ class PeriodicMLP(nn.Module):
         """What the last layer combines, ``(N, width)``, in the units of the field: `shifted_by` adds multiples of them."""
         return self.scale * self.body(self.embedding(x))
 
-    def shifted_by(self, weights: Tensor) -> PeriodicMLP:
+    def shifted_by(self, weights: Tensor) -> "PeriodicMLP":
         """A copy whose one output has ``weights`` ``(width,)`` times the features added."""
         other = copy.deepcopy(self)
         with torch.no_grad():

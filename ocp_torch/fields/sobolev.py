@@ -5,8 +5,6 @@ frequencies `w, -w`, `sqrt(2 k_w) cos(2 pi w . x)` and `sqrt(2 k_w) sin(2 pi w .
 in `theta` of a function of `V` is its gradient in the space, and `|theta|` is the norm of `V` there.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -151,7 +149,7 @@ class SobolevField(nn.Module):
         return {}
 
     @classmethod
-    def of(cls, features: SobolevFeatures, outputs: int | None) -> SobolevField:
+    def of(cls, features: SobolevFeatures, outputs: int | None) -> "SobolevField":
         """The zero field on ``features`` that are there already, in units of 1."""
         field = cls.__new__(cls)
         nn.Module.__init__(field)

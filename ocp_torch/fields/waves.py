@@ -5,8 +5,6 @@ entries. A network that gets only single coordinates must learn such products on
 beforehand, from the Fourier coefficients of `f`, `a`, `B` and `mu0` at random states.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 

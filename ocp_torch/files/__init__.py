@@ -1,1 +1,1 @@
-"""Files, read as a stranger's and within limits, and written so that they survive. Imports `errors` alone."""
+"""Reading files that a stranger may have written, and writing files that survive a crash. Imports `errors` alone."""

@@ -1,13 +1,12 @@
-"""NumPy's files, `.npy` and `.npz`, from strangers: what an array claims to be is judged before a byte of it is unpacked."""
-
-from __future__ import annotations
+"""NumPy's files, `.npy` and `.npz`, from strangers: the size that an array claims is checked before its numbers are read."""
 
 import io
 import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
+from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
 
@@ -16,34 +15,24 @@ from ocp_torch.files.reading import opened, zip_file
 
 # Bytes of the header of an array of numbers at most; NumPy itself writes 118.
 LONGEST_HEADER = 1024
-# NumPy's letters for the kinds of numbers that are read.
+# NumPy's letters for the kinds of numbers that are read: floats and integers; and flags.
 REAL, FLAGS = "fiu", "b"
-# What is unpacked from any file, in bytes, and how often its own size from a larger one. Random states hardly compress,
-# and are a part of one in `3 + m` of a recording; the others may be constant.
+# A file may unpack to this many bytes, or to this many times its own size. Of a recording at least one part in `3 + m`,
+# the random states, hardly compresses; the other columns may be constant.
 FREELY, MOST_TIMES = 2**27, 64
 
 
 @dataclass(frozen=True)
 class Form:
-    """What an array claims to be."""
+    """What the header of an array claims."""
 
     shape: tuple[int, ...]
-    dtype: np.dtype
-    start: int  # where its numbers begin
-
-    @property
-    def size(self) -> int:
-        """Bytes in memory, as it comes and as float64, whichever is more."""
-        return math.prod(self.shape) * max(self.dtype.itemsize, 8)
-
-    @property
-    def stored(self) -> int:
-        """Bytes of header and numbers in the file."""
-        return self.start + math.prod(self.shape) * self.dtype.itemsize
+    size: int  # bytes in memory, as it comes or as float64, whichever is more
+    stored: int  # bytes of header and numbers in the file
 
 
 def form_of(file: BinaryIO, kinds: str = REAL) -> Form:
-    """The form of the array that begins in ``file``; `ValueError` where it is none, or not of the ``kinds`` of numbers."""
+    """The form of the array that begins in ``file``; `ValueError` where there is none, or its numbers are of no such kind."""
     begin = file.read(8)
     if len(begin) < 8 or begin[:6] != b"\x93NUMPY" or begin[6] not in (1, 2):
         raise ValueError("is damaged: it is no array of NumPy's")
@@ -56,69 +45,71 @@ def form_of(file: BinaryIO, kinds: str = REAL) -> Form:
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     try:
         shape, _, dtype = read(header, max_header_size=LONGEST_HEADER)
-    except Exception:  # the parser beneath has types of its own
+    except Exception:  # NumPy's parser raises many types
         raise ValueError("is damaged: its header is not one of NumPy's") from None
     if dtype.hasobject:
         raise ValueError("holds Python objects, which are never read from a file")
     if dtype.kind not in kinds or min(shape, default=0) < 0:
         raise ValueError(f"has type {dtype}, but must hold real numbers")
-    return Form(tuple(map(int, shape)), dtype, header.tell())
+    count = math.prod(map(int, shape))
+    return Form(tuple(map(int, shape)), count * max(dtype.itemsize, 8), header.tell() + count * dtype.itemsize)
+
+
+def _numbers(file) -> np.ndarray:
+    """The array in ``file``, whose form has been checked, in float64."""
+    array = np.lib.format.read_array(file, allow_pickle=False, max_header_size=LONGEST_HEADER)
+    return array.astype(np.float64, copy=False)
 
 
 def read_npy(path: Path, most: int) -> np.ndarray:
-    """The array in the file ``path``, in float64 and of at most ``most`` bytes; `InputError` for a file that cannot be read,
-    and `ValueError` for a larger array or none."""
+    """The array in the file ``path``, in float64. Raises `InputError` where the file cannot be read, and `ValueError`, whose
+    words follow the file's name, where it holds no array of numbers or one of more than ``most`` bytes."""
     with opened(path) as file:
         form = form_of(file, REAL + FLAGS)
         if form.size > most:
             raise ValueError(f"has shape {form.shape}, which is too large")
         file.seek(0)
-        return np.lib.format.read_array(file, allow_pickle=False, max_header_size=LONGEST_HEADER).astype(np.float64)
+        return _numbers(file)
 
 
 def read_npz(path: Path, known: Collection[str], most: int) -> dict[str, np.ndarray]:
-    """The arrays of the file ``path``, in float64: their names among the ``known`` ones, all together of at most ``most``
-    bytes. Raises `InputError`, in one sentence, for anything else."""
+    """The arrays of the file ``path`` by name, in float64. Raises `InputError` where a name is not among the ``known`` ones,
+    where the file or all its arrays together have more than ``most`` bytes, and for any damage."""
     with opened(path, most) as file:
         try:
             with zip_file(file) as archive:
-                forms: dict[str, Form] = {}
-                for entry in archive.infolist():
-                    name = entry.filename.removesuffix(".npy")
-                    if name not in known or name in forms:
-                        hint = nearest(name, known)
-                        raise InputError(f"{path} holds {visible(name, 80)!r}, which is no array of a recording{hint}.")
-                    forms[name] = _form(path, name, archive, entry)
+                forms = _forms(path, archive, known)
                 total, size = sum(form.size for form in forms.values()), file.seek(0, io.SEEK_END)
                 limit = min(most, max(FREELY, MOST_TIMES * size))
                 if total > limit:
                     raise InputError(
                         f"{path} unpacks to {total:,} bytes; at most {limit:,} are read from one of its size."
                     )
-                return {name: _numbers(archive, f"{name}.npy") for name in forms}
+                return {name: _numbers(archive.open(f"{name}.npy")) for name in forms}
         except InputError:
             raise
-        except Exception as error:  # zipfile, zlib and numpy have no one type for damage
+        except Exception as error:  # zipfile, zlib and NumPy have no one type for damage
             reason = next(iter(str(error).splitlines()), "").rstrip(".") or "no message"
             raise InputError(f"{path} is not a whole .npz file: it is damaged or of another kind ({reason}).") from None
 
 
-def _form(path: Path, name: str, archive, entry) -> Form:
-    if entry.compress_type not in (0, 8):  # stored or deflated, as NumPy writes them
-        raise InputError(f"{path}: {name} is packed in a way that NumPy does not use.")
-    try:
-        with archive.open(entry) as stream:
-            form = form_of(stream)
-    except ValueError as error:
-        raise InputError(f"{path}: {name} {error}.") from None
-    if form.stored != entry.file_size:
-        raise InputError(
-            f"{path} is damaged: {name} claims to have {form.stored:,} bytes, but has {entry.file_size:,}."
-        )
-    return form
-
-
-def _numbers(archive, name: str) -> np.ndarray:
-    with archive.open(name) as stream:
-        array = np.lib.format.read_array(stream, allow_pickle=False, max_header_size=LONGEST_HEADER)
-    return array.astype(np.float64, copy=False)
+def _forms(path: Path, archive: ZipFile, known: Collection[str]) -> dict[str, Form]:
+    """The form of each array of the ``archive``, by its name. Raises `InputError`."""
+    forms: dict[str, Form] = {}
+    for entry in archive.infolist():
+        name = entry.filename.removesuffix(".npy")
+        if name not in known or name in forms:
+            hint = nearest(name, known)
+            raise InputError(f"{path} holds {visible(name, 80)!r}, which is no array of a recording{hint}.")
+        if entry.compress_type not in (ZIP_STORED, ZIP_DEFLATED):
+            raise InputError(f"{path}: {name} is packed in a way that NumPy does not use.")
+        try:
+            with archive.open(entry) as stream:
+                form = form_of(cast(BinaryIO, stream))
+        except ValueError as error:
+            raise InputError(f"{path}: {name} {error}.") from None
+        if form.stored != entry.file_size:
+            claimed = f"{name} claims to have {form.stored:,} bytes"
+            raise InputError(f"{path} is damaged: {claimed}, but has {entry.file_size:,}.")
+        forms[name] = form
+    return forms

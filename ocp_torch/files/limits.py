@@ -1,14 +1,15 @@
-"""What a file may ask of the machine by itself. More than this only the user may: on the command line, or in Python."""
+"""How much a file may ask of the machine, more than which only the user may; and what fits into its memory at all."""
 
-from __future__ import annotations
-
+import os
 from collections.abc import Collection
+from pathlib import Path
 
 from ocp_torch.errors import InputError
+from ocp_torch.files.plain import value_at
 
-# Whole numbers and lengths of lists among a problem's arguments; `seed` is but a name.
+# The largest whole number and the longest list that a file may give as an argument of a problem; a `seed` may be any number.
 MOST_OF_A_PROBLEM, LONGEST_LIST = 128, 256
-# Dotted field of a run -> its largest value: some sixteen times a default.
+# Dotted field of a run -> the largest value that a file may give it: some sixteen times a default.
 MOST = {
     "trainer.steps": 2**24,
     "trainer.batch": 2**16,
@@ -24,34 +25,31 @@ MOST = {
     "certificate.stage.batch": 2**13,
 }
 LEAST = {"certificate.tolerance": 1e-9}
+GIGABYTE = 1e9
+# Where Linux says how much memory a container may use, in both generations of control groups.
+CONTAINER_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 
 
 def require_modest_problem(source: object, parameters: dict, remedy: str) -> None:
-    """Raise `InputError` where ``parameters``, as the file ``source`` has them, make too large a problem."""
-    for name, value in parameters.items():
-        _require_modest(source, name, value, remedy)
-
-
-def _require_modest(source: object, name: str, value: object, remedy: str) -> None:
-    if isinstance(value, list | tuple):
-        if len(value) > LONGEST_LIST:
-            raise InputError(f"{source} asks for problem.{name} of {len(value):,} entries; {remedy}.")
-        for one in value:
-            if isinstance(one, list | tuple):
-                _require_modest(source, name, one, remedy)
-    elif isinstance(value, int) and value > MOST_OF_A_PROBLEM and name != "seed":
-        raise InputError(
-            f"{source} asks for problem.{name} = {value:,}, and up to {MOST_OF_A_PROBLEM} is believed of a file; {remedy}."
-        )
+    """Raise `InputError`, which ends with ``remedy``, where the file ``source`` gives a problem too large an argument."""
+    for name, parameter in parameters.items():
+        waiting = [parameter]
+        while waiting:
+            value = waiting.pop()
+            if isinstance(value, list | tuple):
+                if len(value) > LONGEST_LIST:
+                    raise InputError(f"{source} asks for problem.{name} of {len(value):,} entries; {remedy}.")
+                waiting += [one for one in value if isinstance(one, list | tuple)]
+            elif isinstance(value, int) and value > MOST_OF_A_PROBLEM and name != "seed":
+                asked = f"{source} asks for problem.{name} = {value:,}"
+                raise InputError(f"{asked}, and up to {MOST_OF_A_PROBLEM} is believed of a file; {remedy}.")
 
 
 def require_modest_run(source: object, config: dict, named: Collection[str] = frozenset()) -> None:
-    """Raise `InputError` where the plain ``config`` that the file ``source`` holds asks for too much of anything but what
-    the command line ``named``."""
+    """Raise `InputError` where a field of ``config``, as the file ``source`` has it, is beyond its limit in `MOST` or `LEAST`
+    and is not one that the command line ``named``."""
     for field, limit in {**MOST, **LEAST}.items():
-        value: object = config
-        for key in field.split("."):
-            value = value.get(key) if isinstance(value, dict) else None
+        value = value_at(config, field)
         if not isinstance(value, int | float) or field in named:
             continue
         if not (value >= limit if field in LEAST else value <= limit):
@@ -63,10 +61,33 @@ def require_modest_run(source: object, config: dict, named: Collection[str] = fr
 
 
 def require_held(source: object, model: object, numbers: int) -> None:
-    """Raise `InputError` where networks as ``model`` describes have more weights than the ``numbers`` the file holds."""
+    """Raise `InputError` where networks of the form ``model`` have more weights than the file ``source`` has ``numbers``."""
     if not isinstance(model, dict):
         return
     sizes = {name: model.get(name) for name in ("width", "depth", "modes", "waves")}
     width, depth, modes, waves = (v if isinstance(v, int) and v > 0 else 1 for v in sizes.values())
     if max(width**2 * (depth - 1), 2 * (modes + waves - 1) * width) > numbers:
         raise InputError(f"{source} describes larger networks ({sizes}) than it holds the weights of.")
+
+
+def memory() -> float:
+    """Bytes that this process could ever have: the machine's, or its container's; infinite where neither is known."""
+    found = []
+    if {"SC_PHYS_PAGES", "SC_PAGE_SIZE"} <= os.sysconf_names.keys():
+        found.append(float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE"))
+    for limit in CONTAINER_LIMITS:
+        try:
+            found.append(float(limit.read_text()))
+        except (OSError, ValueError):  # there is no such file, or it holds the word max
+            continue
+    return min((size for size in found if size > 0.0), default=float("inf"))
+
+
+def require_memory(name: str, value: int, each: float) -> None:
+    """Raise `InputError` when ``value`` things of at least ``each`` bytes do not fit into the memory of the machine."""
+    most = memory()
+    if value * each > most:
+        raise InputError(
+            f"{name} is {value}, which needs {value * each / GIGABYTE:,.3g} GB of memory or more, but this machine has "
+            f"{most / GIGABYTE:.3g}; at most {int(most / each)} fit."
+        )

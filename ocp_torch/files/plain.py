@@ -1,27 +1,25 @@
-"""JSON, YAML and what comes out of them as plain data of a bounded size: words, numbers, lists and groups, and nothing else.
-
-Texts may come from strangers. Nothing in them is run, looked up elsewhere or unfolded; what is not plain is `NotPlain`.
-"""
-
-from __future__ import annotations
+"""JSON and YAML from strangers as plain data of a bounded size, words, numbers, lists and groups: nothing in them is run."""
 
 import json
 import math
 import re
+from typing import Any
 
 import yaml
 from torch import Tensor
 
-# More than any certificate, controller or configuration holds: values, levels, digits, bits, characters.
-MOST_VALUES, MOST_OF_YAML, DEEPEST, LONGEST_NUMBER, MOST_BITS, LONGEST_SCALAR = 2**21, 2**17, 32, 64, 128, 2**13
-# A value that stands for another one of the same file, a.b: the only kind of interpolation that is looked up for a file.
+# No certificate, controller or configuration holds more values; of these in YAML, more; or deeper nested ones.
+MOST_VALUES, MOST_OF_YAML, DEEPEST = 2**21, 2**17, 32
+# Signs of a number in JSON, bits of a whole number, and characters of a value in YAML, at most.
+LONGEST_NUMBER, MOST_BITS, LONGEST_SCALAR = 64, 128, 2**13
+# `${a.b}`, a value that stands for the one at a.b of the same file; such a value may stand for a third one, and so on.
 REFERENCE, MOST_STEPS = re.compile(r"\$\{([A-Za-z_]\w*(?:\.\w+)*)\}"), 8
-# libyaml's parser where PyYAML has it: ten times as fast.
+# The parser of the C library, where PyYAML has it, is ten times as fast.
 YAML = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class NotPlain(ValueError):
-    """What a file holds is not the plain data it should be; the message ends a sentence that begins with its name."""
+    """What a file holds is not the plain data it should be; the message is to follow the name of the file and a colon."""
 
 
 def json_object(text: str) -> dict:
@@ -41,8 +39,7 @@ def json_object(text: str) -> dict:
 
 
 def yaml_mapping(text: str) -> dict:
-    """``text`` as a YAML mapping of plain data; raises `NotPlain` for tags, references to anchors, and all but words,
-    numbers, lists and mappings."""
+    """``text`` as a YAML mapping of plain data; raises `NotPlain`, also for tags and for references to anchors."""
     depth = 0
     try:
         for count, event in enumerate(yaml.parse(text, Loader=YAML)):
@@ -78,10 +75,11 @@ def _float(digits: str) -> float:
     return float(digits)
 
 
-def require_plain(data: object, tensors: bool = False) -> None:
-    """Raise `NotPlain` unless ``data`` is made of `None`, flags, numbers and words in lists, tuples and dicts, and, with
-    ``tensors``, tensors; not too many (what is shared counts each time), not too deep, and no number too long."""
-    waiting, count = [(data, 0)], 0
+def require_plain(data: object, tensors: bool = False) -> list[Tensor]:
+    """Raise `NotPlain` unless ``data`` is made of `None`, flags, numbers and words in lists, tuples and dicts, and, where
+    ``tensors`` are allowed, of tensors, which are returned; or where there are too many of them (one that stands in several
+    places counts each time), one lies too deep inside others, or a number is too long."""
+    found, waiting, count = [], [(data, 0)], 0
     while waiting:
         value, depth = waiting.pop()
         count += 1
@@ -97,31 +95,31 @@ def require_plain(data: object, tensors: bool = False) -> None:
         elif isinstance(value, int):
             if value.bit_length() > MOST_BITS:
                 raise NotPlain(f"it holds a whole number of {value.bit_length():,} bits")
-        elif not (value is None or isinstance(value, float | str) or (tensors and isinstance(value, Tensor))):
+        elif tensors and isinstance(value, Tensor):
+            found.append(value)
+        elif not (value is None or isinstance(value, float | str)):
             raise NotPlain(f"it holds a {type(value).__name__}, which is no word, number, list or group")
+    return found
 
 
-def looked_up(data: dict) -> dict:
-    """``data`` with each value `${a.b}` replaced by the word or number at a.b; any other `${` raises `NotPlain`.
+def value_at(data: object, field: str) -> Any:
+    """The value at the dotted ``field``, a.b, of nested ``data``; `None` where there is none."""
+    for key in field.split("."):
+        data = data.get(key) if isinstance(data, dict) else None
+    return data
 
-    A stranger's file is not given to OmegaConf: its interpolations may call functions, and unfold to any length.
-    """
-    return _replaced(data, data)
 
-
-def _replaced(value: object, data: dict):
+def looked_up(value: Any, data: dict | None = None) -> Any:
+    """``value``, the whole of a file or a part of its ``data``, in which what stands at a.b takes the place of each `${a.b}`,
+    where that is a word or a number; raises `NotPlain` for any other `${`. (OmegaConf's may call functions.)"""
+    data = value if data is None else data
     if isinstance(value, dict):
-        return {_literal(key): _replaced(one, data) for key, one in value.items()}
+        return {_literal(key): looked_up(one, data) for key, one in value.items()}
     if isinstance(value, list):
-        return [_replaced(one, data) for one in value]
+        return [looked_up(one, data) for one in value]
     for _ in range(MOST_STEPS):
         reference = REFERENCE.fullmatch(value) if isinstance(value, str) else None
-        if reference is None:
-            break
-        found: object = data
-        for key in reference[1].split("."):
-            found = found.get(key) if isinstance(found, dict) else None
-        if isinstance(found, dict | list):
+        if reference is None or isinstance(found := value_at(data, reference[1]), dict | list):
             break
         value = found
     return _literal(value)

@@ -1,18 +1,13 @@
-"""The door through which files come in, and the one through which a run's folder is written: ordinary files alone.
-
-Files may come from strangers. Whatever they hold, reading ends, in little memory, with plain data or an `InputError`.
-"""
-
-from __future__ import annotations
+"""Reading ordinary files, whatever a stranger put there, in little memory; and checking that a run writes to such alone."""
 
 import errno
 import os
 import stat
-import zipfile
 from collections.abc import Iterable
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
+from zipfile import ZipFile
 
 from ocp_torch.errors import InputError
 from ocp_torch.files.plain import NotPlain, json_object, looked_up, yaml_mapping
@@ -22,17 +17,15 @@ FILE, FOLDER, OTHER = "file", "folder", "other"
 LARGEST_FILE = 2**31
 # More bytes of text than any certificate, controller or configuration has.
 LARGEST_JSON, LARGEST_YAML = 2**26, 2**20
-# Of an archive what is read at once at most: its list of parts has 50 bytes and more for each.
+# Bytes of a ZIP archive that are read at once, at most; its list of parts, which is read at once, has 50 or more for each.
 LARGEST_PIECE = 2**20
 # What a run writes in its folder.
 WRITTEN = (".hydra", "checkpoints", "figures", "*.log", "*.json", "*.safetensors", "events.*")
 
 
 def kind(path: str | Path) -> str | None:
-    """``FILE``, ``FOLDER`` or ``OTHER`` (a pipe, a device, a socket), links followed; `None` where there is nothing.
-
-    Raises `InputError` for a path that cannot be looked at: too long, in a folder that may not be entered, in a circle.
-    """
+    """``FILE``, ``FOLDER`` or ``OTHER`` (a pipe, a device, a socket), links followed; `None` where there is nothing, and
+    `InputError` where nobody can say: the path is too long, in a folder that may not be entered, or a circle of links."""
     try:
         mode = os.stat(path).st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -82,25 +75,23 @@ def read_text(path: str | Path, most: int) -> str:
 
 
 def read_json(path: str | Path, most: int = LARGEST_JSON) -> dict:
-    """The JSON object in the file ``path``; `InputError`, naming the file, where there is none, or a crafted one."""
-    text = read_text(path, most)
+    """The JSON object in the file ``path``, of at most ``most`` bytes; `InputError`, with its name, otherwise."""
     try:
-        return json_object(text)
+        return json_object(read_text(path, most))
     except NotPlain as error:
         raise InputError(f"{path} is damaged: {error}.") from None
 
 
 def read_yaml(path: str | Path) -> dict:
-    """The YAML mapping in the file ``path`` with its references looked up; `InputError`, naming the file, otherwise."""
-    text = read_text(path, LARGEST_YAML)
+    """The YAML mapping in the file ``path``, its references looked up; `InputError`, with its name, otherwise."""
     try:
-        return looked_up(yaml_mapping(text))
+        return looked_up(yaml_mapping(read_text(path, LARGEST_YAML)))
     except NotPlain as error:
         raise InputError(f"{path} is damaged or not a run's configuration: {error}.") from None
 
 
 class _Frugal:
-    """An open file that is read in small pieces only."""
+    """An open file that refuses to have more than `LARGEST_PIECE` bytes read at once."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -113,18 +104,15 @@ class _Frugal:
         return data
 
 
-def zip_file(file: BinaryIO) -> zipfile.ZipFile:
-    """The ZIP archive in ``file``, whose list of parts is read at once; raises `ValueError` where that is too long."""
-    return zipfile.ZipFile(_Frugal(file))
+def zip_file(file: BinaryIO) -> ZipFile:
+    """The ZIP archive in ``file``; raises `ValueError` where its list of parts is too long to be read at once."""
+    return ZipFile(cast(BinaryIO, _Frugal(file)))
 
 
 def require_unlinked(folder: Path, names: Iterable[str] = WRITTEN) -> None:
-    """Raise `InputError` where an entry of ``folder`` that is about to be written, by the patterns ``names``, is a link, a
-    pipe or a device, or holds one.
-
-    A link would lead what is written somewhere else; a pipe would keep the run waiting. ``folder`` itself may be a link:
-    it is the user who named it.
-    """
+    """Raise `InputError` where anything in ``folder`` that the patterns ``names`` match, or below a folder that they match,
+    is a link, which would lead what is written somewhere else, a pipe, which would keep the run waiting, or a device.
+    ``folder`` itself may be a link: it is the user who named it."""
     entries = [entry for entry in _entries(str(folder)) if any(fnmatch(entry.name, name) for name in names)]
     while entries:
         entry = entries.pop()
@@ -132,14 +120,11 @@ def require_unlinked(folder: Path, names: Iterable[str] = WRITTEN) -> None:
         if stat.S_ISDIR(status.st_mode):
             entries += _entries(entry.path)
             continue
-        # Logs are continued in place; everything else is replaced as a whole.
+        # Logs are continued in place, also where the file has a second name; everything else is replaced as a whole.
         second = status.st_nlink > 1 and entry.name.endswith(".log")
-        if stat.S_ISLNK(status.st_mode) or second:
-            wrong = "a link to another file"
-        elif stat.S_ISREG(status.st_mode):
+        if stat.S_ISREG(status.st_mode) and not second:
             continue
-        else:
-            wrong = "a pipe or a device"
+        wrong = "a link to another file" if stat.S_ISLNK(status.st_mode) or second else "a pipe or a device"
         raise InputError(
             f"{entry.path} is {wrong}, and nothing is written into a folder that holds one; remove it, or copy the run."
         )

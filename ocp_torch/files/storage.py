@@ -1,6 +1,4 @@
-"""Files that survive: atomic writes, and one safetensors file with JSON metadata and a digest over everything in it."""
-
-from __future__ import annotations
+"""Files that survive a crash: written whole or not at all; and safetensors files with JSON metadata and a digest."""
 
 import contextlib
 import hashlib
@@ -22,24 +20,23 @@ from ocp_torch.files.plain import NotPlain, json_object
 from ocp_torch.files.reading import LARGEST_FILE, kind, opened
 
 METADATA_KEY, DIGEST_KEY = "ocp_torch", "sha256"
-# More than the header of any controller or recording has, in bytes, and more tensors than a network has.
+# Bytes of the header of a safetensors file, and tensors in it, at most: more than any controller or recording has.
 LARGEST_HEADER, MOST_TENSORS = 2**24, 2**14
 
 
 def write_atomically(path: Path, write: Callable[[Path], object], make_room: Callable[[], None] | None = None) -> None:
-    """Let ``write`` fill a temporary file beside ``path``, then put it in place in one step: old or new, never half.
+    """Let ``write`` fill a temporary file beside ``path``, then put it in the place of ``path`` in one step, for good.
 
-    ``make_room`` is called in between, once the new file is whole and on the disk. File and folder are on the disk when it
-    returns. Raises `StorageError` when there is no room or no permission.
+    ``make_room`` is called in between, once the new file is whole and on the disk. Raises `StorageError` when there is no
+    room or no permission; what was there before is then untouched.
     """
-    temporary: Path | None = None
+    temporary = None
     if os.path.lexists(path) and not path.is_file():
         raise StorageError(f"{path} is no file but a folder or a device, which nothing may replace.")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        os.close(handle)
-        temporary = Path(name)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+            temporary = Path(file.name)
         write(temporary)
         sync(temporary)
         temporary.chmod(0o644)
@@ -66,7 +63,7 @@ def sync(path: Path) -> None:
 
 
 def sweep_temporaries(folder: Path) -> None:
-    """Remove what a process that was killed in `write_atomically` left half-written in ``folder``."""
+    """Remove the temporary files in ``folder`` of processes that were killed in `write_atomically`."""
     for leftover in folder.glob(".*"):
         if re.fullmatch(r"\..+\.(pt|json|safetensors|yaml)\.[a-z0-9_]{8}", leftover.name):
             with contextlib.suppress(OSError):
@@ -93,7 +90,7 @@ def digest(tensors: dict[str, Tensor], metadata: str) -> str:
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict) -> None:
-    """Write ``tensors`` and JSON ``metadata`` to ``path`` atomically, with their digest."""
+    """Write ``tensors`` and ``metadata``, as JSON, to the safetensors file ``path``, with a digest of both."""
     text = json.dumps(finite(metadata), allow_nan=False)
     tensors = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
     header = {METADATA_KEY: text, DIGEST_KEY: digest(tensors, text)}
@@ -101,10 +98,7 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict) -> None
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict]:
-    """Read what `save_tensors` wrote; runs no code from the file.
-
-    Raises `InputError` when the file is missing, is not a safetensors file of ours, or does not match its digest.
-    """
+    """The tensors and the metadata that `save_tensors` wrote. Raises `InputError` for any other file or a damaged one."""
     if kind(path) is None:
         raise InputError(f"{path} does not exist; give the path of a controller.safetensors file.")
     tensors, header = read_safetensors(path)
@@ -119,8 +113,7 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict]:
 
 
 def read_safetensors(path: Path, most: int = LARGEST_FILE) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors and the header's words of a safetensors file of at most ``most`` bytes. Raises `InputError` where it is
-    none, or a crafted one."""
+    """The tensors and the header of a safetensors file of at most ``most`` bytes. Raises `InputError` for any other file."""
     with opened(path, most) as file:
         length = int.from_bytes(file.read(8), "little")
     if length > LARGEST_HEADER:
@@ -134,7 +127,5 @@ def read_safetensors(path: Path, most: int = LARGEST_FILE) -> tuple[dict[str, Te
     except InputError:
         raise
     except Exception as error:  # the library has no one type for damage
-        reason = " ".join(str(error).split()).rstrip(".")
-        raise InputError(
-            f"{path} is not a readable safetensors file ({reason}); it is damaged or of another kind."
-        ) from None
+        told = f"{path} is not a readable safetensors file ({' '.join(str(error).split()).rstrip('.')})"
+        raise InputError(f"{told}; it is damaged or of another kind.") from None

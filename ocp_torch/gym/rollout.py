@@ -1,10 +1,10 @@
-"""Episodes of a saved controller in a Gymnasium environment: played, printed and filmed."""
-
-from __future__ import annotations
+"""A saved controller as an agent in a Gymnasium environment, ours or anybody's: its episodes played, printed and filmed."""
 
 import logging
 import math
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from PIL import Image
 from ocp_torch.control.controller import Controller
 from ocp_torch.errors import InputError, require_integer
 from ocp_torch.files.storage import write_atomically
-from ocp_torch.gym.agent import Agent
 from ocp_torch.gym.environment import require_gymnasium
 from ocp_torch.runs.evaluate import load_run
 
@@ -24,6 +23,42 @@ log = logging.getLogger(__name__)
 MOST_FRAMES, MOST_STEPS = 600, 100_000
 
 
+class Agent:
+    """``controller`` in the environment ``env`` (its id is ``name``): observations to states, controls to actions.
+
+    An environment of ours says how itself; for any other the controller's problem does, by `Problem.from_observation` and
+    `Problem.to_action`. Raises `InputError` where neither does, or what they give does not fit.
+    """
+
+    def __init__(self, controller: Controller, env, name: str) -> None:
+        self.controller, self.name, self.space = controller, name, env.action_space
+        own = env.unwrapped
+        if hasattr(own, "from_observation"):
+            if own.problem.dim != controller.problem.dim or own.problem.control_dim != controller.problem.control_dim:
+                raise InputError(
+                    f"{name} has d = {own.problem.dim}, m = {own.problem.control_dim}, but the controller is for "
+                    f"d = {controller.problem.dim}, m = {controller.problem.control_dim}."
+                )
+            self._state, self._action = own.from_observation, own.to_action
+        else:
+            self._state = partial(controller.problem.from_observation, name)
+            self._action = partial(controller.problem.to_action, name)
+
+    def act(self, observation) -> np.ndarray:
+        """The action for ``observation``."""
+        d = self.controller.problem.dim
+        state = np.asarray(self._state(observation), dtype=np.float64)
+        if state.shape != (d,) or not np.isfinite(state).all():
+            raise InputError(f"from_observation gave {state} for {self.name}, but must give {d} finite coordinates.")
+        control = self.controller(state[None])[0]
+        action = np.asarray(self._action(control), dtype=self.space.dtype)
+        if action.shape != self.space.shape:
+            raise InputError(
+                f"to_action gave shape {action.shape} for {self.name}, whose actions have shape {self.space.shape}."
+            )
+        return np.clip(action, self.space.low, self.space.high) if hasattr(self.space, "low") else action
+
+
 @dataclass(frozen=True)
 class Rollouts:
     """Undiscounted ``returns`` and ``lengths`` per episode."""
@@ -31,66 +66,48 @@ class Rollouts:
     returns: np.ndarray
     lengths: np.ndarray
 
-    @property
-    def mean(self) -> float:
-        return float(self.returns.mean())
-
-    @property
-    def se(self) -> float:
-        """Standard error of the mean; 0 for one episode."""
-        count = len(self.returns)
-        return float(self.returns.std(ddof=1) / math.sqrt(count)) if count > 1 else 0.0
-
     def __str__(self) -> str:
-        low, high = self.returns.min(), self.returns.max()
+        low, high, count = self.returns.min(), self.returns.max(), len(self.returns)
+        se = self.returns.std(ddof=1) / math.sqrt(count) if count > 1 else 0.0
         return (
-            f"return {self.mean:.6g} ± {self.se:.2g} (standard error of {len(self.returns)} episodes), from {low:.6g} to "
+            f"return {self.returns.mean():.6g} ± {se:.2g} (standard error of {count} episodes), from {low:.6g} to "
             f"{high:.6g}; {self.lengths.mean():.1f} steps each"
         )
 
 
-@dataclass(frozen=True)
 class RolloutJob:
-    """What was asked for, checked."""
+    """What was asked for: a saved controller and an environment it can act in. Raises `InputError` for a wrong field."""
 
-    controller: Controller
-    env: str
-    episodes: int
-    seed: int
-    video: Path | None
+    def __init__(self, config: dict) -> None:
+        self.controller = load_run(config)
+        self.video = None if config["video"] is None else Path(str(config["video"]))
+        if self.video is not None and self.video.suffix != ".gif":
+            raise InputError(f"video is {str(self.video)!r}, but must be a file whose name ends in .gif.")
+        self.env = str(config["env"])
+        with closing(made(self.env)) as env:
+            Agent(self.controller, env, self.env).act(env.reset(seed=0)[0])
+        self.episodes = require_integer("episodes", config["episodes"], 1, maximum=10**6)
+        self.seed = require_integer("seed", config["seed"], 0)
 
     def run(self) -> Rollouts:
-        """Play, print, and draw."""
-        env = made(self.env, None)
-        try:
+        """Play and print; then film the first episode again, if asked to."""
+        with closing(made(self.env)) as env:
             found = play(self.controller, env, self.env, self.episodes, self.seed)
-        finally:
-            env.close()
         log.info("%s: %s", self.env, found)
         if self.video is not None:
-            self._film(self.video)
+            frames: list[np.ndarray] = []
+            with closing(made(self.env, render_mode="rgb_array")) as env:
+                play(self.controller, env, self.env, 1, self.seed, frames)
+                save_gif(self.video, frames, env.metadata.get("render_fps", 15))
+            log.info("%d frames in %s", len(frames), self.video)
         return found
 
-    def _film(self, video: Path) -> None:
-        """The first episode again, with pictures."""
-        env = made(self.env, "rgb_array")
-        frames: list[np.ndarray] = []
-        try:
-            play(self.controller, env, self.env, 1, self.seed, frames)
-            rate = env.metadata.get("render_fps", 15)
-        finally:
-            env.close()
-        save_gif(video, frames, rate)
-        log.info("%d frames in %s", len(frames), video)
 
-
-def made(name: str, render_mode: str | None):
+def made(name: str, **options):
     """The environment ``name``. Raises `InputError` where Gymnasium has none, or cannot make it here."""
     gymnasium = require_gymnasium()
-    import ocp_torch.gym  # noqa: F401 (registers ours)
-
     try:
-        return gymnasium.make(name, **({} if render_mode is None else {"render_mode": render_mode}))
+        return gymnasium.make(name, **options)
     except InputError:
         raise
     except Exception as error:  # whatever a stranger's environment may raise
@@ -131,19 +148,3 @@ def save_gif(path: Path, frames: list[np.ndarray], rate: float) -> None:
     images = [Image.fromarray(frame) for frame in frames]
     options: dict[str, Any] = dict(save_all=True, append_images=images[1:], duration=round(1000.0 / rate), loop=0)
     write_atomically(path, lambda temporary: images[0].save(temporary, format="GIF", **options))
-
-
-def rollout_job(config: dict) -> RolloutJob:
-    """Check every field. Raises `InputError` for a wrong one."""
-    controller = load_run(config)
-    video = None if config["video"] is None else Path(str(config["video"]))
-    if video is not None and video.suffix != ".gif":
-        raise InputError(f"video is {str(video)!r}, but must be a file whose name ends in .gif.")
-    name = str(config["env"])
-    env = made(name, None)
-    try:
-        Agent(controller, env, name).act(env.reset(seed=0)[0])
-    finally:
-        env.close()
-    episodes = require_integer("episodes", config["episodes"], 1, maximum=10**6)
-    return RolloutJob(controller, name, episodes, require_integer("seed", config["seed"], 0), video)

@@ -5,8 +5,6 @@ one reverse pass for each output: forward mode would take one for each direction
 at several times the cost. Everything here is differentiable again with respect to the field's parameters.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -27,12 +25,12 @@ class Jet:
     value: Any
     gradient: Any
 
-    def map(self, function: Callable[[Any], Any]) -> Jet:
+    def map(self, function: Callable[[Any], Any]) -> "Jet":
         """``function`` of each part, for what acts on all alike: a choice of states, a multiple, the field as mere data."""
         return Jet(function(self.value), function(self.gradient))
 
     @staticmethod
-    def concatenate(jets: list[Jet]) -> Jet:
+    def concatenate(jets: "list[Jet]") -> "Jet":
         """The jets of one field at several batches of states as one."""
         return Jet(torch.cat([j.value for j in jets]), torch.cat([j.gradient for j in jets]))
 

@@ -4,8 +4,6 @@ Its points are randomised quasi-Monte Carlo points, each with one over the densi
 estimate integrals over the torus without bias whatever the density (defensive mixtures: Owen and Zhou, 2000).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -34,7 +32,7 @@ class Mixture:
     widths: Tensor  # (K, d) standard deviations
 
     @classmethod
-    def uniform(cls, dim: int) -> Mixture:
+    def uniform(cls, dim: int) -> "Mixture":
         none = torch.zeros(0, dim, dtype=torch.float64)
         return cls(none[:, 0], none, none)
 
@@ -46,12 +44,12 @@ class Mixture:
     def is_uniform(self) -> bool:
         return len(self.shares) == 0
 
-    def scaled(self, part: float) -> Mixture:
+    def scaled(self, part: float) -> "Mixture":
         """With ``part`` of the whole in the components, and the rest uniform."""
         return self if self.is_uniform else Mixture(part * self.shares / self.shares.sum(), self.centres, self.widths)
 
     @staticmethod
-    def join(mixtures: list[Mixture]) -> Mixture:
+    def join(mixtures: "list[Mixture]") -> "Mixture":
         """The components of all, with the shares they have."""
         return Mixture(*(torch.cat([getattr(m, k) for m in mixtures]) for k in ("shares", "centres", "widths")))
 

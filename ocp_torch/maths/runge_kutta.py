@@ -4,8 +4,6 @@ Steps are equal along a trajectory and the error is controlled by halving them (
 libraries choose one step for a whole batch, so that a single trajectory at a jump of its controller stalls the rest.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -3,8 +3,6 @@
 Points are always made on the CPU, so that the same seed gives the same states on every device.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -4,8 +4,6 @@
 of one kind changes no other, and no set of states is used twice without that being meant.
 """
 
-from __future__ import annotations
-
 from enum import IntEnum, unique
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sums of tensors: to a type checker `sum` of a list may be the integer 0."""
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Iterable
 from functools import reduce

@@ -1,7 +1,5 @@
 """Suprema over the torus: sampled, then climbed by local ascent from the worst points."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

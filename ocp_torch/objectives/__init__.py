@@ -3,8 +3,7 @@
 from collections.abc import Callable
 
 from ocp_torch.objectives.dual import Dual
-from ocp_torch.objectives.objective import Objective
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.objectives.objective import Objective, Phase
 from ocp_torch.objectives.primal import primal
 from ocp_torch.objectives.saddle import saddle
 

@@ -1,14 +1,11 @@
 r"""The dual with an exact penalty, D(M) (section 4.1 of the paper), and the bound without `M` where no `M` will do."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from ocp_torch.errors import require_number
 from ocp_torch.fields.fields import VALUE, Fields
 from ocp_torch.maths import jets
-from ocp_torch.objectives.objective import Objective
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.objectives.objective import Objective, Phase
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 

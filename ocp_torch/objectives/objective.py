@@ -1,9 +1,8 @@
 """What every method has in common: which fields it trains, who moves them, and one loss per player."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -11,13 +10,24 @@ from torch import Tensor
 from ocp_torch.fields.fields import Fields
 from ocp_torch.maths import jets
 from ocp_torch.maths.jets import Field
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
 # How a method turns its fields into mu: Lemma 2, Lemma 3, or a network for log mu.
 CLOSED, SADDLE, NETWORK = "closed", "saddle", "network"
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Made by whoever trains, at each step, and passed on to losses: an objective has neither a clock nor a state.
+
+    ``constants`` are `M`, `C_V` and `C_u` in force; ``progress`` is the part of the present round that is done, in [0, 1].
+    """
+
+    constants: Constants
+    progress: float = 1.0
 
 
 class Objective(ABC):

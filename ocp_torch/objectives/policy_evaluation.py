@@ -1,14 +1,11 @@
 r"""Policy evaluation by least squares: `V^u` and `mu^u` of a closed loop, two linear equations with smooth losses."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
 from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
 from ocp_torch.maths import jets
-from ocp_torch.objectives.objective import Objective
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.objectives.objective import Objective, Phase
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.samples import Samples
 

@@ -1,13 +1,10 @@
 r"""The primal with an exact penalty, P-P (section 5 of the paper)."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from ocp_torch.errors import InputError, require_choice
 from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, Fields
-from ocp_torch.objectives.objective import CLOSED, NETWORK, Objective
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.objectives.objective import CLOSED, NETWORK, Objective, Phase
 from ocp_torch.objectives.saddle import Saddle
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples

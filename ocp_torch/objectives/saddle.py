@@ -3,16 +3,13 @@ r"""The primal-dual saddle, PD (section 6 of the paper), as it stands there and 
 `L(V; w, mu) = E[V mu0 + l]` with `l = (f + R(w/mu)) mu - V mu + grad V . (a mu + B w) / rho` is its Lagrangian.
 """
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fields
 from ocp_torch.maths import jets
 from ocp_torch.objectives.dual import value_loss
-from ocp_torch.objectives.objective import NETWORK, SADDLE, Objective
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.objectives.objective import NETWORK, SADDLE, Objective, Phase
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 

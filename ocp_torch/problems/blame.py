@@ -1,7 +1,5 @@
 """Whose fault an exception is: what came out of a user's own code becomes one sentence with the place and the state."""
 
-from __future__ import annotations
-
 import sys
 import sysconfig
 import traceback
@@ -26,8 +24,8 @@ MOST_SHOWN, LONGEST = 8, 300
 
 
 def blamed(error: BaseException, of: type | None = None) -> ProblemError | None:
-    """The sentence on an ``error`` that came out of a user's code, or `None` for one that did not; ``of`` is the class of the
-    problem at hand, whose file is a user's wherever it lies."""
+    """The sentence on an ``error`` that came out of a user's code, else `None`; ``of`` is the class of the problem at hand,
+    whose file is a user's wherever it lies."""
     if isinstance(error, InputError):
         return error if isinstance(error, ProblemError) else None
     frames = _frames(error, of)
@@ -94,13 +92,12 @@ def failing_state(function: Callable[[Tensor], object], x: Tensor) -> Tensor | N
             return True
         return False
 
-    every = x
-    while len(x) > 1:
-        half = x[: len(x) // 2]
-        x = half if raises(half) else x[len(x) // 2 :]
-    if not raises(x) or (len(every) > 1 and raises(every[-1:] if torch.equal(x, every[:1]) else every[:1])):
-        return None
-    return x[0]
+    one = x
+    while len(one) > 1:
+        half, rest = one[: len(one) // 2], one[len(one) // 2 :]
+        one = half if raises(half) else rest
+    other = x[-1:] if torch.equal(one, x[:1]) else x[:1]
+    return one[0] if raises(one) and not (len(x) > 1 and raises(other)) else None
 
 
 def _at(frame: FrameType, owner: object) -> str:
@@ -112,25 +109,21 @@ def _at(frame: FrameType, owner: object) -> str:
         return ""
     try:
         state = failing_state(function, x.detach()) if x.ndim == 2 else None
-        return "" if state is None else f" at {place(state)}"
     except Exception:  # a tensor of a transform that is over
         return ""
+    return "" if state is None else f" at {place(state)}"
 
 
 def _is_users(file: str, of: type | None) -> bool:
     if file.startswith("<frozen"):
         return False
-    path = str(Path(file).resolve()) if not file.startswith("<") else file
-    if not any(path.startswith(library) for library in LIBRARIES):
+    path = file if file.startswith("<") else str(Path(file).resolve())
+    if not path.startswith(LIBRARIES):
         return True
-    return path in _files(of)
-
-
-def _files(of: type | None) -> set[str]:
-    """Where the classes that ``of`` is made of are written."""
+    # Where the classes that ``of`` is made of are written.
     modules = [sys.modules.get(c.__module__) for c in (of.__mro__ if of is not None else ())]
-    files = {str(Path(file).resolve()) for file in (getattr(m, "__file__", None) for m in modules) if file}
-    return {file for file in files if not file.startswith(str(PACKAGE))}
+    own = {str(Path(f).resolve()) for f in (getattr(m, "__file__", None) for m in modules) if f}
+    return path in own and not path.startswith(str(PACKAGE))
 
 
 def _short(file: str) -> str:

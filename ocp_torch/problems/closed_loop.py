@@ -1,7 +1,5 @@
 """A problem whose controller is fixed: an uncontrolled system, on which policy evaluation is the same mathematics."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from torch import Tensor

@@ -1,11 +1,14 @@
-"""What a user is told to type: values as Hydra reads them back, and the arguments that name a problem again."""
-
-from __future__ import annotations
+"""How problems are named: in what a user is told to type, and by the files of earlier versions."""
 
 import re
+from typing import Any
 
+from ocp_torch import problems
 from ocp_torch.errors import InputError
 
+PACKAGE = "ocp_torch.problems"
+# Class in an earlier version -> class now.
+RENAMED = {"Callable": "Simulator"}
 # What Hydra takes for a word as it stands.
 PLAIN = re.compile(r"(?!(?:null|true|false|nan|inf)$)[A-Za-z_/][\w./:@-]*", re.IGNORECASE)
 TARGET = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")
@@ -23,8 +26,7 @@ class ForeignProblem(InputError):
 
 def quoted(value: object) -> str:
     """A value as Hydra reads it back, whatever signs it holds."""
-    text = str(value).replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{text}'"
+    return "'" + str(value).replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def as_typed(value: object) -> str:
@@ -44,14 +46,41 @@ def as_typed(value: object) -> str:
 def naming(section: dict, mark: str = "+") -> list[str]:
     """The overrides that make the problem of ``section``, a run's own, again."""
     target = str(section.get("_target_"))
-    own = {name: value for name, value in section.items() if name != "_target_" and str(name).isidentifier()}
     named = target if TARGET.fullmatch(target) else UNKNOWN
-    return [f"{mark}problem._target_={named}", *(f"{mark}problem.{k}={as_typed(v)}" for k, v in own.items())]
+    own = [f"{mark}problem.{name}={as_typed(value)}" for name, value in _arguments(section).items()]
+    return [f"{mark}problem._target_={named}", *own]
 
 
 def made_by(section: dict) -> str:
     """The same as Python: ``Pendula(coupling=0.2)``."""
     name = str(section.get("_target_")).rpartition(".")[2]
-    own = {k: v for k, v in section.items() if k != "_target_" and str(k).isidentifier()}
-    arguments = ", ".join(f"{k}={v!r}" for k, v in own.items())
+    arguments = ", ".join(f"{k}={v!r}" for k, v in _arguments(section).items())
     return f"{name if name.isidentifier() and name != 'None' else 'MyProblem'}({arguments})"
+
+
+def _arguments(section: dict) -> dict:
+    return {name: value for name, value in section.items() if name != "_target_" and str(name).isidentifier()}
+
+
+def current_target(target: Any) -> Any:
+    """The class that ``target``, of a configuration of any version, names now: classes of the package have had other names
+    and lain in other modules of it. Anything else comes back as it is."""
+    package, _, name = str(target).rpartition(".")
+    now = RENAMED.get(name, name)
+    ours = package == PACKAGE or package.startswith(f"{PACKAGE}.")
+    return f"{PACKAGE}.{now}" if ours and now in problems.__all__ else target
+
+
+def current_section(section: Any) -> Any:
+    """``section``, the problem of a configuration, with its `current_target`; as it is where it names none."""
+    if not isinstance(section, dict) or "_target_" not in section:
+        return section
+    return {**section, "_target_": current_target(section["_target_"])}
+
+
+def current_name(name: object, section: object) -> object:
+    """The name by which the problem of ``section``, saved under ``name``, goes now."""
+    target = str(section.get("_target_")) if isinstance(section, dict) else ""
+    cls = target.rpartition(".")[2]
+    renamed = cls in RENAMED and current_target(target) != target
+    return RENAMED[cls].lower() if renamed and name == cls.lower() else name

@@ -1,7 +1,5 @@
 """The three constants the bounds rest on, `M`, `C_V` and `C_u`, and where each came from."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -43,6 +41,10 @@ class Constants:
     warnings: tuple[str, ...] = ()
     unbounded: bool = False
 
+    def __post_init__(self) -> None:
+        for name in ("M", "C_V", "C_u"):
+            require_number(name, getattr(self, name), above=0.0)
+
     @property
     def needs_no_M(self) -> bool:
         """Whether the bound without `M` has to carry the lower side: no `M` is large enough, or nobody gave one."""
@@ -53,10 +55,6 @@ class Constants:
         if self.sources[name] != ESTIMATED:
             return GIVEN
         return GUESSED if name == "M" else SEARCHED
-
-    def __post_init__(self) -> None:
-        for name in ("M", "C_V", "C_u"):
-            require_number(name, getattr(self, name), above=0.0)
 
 
 def resolve_constants(
@@ -74,44 +72,39 @@ def resolve_constants(
     chosen: dict[str, float] = {}
     sources: dict[str, str] = {}
     notes: list[str] = []
-    configured = {"M": occupation_bound, "C_V": value_bound, "C_u": control_bound}
-    known = {"M": problem.occupation_bound, "C_V": problem.value_bound, "C_u": problem.control_bound}
-    fields = {"M": "method.occupation_bound", "C_V": "method.value_bound", "C_u": "method.control_bound"}
-    for name in ("C_V", "C_u", "M"):
-        if configured[name] is not None:
-            chosen[name] = require_number(fields[name], configured[name], above=0.0)
-            sources[name] = FROM_CONFIGURATION
-        elif (declared := known[name]) is not None and math.isfinite(declared):
+    limit, declared_control = problem.control_limit, problem.control_bound
+    if declared_control is None or not math.isfinite(declared_control):
+        declared_control = limit
+    for name, field, configured, declared, estimate in (
+        ("C_V", "method.value_bound", value_bound, problem.value_bound, _estimate_value_bound),
+        ("C_u", "method.control_bound", control_bound, declared_control, _estimate_control_bound),
+        ("M", "method.occupation_bound", occupation_bound, problem.occupation_bound, _estimate_occupation_bound),
+    ):
+        if configured is not None:
+            chosen[name], sources[name] = require_number(field, configured, above=0.0), FROM_CONFIGURATION
+        elif declared is not None and math.isfinite(declared):
             # J bounds the cost of a controller that is not quite optimal only if C_V leaves it room above V*.
             room = MARGIN if name == "C_V" else 1.0
             chosen[name], sources[name] = room * float(declared), FROM_PROBLEM
         else:
-            if name == "C_u" and problem.control_limit is not None:
-                chosen[name], sources[name] = problem.control_limit, FROM_PROBLEM
-                continue
-            chosen[name], why = _ESTIMATES[name](problem)
-            sources[name] = ESTIMATED
-            notes.append(f"{name} is not known: {chosen[name]:.4g} is {why}; {fields[name]} sets it.")
-    if problem.control_limit is not None:
-        chosen["C_u"] = min(chosen["C_u"], problem.control_limit)
-    if sources["M"] == FROM_CONFIGURATION and problem.occupation_bound is not None:
-        if chosen["M"] < problem.occupation_bound:
-            true = f"{problem.occupation_bound:.4g}" if math.isfinite(problem.occupation_bound) else "infinite"
-            notes.append(
-                f"method.occupation_bound = {chosen['M']:.4g} is below this problem's sup mu*, which is {true}."
-            )
-    return Constants(
-        **chosen, sources=sources, warnings=tuple(notes), unbounded=is_unbounded(problem, occupation_bound)
-    )
+            (chosen[name], why), sources[name] = estimate(problem), ESTIMATED
+            notes.append(f"{name} is not known: {chosen[name]:.4g} is {why}; {field} sets it.")
+    if limit is not None:
+        chosen["C_u"] = min(chosen["C_u"], limit)
+    true = problem.occupation_bound
+    if sources["M"] == FROM_CONFIGURATION and true is not None and chosen["M"] < true:
+        shown = f"{true:.4g}" if math.isfinite(true) else "infinite"
+        notes.append(f"method.occupation_bound = {chosen['M']:.4g} is below this problem's sup mu*, which is {shown}.")
+    unbounded = is_unbounded(problem, occupation_bound)
+    return Constants(**chosen, sources=sources, warnings=tuple(notes), unbounded=unbounded)
 
 
 def is_unbounded(problem: Problem, occupation_bound: float | None = None) -> bool:
     """Whether no `M` is known to be large enough: `mu*` has no bound, or neither problem nor user (``occupation_bound``)
     gives one. A data set has no bound without `M` to aim at instead."""
-    known = problem.occupation_bound
-    if known is None:
+    if problem.occupation_bound is None:
         return occupation_bound is None and problem.has_simulator
-    return math.isinf(known)
+    return math.isinf(problem.occupation_bound)
 
 
 def state_cost_supremum(problem: Problem) -> float:
@@ -138,8 +131,8 @@ def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
     if problem.driftless:
         return total ** (1.0 / q), "Proposition 2 of the paper with a sampled sup f"
     B, a = problem.probe(PROBED_MATRICES, 1, "B", "a")
-    alpha = torch.linalg.pinv(B) @ a.unsqueeze(-1)
-    largest = float(alpha.squeeze(-1).norm(dim=-1).max())
+    alpha = (torch.linalg.pinv(B) @ a.unsqueeze(-1)).squeeze(-1)
+    largest = float(alpha.norm(dim=-1).max())
     return (total + 2.0**q * (conjugate - 1.0) * largest) ** (1.0 / q), "Proposition 2 with a least-squares alpha"
 
 
@@ -149,6 +142,3 @@ def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:
     if problem.has_simulator and starts_narrowly(problem):
         mu0 = problem.initial_density(drawn_starts(problem, PROBED_STARTS, 1))
     return guess * float(mu0.max()), f"a guess to train with, {guess:g} times sup mu0"
-
-
-_ESTIMATES = {"M": _estimate_occupation_bound, "C_V": _estimate_value_bound, "C_u": _estimate_control_bound}

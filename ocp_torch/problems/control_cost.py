@@ -5,8 +5,6 @@ Nobody else in the package branches on the form of `R`: another cost, a control 
 with the same methods.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -5,8 +5,6 @@ The paper's Corollary 1 allows any compact control set. What changes against `Po
 pointwise minimisers over `mu` are clipped from below there (the functions they minimise are convex in `mu`).
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -4,8 +4,6 @@ Every loss and every bound is a mean or a supremum of two constraint violations:
 equation for `V`, and the residual of Liouville's equation, the adjoint one, for `(w, mu)`. They are written here, once.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,7 +47,7 @@ class Generator:
     cost: PowerCost | Any = None
 
     @classmethod
-    def of(cls, problem: Problem, samples: Samples) -> Generator:
+    def of(cls, problem: Problem, samples: Samples) -> "Generator":
         """That of ``problem`` at ``samples`` of it."""
         return cls(samples, problem.discount, problem.control_cost)
 

@@ -1,7 +1,5 @@
 """What a bound rests on, and where each of those things comes from: only what is not guessed makes a bound count."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 # The problem declares it or the user sets it; a theorem or interval arithmetic shows it; the largest value that a search of

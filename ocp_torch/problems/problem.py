@@ -3,7 +3,7 @@ r"""A discounted control-affine problem on the unit torus, known through evaluat
 minimise  rho E_{x0 ~ mu0} int_0^inf e^{-rho t} (f(x_t) + |u_t|^q / q) dt,   dx/dt = a(x) + B(x) u
 """
 
-from __future__ import annotations
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from ocp_torch.maths import jets
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.control_limit import control_cost
-from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.reproducible import Reproducible
 from ocp_torch.problems.samples import Samples
 
@@ -27,6 +26,19 @@ MARGIN = 1.05
 # States scanned for narrow features of a user's own data, for each at which a bound is evaluated: more find narrower ones,
 # and take longer.
 SCAN_FACTOR = 32
+
+
+@dataclass(frozen=True)
+class Lipschitz:
+    """`|g(x) - g(y)| <= L |x - y|`, Euclidean in torus units, for each entry `g` of the data; `None` where `L` is unknown.
+
+    A method that is not overridden needs none.
+    """
+
+    state_cost: float | None = None
+    drift: float | None = None
+    control_matrix: float | None = None
+    initial_density: float | None = None
 
 
 class Problem(Reproducible):
@@ -59,14 +71,10 @@ class Problem(Reproducible):
         control_limit: float | None = None,
     ) -> None:
         self.dim = require_integer("problem.dim", dim, 1, maximum=MOST_COORDINATES)
-        self.control_dim = (
-            self.dim
-            if control_dim is None
-            else require_integer("problem.control_dim", control_dim, 1, maximum=MOST_COORDINATES)
-        )
-        self.discount = require_number(
-            "problem.discount", discount, above=0.0, at_least=LEAST_DISCOUNT, at_most=LARGEST_DISCOUNT
-        )
+        controls = self.dim if control_dim is None else control_dim
+        self.control_dim = require_integer("problem.control_dim", controls, 1, maximum=MOST_COORDINATES)
+        within = dict(at_least=LEAST_DISCOUNT, at_most=LARGEST_DISCOUNT)
+        self.discount = require_number("problem.discount", discount, above=0.0, **within)
         self.exponent = require_number("problem.exponent", exponent, above=1.0, at_most=2.0)
         self.control_cost = control_cost(self.exponent, control_limit)
         self.control_limit = None if control_limit is None else float(control_limit)
@@ -160,7 +168,7 @@ class Problem(Reproducible):
         return Samples.of(self, x, divergences=False)
 
     @property
-    def validation_view(self) -> Problem:
+    def validation_view(self) -> "Problem":
         """The problem as evaluations during training see it, by which choices are made: itself, where fresh states cost
         nothing; a data set gives other samples than the certificate's."""
         return self
@@ -173,15 +181,15 @@ class Problem(Reproducible):
     def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
         """The state ``(d,)`` that an observation of the Gymnasium environment ``env`` shows. Override it, with `to_action`,
         for the environments the problem is a model of; ours need neither."""
-        raise InputError(
-            f"{type(self).__name__} does not know the environment {env}: it must define from_observation and to_action."
-        )
+        raise self._unknown(env)
 
     def to_action(self, env: str, control: np.ndarray) -> np.ndarray:
         """The action of ``env`` that applies ``control`` ``(m,)``."""
-        raise InputError(
-            f"{type(self).__name__} does not know the environment {env}: it must define from_observation and to_action."
-        )
+        raise self._unknown(env)
+
+    def _unknown(self, env: str) -> InputError:
+        must = "it must define from_observation and to_action"
+        return InputError(f"{type(self).__name__} does not know the environment {env}: {must}.")
 
     def _like(self, x: Tensor, name: str, constant: Tensor) -> Tensor:
         """``constant`` in the precision and on the device of ``x``, converted once."""

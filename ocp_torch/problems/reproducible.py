@@ -1,7 +1,5 @@
 """An object that can be made again: what a checkpoint or a saved controller keeps of a problem."""
 
-from __future__ import annotations
-
 import inspect
 
 
@@ -10,7 +8,7 @@ class Reproducible:
 
     _given: tuple[tuple, dict]  # what `__init__` was called with
 
-    def __new__(cls, *args, **kwargs) -> Reproducible:
+    def __new__(cls, *args, **kwargs) -> "Reproducible":
         made = super().__new__(cls)
         made._given = args, kwargs
         return made
@@ -19,12 +17,11 @@ class Reproducible:
     def parameters(self) -> dict:
         """The arguments that make this object again: each `__init__` argument is read from the attribute of its name, or,
         where there is none, is what was given."""
-        args, kwargs = self._given
-        signature = inspect.signature(type(self).__init__)
+        signature, (args, kwargs) = inspect.signature(type(self).__init__), self._given
         bound = signature.bind(self, *args, **kwargs)
         bound.apply_defaults()
         found = dict(list(bound.arguments.items())[1:])
-        for name, parameter in signature.parameters.items():
-            if parameter.kind is parameter.VAR_KEYWORD:
-                found |= found.pop(name)
-        return {name: getattr(self, name, value) for name, value in found.items()}
+        for name in (n for n, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD):
+            found |= found.pop(name)
+        kept = {name: getattr(self, name, value) for name, value in found.items()}
+        return {name: found[name] if inspect.ismethod(value) else value for name, value in kept.items()}

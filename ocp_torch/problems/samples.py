@@ -1,7 +1,5 @@
 """What the learner may see of a problem: evaluations at a batch of states, and nothing that could be differentiated."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
@@ -36,7 +34,7 @@ class Samples:
 
     @classmethod
     @torch.no_grad()
-    def of(cls, problem: Problem, x: Tensor, divergences: bool = True, weight: Tensor | None = None) -> Samples:
+    def of(cls, problem: "Problem", x: Tensor, divergences: bool = True, weight: Tensor | None = None) -> "Samples":
         """Evaluate ``problem`` at the states ``x`` of shape ``(N, d)``."""
         return cls(
             x=x,
@@ -66,34 +64,34 @@ class Samples:
             raise InputError(f"{who} needs the divergences of a and B, which this problem does not give.")
         return self.div_a, self.div_B
 
-    def take(self, index: Tensor | slice) -> Samples:
+    def take(self, index: Tensor | slice) -> "Samples":
         """The samples at the rows ``index``."""
         return self._map(lambda column: column[index])
 
-    def take_weighted(self, most: int | None = None) -> tuple[Samples, Tensor]:
+    def take_weighted(self, most: int | None = None) -> "tuple[Samples, Tensor]":
         """Those that carry weight, the first ``most`` of them, and their rows; `mean` estimates the same integrals."""
         rows = self.weight.nonzero().squeeze(-1)
         part = len(rows) / len(self)
         chosen = self.take(rows[:most])
         return replace(chosen, weight=part * chosen.weight, penalty_weight=None), rows[:most]
 
-    def to(self, like: Tensor) -> Samples:
+    def to(self, like: Tensor) -> "Samples":
         """The samples in the precision and on the device of ``like``."""
         return self._map(lambda column: column.to(like))
 
-    def split(self, chunk: int) -> list[Samples]:
+    def split(self, chunk: int) -> "list[Samples]":
         """The samples in pieces of at most ``chunk`` states."""
         rows = torch.arange(len(self), device=self.x.device).split(chunk)
         return [self.take(slice(int(part[0]), int(part[-1]) + 1)) for part in rows]
 
     @staticmethod
-    def concatenate(pieces: list[Samples]) -> Samples:
+    def concatenate(pieces: "list[Samples]") -> "Samples":
         """All ``pieces`` as one batch."""
         columns: dict[str, Any] = {f.name: [getattr(p, f.name) for p in pieces] for f in fields(Samples)}
         columns |= {name: None if parts[0] is None else torch.cat(parts) for name, parts in columns.items()}
         return Samples(**columns)
 
-    def _map(self, change: Callable[[Tensor], Tensor]) -> Samples:
+    def _map(self, change: Callable[[Tensor], Tensor]) -> "Samples":
         """With each column there is ``change``d."""
         columns: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         columns |= {name: change(column) for name, column in columns.items() if column is not None}

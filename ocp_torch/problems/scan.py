@@ -6,8 +6,6 @@ with 95 % probability. Kept are the states where a column of the data is smalles
 there downhill and uphill, and the states where a column differs most from its value nearby.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
@@ -25,36 +23,30 @@ NEARBY = 0.02
 STEPS = 60
 
 
+@torch.no_grad()
 def odd_states(problem: Problem, count: int, seed: int) -> Tensor:
     """States ``(K, d)`` in float64 at which the data of ``problem`` are odd, found among ``count`` uniform ones; found once
     for a problem, so that evaluations during training cost no more."""
     kept = vars(problem).setdefault("_odd_states", {})
-    if (count, seed) not in kept:
-        kept[count, seed] = _odd_states(problem, count, seed)
-    return kept[count, seed]
-
-
-@torch.no_grad()
-def _odd_states(problem: Problem, count: int, seed: int) -> Tensor:
-    pairs = count // 2
+    if (count, seed) in kept:
+        return kept[count, seed]
     generator = torch.Generator().manual_seed(derive_seed(seed, Branch.SCAN))
     draw = lambda size: torch.rand(size, problem.dim, generator=generator, dtype=torch.float64)
-    found: dict[str, tuple[Tensor, Tensor]] = {}
-    for start in range(0, pairs, CHUNK):
-        x = draw(min(CHUNK, pairs - start))
+    low, high, steps = None, None, None
+    for start in range(0, count // 2, CHUNK):
+        x = draw(min(CHUNK, count // 2 - start))
         away = torch.nn.functional.normalize(draw(len(x)) - 0.5)
         near = (x + NEARBY * away).remainder(1.0)
         here, there = _columns(problem, x), _columns(problem, near)
-        alone, together = torch.cat([x, near]), torch.cat([x, near], dim=1)
-        values = torch.cat([here, there])
-        found["low"] = _highest(found.get("low"), -values, alone)
-        found["high"] = _highest(found.get("high"), values, alone)
-        found["step"] = _highest(found.get("step"), (here - there).abs(), together)
-    reached = [
-        _extremes(problem, found[name][1], sign) for name, sign in (("low", -1.0), ("high", 1.0)) if name in found
-    ]
-    kept = [states.reshape(-1, problem.dim) for _, states in found.values()]
-    return torch.cat([draw(0), *kept, *reached]).unique(dim=0)
+        values, alone = torch.cat([here, there]), torch.cat([x, near])
+        low, high = _highest(low, -values, alone), _highest(high, values, alone)
+        steps = _highest(steps, (here - there).abs(), torch.cat([x, near], dim=1))
+    found = [draw(0)]
+    if low and high and steps:
+        found += [states.reshape(-1, problem.dim) for _, states in (low, high, steps)]
+        found += [_extremes(problem, low[1], -1.0), _extremes(problem, high[1], 1.0)]
+    kept[count, seed] = torch.cat(found).unique(dim=0)
+    return kept[count, seed]
 
 
 def _extremes(problem: Problem, states: Tensor, sign: float) -> Tensor:

@@ -4,8 +4,6 @@ Every point carries a weight, so that means estimate the same integrals whatever
 uniform state carries its mass, and none of a few.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import torch
@@ -42,9 +40,9 @@ def start_distribution(problem: Problem) -> Mixture:
 
 def evaluation_distribution(problem: Problem) -> Mixture:
     """The density states are drawn from at which bounds are evaluated; uniform where neither `mu0` nor `f` is narrow."""
-    distributions = [d for d in _fits(problem) if not d.is_uniform]
-    part = (1.0 - UNIFORM_STATES) / max(1, len(distributions))
-    return Mixture.uniform(problem.dim) if not distributions else Mixture.join([d.scaled(part) for d in distributions])
+    narrow = [d for d in _fits(problem) if not d.is_uniform]
+    parts = [d.scaled((1.0 - UNIFORM_STATES) / len(narrow)) for d in narrow]
+    return Mixture.join([Mixture.uniform(problem.dim), *parts])
 
 
 def starts_narrowly(problem: Problem) -> bool:

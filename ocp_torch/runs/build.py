@@ -1,39 +1,31 @@
 """From a resolved configuration, as plain nested data, to a trainer ready to run. No Hydra in here."""
 
-from __future__ import annotations
-
+import ctypes
 import importlib
 import inspect
+import platform
 import re
 from collections.abc import Callable
 
+import torch
 from torch import nn
 
 from ocp_torch.certificate import CertificateSettings, StageSettings
 from ocp_torch.control.controller import problem_name
-from ocp_torch.errors import (
-    InputError,
-    call,
-    nearest,
-    require_choice,
-    require_integer,
-    require_number,
-    require_section,
-)
+from ocp_torch.errors import InputError, call, nearest, require_choice, require_integer, require_number, require_section
 from ocp_torch.fields import MODELS, VALUE, Fields
 from ocp_torch.fields.fields import cost_unit
 from ocp_torch.fields.waves import STATES
-from ocp_torch.files.memory import require_memory
+from ocp_torch.files.limits import require_memory
 from ocp_torch.maths.sampling import SAMPLERS, RowSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives import METHODS, Objective
 from ocp_torch.problems import Dataset, Problem
 from ocp_torch.problems.blame import in_their_words, origin, words
-from ocp_torch.problems.checks import check_once
+from ocp_torch.problems.checks.check import check_once
+from ocp_torch.problems.commands import current_target
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.problem import MOST_COORDINATES
-from ocp_torch.problems.renamed import current_target
-from ocp_torch.runs.process import use_threads
 from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.budgets import fill
@@ -46,6 +38,8 @@ from ocp_torch.training.trainer import Trainer
 VALUES_PER_UNIT = 5
 # Of all methods; a learning rate may be set for each that the chosen one has.
 PLAYERS = ("value", "density")
+# Parameters of glibc's mallopt, M_MMAP_THRESHOLD and M_TRIM_THRESHOLD, and the largest value that each takes.
+MALLOPT = ((-3, 2**25), (-1, 2**31 - 1))
 BOUND_FIELDS = ("occupation_bound", "value_bound", "control_bound")
 
 
@@ -83,8 +77,22 @@ def build_problem(section: object) -> Problem:
 def _require_room(dim: int, control_dim: object) -> None:
     """Raise `InputError` where `B` at the states at which the embedding looks for waves would not fit into the memory."""
     given = control_dim if isinstance(control_dim, int) and 1 <= control_dim <= MOST_COORDINATES else dim
-    entries = dim * given
-    require_memory("the number of entries of B, problem.dim times control_dim,", entries, 8.0 * STATES)
+    require_memory("the number of entries of B, problem.dim times control_dim,", dim * given, 8.0 * STATES)
+
+
+def use_threads(threads: int) -> None:
+    """Use ``threads`` CPU threads, and, with glibc, keep freed memory for the next tensor: by default large blocks return to
+    the system at once, and the page faults of getting them back can cost as much as the arithmetic."""
+    torch.set_num_threads(threads)
+    if platform.libc_ver()[0] == "glibc":
+        for parameter, largest in MALLOPT:
+            ctypes.CDLL(None).mallopt(parameter, largest)
+
+
+def _chosen(group: str, section: object, table: dict) -> tuple[str, dict]:
+    """The name in ``table`` that the configuration of a ``group`` chooses, and the group's other fields."""
+    fields = require_section(group, section)
+    return require_choice(f"{group}.name", fields.pop("name", None), table), fields
 
 
 def build_trainer(config: dict) -> Trainer:
@@ -94,8 +102,7 @@ def build_trainer(config: dict) -> Trainer:
     config = fill(config, problem)
     settings = call(TrainerSettings, "trainer", require_section("trainer", config["trainer"]))
     use_threads(settings.threads)
-    method = require_section("method", config["method"])
-    name = require_choice("method.name", method.pop("name", None), METHODS)
+    name, method = _chosen("method", config["method"], METHODS)
     constants = resolve_constants(problem, **{field: method.pop(field, None) for field in BOUND_FIELDS})
     objective = call(METHODS[name], "method", method, problem=problem)
     if settings.target_gap is not None and VALUE not in objective.fields:
@@ -106,15 +113,16 @@ def build_trainer(config: dict) -> Trainer:
     network = build_network(config["model"])
     fields = Fields.build(problem, objective.fields, network, derive_seed(seed, Branch.WEIGHTS))
     fields = fields.to(dtype=settings.torch_dtype, device=settings.torch_device)
-    require_memory("trainer.batch", settings.batch, _bytes_per_state(problem, fields, settings))
+    # What a step keeps of a state at least: x, f, a and mu0 (a constant B takes no room), and all units with derivatives.
+    kept = 2 * problem.dim + 2 + VALUES_PER_UNIT * sum(p.shape[0] for p in fields.parameters() if p.dim() == 2)
+    require_memory("trainer.batch", settings.batch, settings.torch_dtype.itemsize * kept)
     stepper = _build_stepper(config, fields, objective, settings.steps, cost_unit(problem))
     average = call(averaged, "averaging", require_section("averaging", config["averaging"]), fields=fields)
-    sampler_section = require_section("sampler", config["sampler"])
-    sampler_name = require_choice("sampler.name", sampler_section.pop("name", None), SAMPLERS)
-    visited = sampler_section.pop("visited", None)
+    sampler_name, section = _chosen("sampler", config["sampler"], SAMPLERS)
+    visited = section.pop("visited", None)
     given = {"dim": problem.dim, "seed": seed, "dtype": settings.torch_dtype}
     if problem.has_simulator:
-        sampler = call(SAMPLERS[sampler_name], "sampler", sampler_section, **given)
+        sampler = call(SAMPLERS[sampler_name], "sampler", section, **given)
     elif settings.target_gap is not None:
         raise InputError("trainer.target_gap is set, but a data set has no simulation to see a gap by.")
     else:  # a data set has its own samples
@@ -126,18 +134,10 @@ def build_trainer(config: dict) -> Trainer:
     return Trainer(problem, objective, settings, network, seed, state)
 
 
-def _bytes_per_state(problem: Problem, fields: Fields, settings: TrainerSettings) -> float:
-    """What a step keeps of each state of a batch, at least: its samples, and the values of all units with derivatives."""
-    units = sum(p.shape[0] for p in fields.parameters() if p.dim() == 2)
-    samples = 2 * problem.dim + 2  # x, f, a and mu0; a constant B takes no room
-    return settings.torch_dtype.itemsize * (samples + VALUES_PER_UNIT * units)
-
-
 def build_network(model: object) -> Callable[..., nn.Module]:
     """A maker of networks of the configured ``model``, given the form a field wants."""
-    options = require_section("model", model)
-    network = MODELS[require_choice("model.name", options.pop("name", None), MODELS)]
-    return lambda **form: call(network, "model", options, **form)
+    name, options = _chosen("model", model, MODELS)
+    return lambda **form: call(MODELS[name], "model", options, **form)
 
 
 def build_certificate_settings(config: dict) -> CertificateSettings:
@@ -159,10 +159,9 @@ def _build_stepper(config: dict, fields: Fields, objective: Objective, steps: in
     rates = {player: lr if player_lr.get(player) is None else player_lr[player] for player in objective.players}
     makers = {player: call(optimizer_maker, "optimizer", options, lr=rate) for player, rate in rates.items()}
     schedule = call(schedule_maker, "schedule", require_section("schedule", config["schedule"]), steps=steps)
-    section = require_section("stepper", config["stepper"])
-    stepper = STEPPERS[require_choice("stepper.name", section.pop("name", None), STEPPERS)]
+    name, section = _chosen("stepper", config["stepper"], STEPPERS)
     for field in ("radius", "clip"):
         if section.get(field) is not None:
             require_number(f"stepper.{field}", section[field], above=0.0)
     given = dict(fields=fields, objective=objective, optimizers=makers, schedule=schedule, unit=unit)
-    return call(stepper, "stepper", section, **given)
+    return call(STEPPERS[name], "stepper", section, **given)

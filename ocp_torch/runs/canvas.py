@@ -1,11 +1,15 @@
-"""An empty Matplotlib figure. Matplotlib takes half a second of CPU to import, and is not before something is drawn."""
+"""An empty Matplotlib figure, and figures as files. Matplotlib takes half a second of CPU to import: only to draw."""
 
-from __future__ import annotations
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from typing import TYPE_CHECKING
+from ocp_torch.files.storage import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+else:
+    Figure = Any
 
 
 def blank_figure(width: float, height: float, **options) -> Figure:
@@ -16,3 +20,9 @@ def blank_figure(width: float, height: float, **options) -> Figure:
     figure = Figure(figsize=(width, height), **{"layout": "constrained", **options})
     FigureCanvasAgg(figure)
     return figure
+
+
+def save(figures: dict[str, Figure], folder: Path) -> None:
+    """Write `<name>.png` of each in ``folder``."""
+    for name, figure in figures.items():
+        write_atomically(folder / f"{name}.png", partial(figure.savefig, dpi=120, format="png"))

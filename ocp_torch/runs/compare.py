@@ -1,30 +1,102 @@
-"""Runs side by side: their certificates as rows, the smallest gap first; and what is broken or not finished."""
+"""Runs side by side, the smallest gap first: their certificates as a table for the terminal, as CSV, and as a plot."""
 
-from __future__ import annotations
-
+import csv
+import io
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from ocp_torch.certificate.run import LONGEST_NAME
+from ocp_torch.certificate.settings import LONGEST_NAME
 from ocp_torch.errors import InputError, visible
 from ocp_torch.files.reading import FOLDER, kind, read_json
-from ocp_torch.runs.comparison import Comparison
+from ocp_torch.files.storage import write_atomically
+from ocp_torch.runs.canvas import blank_figure
 from ocp_torch.training.checkpoint import newest
 
 LARGEST_CERTIFICATE = 2**22
+# Names come from files of strangers: nothing in them may steer a terminal, or fill it.
+printable = partial(visible, most=LONGEST_NAME)
+# A number that would take more characters is shown by its leading digits and its size.
+WIDEST = 24
+# Column -> how a number in it is shown.
+COLUMNS = {
+    "run": "",
+    "problem": "",
+    "method": "",
+    "seed": "d",
+    "step": ",d",
+    "train_seconds": ".0f",
+    "lower": ".6f",
+    "perf": ".6f",
+    "upper": ".6f",
+    "exact": ".6f",
+    "gap_certified": ".3%",
+    "gap_simulated": ".3%",
+    "share": ".1%",
+    "stopped": "",
+    "warnings": "d",
+}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """``rows`` of the columns `COLUMNS`, `None` where a number does not apply; ``unfinished``: per run, why it has no row."""
+
+    rows: list[dict]
+    unfinished: dict[str, str]
+
+    def table(self) -> str:
+        """For the terminal."""
+        cells = [list(COLUMNS), *([_shown(row[c], form) for c, form in COLUMNS.items()] for row in self.rows)]
+        widths = [max(len(line[k]) for line in cells) for k in range(len(COLUMNS))]
+        lines = ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in cells]
+        lines.insert(1, "-" * max(map(len, lines)))
+        lines += [f"not in the table: {run}: {why}" for run, why in self.unfinished.items()]
+        return "\n".join(lines)
+
+    def save_csv(self, file: Path) -> None:
+        """Numbers in full precision, empty where they do not apply."""
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, COLUMNS)
+        writer.writeheader()
+        writer.writerows(self.rows)
+        write_atomically(file, lambda path: path.write_text(text.getvalue(), newline=""))
+
+    def save_plot(self, file: Path) -> None:
+        """What lies between the lower bound and each upper side of every run, as a picture."""
+        if file.suffix.lower() not in (".png", ".pdf", ".svg"):
+            raise InputError(f"plot is {str(file)!r}, but must end in .png, .pdf or .svg.")
+        figure = blank_figure(7.0, 1.2 + 0.4 * max(1, len(self.rows)))
+        axis = figure.subplots()
+        for k, row in enumerate(self.rows):
+            for column, mark in (("lower", "|"), ("perf", "o"), ("upper", "|")):
+                if row[column] is not None:
+                    axis.plot(row[column], k, mark, color="C0", markersize=10 if mark == "|" else 5)
+            known = [row[c] for c in ("lower", "perf", "upper") if row[c] is not None]
+            axis.plot([min(known, default=0.0), max(known, default=0.0)], [k, k], color="C0", linewidth=1)
+            if row["exact"] is not None:
+                axis.plot(row["exact"], k, "kx", markersize=6)
+        axis.set_yticks(range(len(self.rows)), [row["run"] for row in self.rows], parse_math=False)
+        axis.invert_yaxis()
+        axis.set(xlabel="lower bound | simulated performance o upper bound | (x: OPT)")
+        write_atomically(file, lambda path: figure.savefig(path, format=file.suffix.lower()[1:], dpi=120))
+
+
+def _shown(value, form: str) -> str:
+    text = "-" if value is None else format(value, form)
+    return text if len(text) <= WIDEST or not isinstance(value, int | float) else f"{value:.6g}"
 
 
 def compare(paths: Iterable[Path]) -> Comparison:
     """All runs in ``paths`` (run folders, or folders of them), sorted by the certified gap, then by the simulated one."""
-    folders: list[Path] = []
+    rows, unfinished, folders = [], {}, list[Path]()
     for path in paths:
         if kind(path) != FOLDER:
             raise InputError(f"{path} is not a folder; give runs' folders, or folders that hold some.")
         folders += run_folders(path)
-    rows, unfinished = [], {}
-    names = named(list(dict.fromkeys(folders)))
-    for folder, name in names.items():
+    for folder, name in named(list(dict.fromkeys(folders))).items():
         try:
             rows.append(row_of(folder, name))
         except InputError as error:
@@ -51,11 +123,6 @@ def named(folders: list[Path]) -> dict[Path, str]:
     return {f: printable("/".join(p[keep])) for f, p in zip(folders, parents, strict=True)}
 
 
-def printable(text: object) -> str:
-    """Names come from files of strangers: nothing in them may steer a terminal, or fill it."""
-    return visible(text, LONGEST_NAME)
-
-
 def row_of(folder: Path, name: str) -> dict:
     """The row of one run. Raises `InputError`, saying why, when it has no certificate that can be read."""
     file = folder / "certificate.json"
@@ -63,17 +130,21 @@ def row_of(folder: Path, name: str) -> dict:
         raise InputError(progress_of(folder))
     try:
         certificate = read_json(file, LARGEST_CERTIFICATE)
-        lower, upper = (bound(certificate, *side) for side in SIDES)
+        gap, bounds = certificate["gap"], {}
+        for side in ("lower", "upper"):  # the bounds that the gap was taken from
+            source = gap[f"{side}_from"]
+            bounds[side] = None if source is None else number(certificate[side][source]["value"])
+        gaps = {f"gap_{kind}": number(gap[kind]) for kind in ("certified", "simulated")}
         return {
             "run": name,
             **{k: printable(certificate[k]) for k in ("problem", "method")},
-            **{k: int(_given(certificate[k])) for k in ("seed", "step")},
+            **{k: int(number(certificate[k], given=True)) for k in ("seed", "step")},
             "train_seconds": number(certificate["train_seconds"]),
-            "lower": lower,
             "perf": performance(certificate),
-            "upper": upper,
+            **bounds,
             "exact": number(certificate["exact"]),
-            **{f"gap_{kind}": ranked(certificate["gap"][kind]) for kind in ("certified", "simulated")},
+            # None to rank by where the bounds cross, as older versions wrote them: one of them is then wrong.
+            **{k: None if value is not None and value < 0.0 else value for k, value in gaps.items()},
             "share": number(certificate["share"]["certified"]),
             "stopped": printable(certificate.get("stopped", "steps")),
             "warnings": len(list(certificate["warnings"])),
@@ -83,51 +154,27 @@ def row_of(folder: Path, name: str) -> dict:
         raise InputError(f"its certificate.json is damaged ({reason}).") from None
 
 
-# Each bound's group, and the key of `gap` that names the one in use.
-SIDES = (("lower", "lower_from"), ("upper", "upper_from"))
-
-
-def bound(certificate: dict, group: str, chosen: str) -> float | None:
-    """The bound the gap was taken from."""
-    name = certificate["gap"][chosen]
-    return None if name is None else number(certificate[group][name]["value"])
-
-
 def performance(certificate: dict) -> float | None:
     """Of the controller that was certified, which older certificates do not name: the one that was given, or that which the
     upper bounds speak of, or else the one with the smallest value that its errors allow."""
     known = {name: e for name, e in certificate["perf"].items() if e is not None and number(e["value"]) is not None}
     spoken_of = [e.get("controller") for e in certificate["upper"].values() if e is not None]
-    at_most = lambda name: (
-        known[name]["value"] + (number(known[name].get("bias")) or 0.0) + 2.0 * _given(known[name]["se"])
-    )
-    names = [name for name in (certificate.get("controller"), "given", *spoken_of) if name in known] or sorted(
-        known, key=at_most
-    )
-    return number(known[names[0]]["value"]) if names else None
+    for name in (certificate.get("controller"), "given", *spoken_of):
+        if name in known:
+            return number(known[name]["value"])
+    at_most = lambda e: e["value"] + (number(e.get("bias")) or 0.0) + 2.0 * number(e["se"], given=True)
+    return number(min(known.values(), key=at_most)["value"]) if known else None
 
 
-def _given(value) -> float:
-    """A finite number; `TypeError` where there is none."""
-    found = number(value)
-    if found is None:
+def number(value, given: bool = False):
+    """A finite number or, unless it must be ``given``, `None`; `ValueError` or `TypeError` for anything else."""
+    if value is None and given:
         raise TypeError("a number is missing")
-    return found
-
-
-def number(value) -> float | None:
-    """A finite number, or `None`; `ValueError` for anything else."""
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ValueError(f"{value!r} is not a number")
     return value
-
-
-def ranked(value) -> float | None:
-    """A gap to rank by: none where the bounds cross, as older versions wrote them, since one of them is then wrong."""
-    gap = number(value)
-    return gap if gap is not None and gap >= 0.0 else None
 
 
 def progress_of(folder: Path) -> str:

@@ -1,9 +1,4 @@
-"""The configurations that a run's folder keeps, one for each start, as plain data; and the checkpoint that a path names.
-
-Files may come from strangers: nothing in them is run, and what Hydra wrote is what was asked for, not what the run is.
-"""
-
-from __future__ import annotations
+"""The configurations that a run's folder keeps, one for each start, as plain data; and the checkpoint that a path names."""
 
 import contextlib
 import os
@@ -16,7 +11,7 @@ import yaml
 from ocp_torch.errors import InputError
 from ocp_torch.files.reading import FOLDER, kind, read_yaml
 from ocp_torch.files.storage import write_atomically
-from ocp_torch.problems.renamed import current_name, current_section
+from ocp_torch.problems.commands import current_name, current_section
 from ocp_torch.training.checkpoint import load_checkpoint, newest
 
 CONFIG, AUTO = "config.yaml", "auto"
@@ -36,33 +31,29 @@ def locate(path: Path) -> tuple[Path | None, Path | None]:
 
 
 def load_state(path: Path) -> tuple[Any, Path, list[str]]:
-    """The state that ``path`` names, the file it came from, and a sentence on each damaged newer one."""
-    folder, checkpoint = locate(path)
+    """The state that ``path`` names, in this version's names; its file; and a sentence on each damaged newer one."""
+    checkpoint = locate(path)[1]
     if checkpoint is not None:
-        return current_state(load_checkpoint(checkpoint)), checkpoint, []
-    assert folder is not None  # what names no checkpoint is a folder
-    state, checkpoint, notes = newest(folder / "checkpoints")
-    return current_state(state), checkpoint, notes
-
-
-def current_state(state: Any) -> Any:
-    """The ``state`` of a run of any version, with the names that its problem has now."""
+        state, notes = load_checkpoint(checkpoint), list[str]()
+    else:
+        state, checkpoint, notes = newest(path / "checkpoints")
     config = state.get("config") if isinstance(state, dict) else None
-    if not isinstance(config, dict):
-        return state
-    return {**state, "problem": current_name(state.get("problem"), config.get("problem")), "config": current(config)}
+    if isinstance(config, dict):
+        name = current_name(state.get("problem"), config.get("problem"))
+        state = {**state, "problem": name, "config": current(config)}
+    return state, checkpoint, notes
 
 
-def latest_subfolder(folder: Path) -> Path:
-    """Where the newest start's configuration lies: `.hydra`, or `.hydra/resume_<n>` after `n` resumes."""
-    return max((folder / ".hydra").glob("resume_*"), key=_number, default=folder / ".hydra")
+def starts(folder: Path) -> list[Path]:
+    """Where the configurations of all starts lie, the oldest first: `.hydra`, then `.hydra/resume_<n>` for each resume."""
+    return [folder / ".hydra", *sorted((folder / ".hydra").glob("resume_*"), key=_number)]
 
 
 def next_subfolder(folder: Path) -> str:
-    """Where the next start's configuration goes: `.hydra` is the first start's, and stays."""
+    """Where the next start's configuration goes."""
     if not (folder / ".hydra" / CONFIG).exists():
         return ".hydra"
-    return f".hydra/resume_{_number(latest_subfolder(folder)) + 1}"
+    return f".hydra/resume_{_number(starts(folder)[-1]) + 1}"
 
 
 def _number(path: Path) -> int:
@@ -71,11 +62,9 @@ def _number(path: Path) -> int:
 
 
 def saved_configuration(path: Path) -> dict:
-    """The configuration of the run that ``path`` names, as plain data: that of its newest start that got going, or, for
-    a checkpoint without a run's folder, its own copy."""
-    folder, checkpoint = locate(path)
-    starts = sorted((folder / ".hydra").glob("resume_*"), key=_number, reverse=True) if folder else []
-    for start in starts:
+    """The plain configuration of the newest start that got going of the run that ``path`` names, or its checkpoint's copy."""
+    folder = locate(path)[0]
+    for start in reversed(starts(folder)[1:] if folder else []):
         # Until a start has been checked, its file is what was asked for, names a run, and may be half written.
         with contextlib.suppress(InputError, OSError):
             config = read_configuration(start / CONFIG)
@@ -105,9 +94,8 @@ def current(config: dict) -> dict:
 
 def keep_configuration(folder: Path, config: dict) -> None:
     """Write the configuration with which a run goes on, or begins again, beside its first start's."""
-    file = latest_subfolder(folder) / CONFIG
     text = yaml.safe_dump({**config, "resume": None}, sort_keys=False, allow_unicode=True)
-    write_atomically(file, lambda temporary: temporary.write_text(text))
+    write_atomically(starts(folder)[-1] / CONFIG, lambda temporary: temporary.write_text(text))
 
 
 def adopt(stub: Path, folder: Path) -> None:

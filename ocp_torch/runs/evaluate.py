@@ -1,51 +1,29 @@
 """Certify a saved controller again, on the same or on fresh evaluation states."""
 
-from __future__ import annotations
-
 import logging
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields, table
-from ocp_torch.certificate.checks.possible import require_possible
-from ocp_torch.certificate.trained import in_float64
-from ocp_torch.control.controller import Controller
-from ocp_torch.control.loading import load_controller
-from ocp_torch.control.policies import Policy, trained_policies
+from ocp_torch.certificate.settings import require_possible
+from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.errors import InputError, require_integer, require_section
 from ocp_torch.files.limits import require_modest_run
 from ocp_torch.files.reading import FOLDER, kind
-from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem
-from ocp_torch.runs.metrics import write_metrics
-from ocp_torch.runs.pictures import animate, require_gif
-from ocp_torch.runs.process import use_threads
+from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem, use_threads
+from ocp_torch.runs.loading import policy_of
+from ocp_torch.runs.metrics.trial import write_metrics
+from ocp_torch.runs.pictures.picture import animate, require_gif
 from ocp_torch.training.health import sanity_warnings
 from ocp_torch.training.settings import MOST_THREADS
 
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Recertification:
-    """What was asked for, checked: the certificate of a saved ``controller`` again, on states of ``seed`` (`None`: of its own
-    run's), and a GIF of its motion in the file ``animation``."""
-
-    controller: Controller
-    settings: CertificateSettings
-    seed: int | None
-    animation: Path | None
-
-    def run(self) -> Certificate:
-        """Certify, print and draw."""
-        certificate = certify_saved(self.controller, self.settings, self.seed)
-        if self.animation is not None:
-            animate(self.controller.problem, policy_of(self.controller), self.animation, self.seed or 0)
-            log.info("animated in %s", self.animation)
-        return certificate
-
-
-def recertification(config: dict) -> Recertification:
-    """Check every field of ``config``. Raises `InputError` for a wrong one."""
+def recertification(config: dict) -> Callable[[], Certificate]:
+    """What ``config`` asks for, checked: the certificate of a saved controller again, on states of ``seed`` (`None`: of its
+    own run's), and a GIF of its motion in the file ``animation``. Raises `InputError` for a wrong field."""
     controller, seed, animation = load_run(config), config["seed"], config["animation"]
     if seed is not None:
         require_integer("seed", seed, 0)
@@ -53,7 +31,15 @@ def recertification(config: dict) -> Recertification:
         animation = require_gif(controller.problem, animation)
     settings = settings_for(controller, config)
     require_possible(controller.problem, settings, trains_value=controller.fields.value is not None)
-    return Recertification(controller, settings, seed, animation)
+
+    def recertify() -> Certificate:
+        certificate = certify_saved(controller, settings, seed)
+        if animation is not None:
+            animate(controller.problem, policy_of(controller), animation, seed or 0)
+            log.info("animated in %s", animation)
+        return certificate
+
+    return recertify
 
 
 def load_run(config: dict) -> Controller:
@@ -80,9 +66,8 @@ def settings_for(controller: Controller, config: dict) -> CertificateSettings:
     stage = {k: v for k, v in section.items() if v is not None}
     named = {f"certificate.{k}" for k in changed} | {f"certificate.stage.{k}" for k in stage}
     require_modest_run(config["run"], controller.config, named)
-    return build_certificate_settings(
-        {"certificate": {**own, **changed, "stage": {**(own.get("stage") or {}), **stage}}}
-    )
+    stage = {**(own.get("stage") or {}), **stage}
+    return build_certificate_settings({"certificate": {**own, **changed, "stage": stage}})
 
 
 def certify_saved(controller: Controller, settings: CertificateSettings, seed: int | None = None) -> Certificate:
@@ -91,7 +76,7 @@ def certify_saved(controller: Controller, settings: CertificateSettings, seed: i
     use_threads(require_integer("trainer.threads", threads, 1, maximum=MOST_THREADS))
     run = Run.read(controller.certificate)
     if seed is not None:
-        run = Run(**{**vars(run), "seed": require_integer("seed", seed, 0)})
+        run = replace(run, seed=require_integer("seed", seed, 0))
     trained = Trained(controller.fields, controller.occupation, build_network(controller.model))
     certificate = certify_fields(controller.problem, trained, controller.constants, settings, run)
     found = sanity_warnings(controller.problem, controller.constants, certificate, run.seed)
@@ -101,11 +86,3 @@ def certify_saved(controller: Controller, settings: CertificateSettings, seed: i
     if settings.trajectories:
         write_metrics(controller.problem, policy_of(controller), run.seed, None)
     return certificate
-
-
-def policy_of(controller: Controller) -> Policy:
-    """The policy that ``controller`` follows, in float64."""
-    policies = trained_policies(
-        controller.occupation, controller.problem, in_float64(controller.fields), controller.constants
-    )
-    return policies[controller.kind]

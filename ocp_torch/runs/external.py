@@ -1,7 +1,5 @@
 """Certify a controller somebody brings: load it, train a `V` to judge it by, and put both into a certificate."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -10,10 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, certify_policy, in_float64, table
-from ocp_torch.certificate.checks.possible import require_possible
 from ocp_torch.certificate.external.black_box import BlackBox, require_limit
+from ocp_torch.certificate.settings import require_possible
 from ocp_torch.control.controller import Controller, problem_name
-from ocp_torch.control.policies import Policy, trained_policies
+from ocp_torch.control.policies import Policy
 from ocp_torch.errors import InputError, require_flag, require_integer
 from ocp_torch.fields import Fields
 from ocp_torch.fields.fields import VALUE, cost_unit
@@ -24,11 +22,9 @@ from ocp_torch.maths.supremum import batched
 from ocp_torch.objectives import Dual, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants, resolve_constants
-from ocp_torch.runs import figures
-from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem
-from ocp_torch.runs.interval import interval_figure
-from ocp_torch.runs.loading import load_policy, load_saved
-from ocp_torch.runs.process import use_threads
+from ocp_torch.runs import canvas, loading
+from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem, use_threads
+from ocp_torch.runs.figures import interval_figure
 from ocp_torch.steppers import advance, short_fit
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.budgets import fill
@@ -61,38 +57,37 @@ def certify(
         raise InputError(
             "problem is a data set, on which no given controller can be certified: nothing can be simulated."
         )
-    defaults = fill({"model": dict(MODEL), "trainer": {}, "optimizer": {}, "certificate": {}}, problem)
+    defaults = _defaults(problem, {})
     settings = settings or build_certificate_settings(defaults)
     constants = resolve_constants(problem)
     network = build_network(defaults["model"])
     policy = policy_of(controller, problem)
     steps = defaults["trainer"]["steps"] if train_steps is None else require_integer("train_steps", train_steps, 0)
-    run = Run(problem_name(problem), "given", seed)
-    if value is None and steps:
-        batch, lr, sampler = defaults["trainer"]["batch"], defaults["optimizer"]["lr"], defaults["sampler"]["name"]
-        value = in_float64(train_value(problem, constants, network, steps, batch, lr, sampler, seed)).value
-        run = Run(problem_name(problem), "given", seed, steps, steps * batch)
+    steps = 0 if value is not None else steps
+    if steps:
+        value = in_float64(train_value(problem, constants, network, steps, defaults, seed)).value
     elif value is not None:
         value = value_of(value, problem)
+    run = Run(problem_name(problem), "given", seed, steps, steps * defaults["trainer"]["batch"])
     return certify_policy(problem, policy, value, network, constants, settings, run)
 
 
+def _defaults(problem: Problem, certificate: dict) -> dict:
+    """The configuration of a run of ``problem``, as far as it is needed here, with the defaults of its dimension."""
+    return fill({"model": dict(MODEL), "trainer": {}, "optimizer": {}, "certificate": certificate}, problem)
+
+
 def train_value(
-    problem: Problem,
-    constants: Constants,
-    network: Callable[..., nn.Module],
-    steps: int,
-    batch: int,
-    lr: float,
-    sampler: str,
-    seed: int,
+    problem: Problem, constants: Constants, network: Callable[..., nn.Module], steps: int, defaults: dict, seed: int
 ) -> Fields:
     """A `V` by the dual, with the defaults of a run."""
     fields = Fields.build(problem, (VALUE,), network, derive_seed(seed, Branch.EXTERNAL_VALUE, 0))
     objective = Dual(problem)
-    states = SAMPLERS[sampler](problem.dim, derive_seed(seed, Branch.EXTERNAL_VALUE, 1), torch.float32)
-    batches = Batches(problem, fields, objective, states, batch, derive_seed(seed, Branch.EXTERNAL_VALUE, 2))
-    stepper, average = short_fit(fields, objective, lr, steps, cost_unit(problem))
+    sampler = SAMPLERS[defaults["sampler"]["name"]]
+    states = sampler(problem.dim, derive_seed(seed, Branch.EXTERNAL_VALUE, 1), torch.float32)
+    batch_seed = derive_seed(seed, Branch.EXTERNAL_VALUE, 2)
+    batches = Batches(problem, fields, objective, states, defaults["trainer"]["batch"], batch_seed)
+    stepper, average = short_fit(fields, objective, defaults["optimizer"]["lr"], steps, cost_unit(problem))
     for step in range(steps):
         advance(stepper, average, batches.draw, Phase(constants, step / steps))
     return average.module
@@ -107,8 +102,7 @@ def policy_of(controller: Callable | Controller, problem: Problem) -> Policy:
             f"the controller is for d = {controller.problem.dim} and m = {controller.problem.control_dim}, "
             f"but the problem has d = {problem.dim} and m = {problem.control_dim}."
         )
-    fields = in_float64(controller.fields)
-    policy = trained_policies(controller.occupation, controller.problem, fields, controller.constants)[controller.kind]
+    policy = loading.policy_of(controller)
     if controller.problem.control_limit != problem.control_limit:  # its own limit it obeys by itself
         x = scrambled_sobol(LIMIT_PROBES, problem.dim, 0, torch.float64)
         with torch.no_grad():
@@ -139,19 +133,17 @@ def arguments(config: dict) -> dict:
     """The arguments of `certify` that the plain ``config`` of the command line names; only it may name code to run."""
     use_threads(1)
     problem = build_problem(config["problem"])
-    filled = fill({"model": dict(MODEL), "trainer": {}, "optimizer": {}, "certificate": config["certificate"]}, problem)
+    settings = build_certificate_settings(_defaults(problem, config["certificate"]))
     train = require_flag("train", config["train"])
     if config["steps"] is not None:
         require_integer("steps", config["steps"], 1)
-    settings = build_certificate_settings(filled)
     require_possible(problem, settings, trains_value=False)  # a given controller's bounds are not proved
-    controller = load_policy(config["controller"], problem)
+    controller = loading.load_policy(config["controller"], problem)
     policy_of(controller, problem)
-    value = None if config["value"] is None else load_saved(Path(str(config["value"])), problem)
     return {
         "problem": problem,
         "controller": controller,
-        "value": value,
+        "value": None if config["value"] is None else loading.load_saved(Path(str(config["value"])), problem),
         "settings": settings,
         "seed": require_integer("seed", config["seed"], 0),
         "train_steps": config["steps"] if train else 0,
@@ -162,7 +154,7 @@ def certify_in(given: dict, folder: Path) -> Certificate:
     """Certify what `arguments` gave; print the table and leave `certificate.json` and its figure in ``folder``."""
     certificate = certify(**given)
     certificate.save(folder / "certificate.json")
-    figures.save({"certificate": interval_figure(certificate.to_dict())}, folder / "figures")
+    canvas.save({"certificate": interval_figure(certificate.to_dict())}, folder / "figures")
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
     log.info("in %s", folder)
     return certificate

@@ -1,30 +1,24 @@
-"""Figures of `V`, `u`, `mu` and the HJB slack: curves in one dimension, maps over two coordinates beyond."""
-
-from __future__ import annotations
+"""Figures of a run: its certificate on a line; `V`, `u`, `mu` and the HJB slack as curves, or as maps of two coordinates."""
 
 from collections.abc import Callable
-from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ocp_torch.certificate.lower.shifted import slack_function
+from ocp_torch.certificate.settings import LONGEST_NAME
 from ocp_torch.certificate.trained import in_float64
 from ocp_torch.control.policies import NETWORK, occupation_density, trained_policies
+from ocp_torch.errors import visible
 from ocp_torch.fields import Fields
-from ocp_torch.files.storage import write_atomically
 from ocp_torch.maths.runge_kutta import rate_at
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.starts import initial_points
-from ocp_torch.runs.canvas import blank_figure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from ocp_torch.runs.canvas import Figure, blank_figure
 
 LINE_POINTS, MAP_POINTS = 400, 80
 # Of the simulated occupation density: bins a coordinate by dimension, starts, steps of a trajectory.
@@ -36,38 +30,94 @@ TITLES = {
     "occupation": "mu",
     "slack": "HJB slack Q",
 }
+Function = Callable[[Tensor], Any]
 
 
-def quantities(problem: Problem, fields: Fields, constants: Constants, occupation: str | None) -> dict[str, tuple]:
-    """Name -> (learned function, exact function or None), for what the fields give."""
+def interval_figure(certificate: dict) -> Figure:
+    """The certificate (as a dict of its schema) on a line: bounds, `OPT` where known and performances, with their intervals.
+
+    What is much farther from the tightest of them than they are from one another is cut off, with an arrow and its value.
+    """
+    rows = [(f"{n} ≤ OPT", e, "C0") for n, e in certificate["lower"].items() if e]
+    rows += [(f"Perf, {n}", e, "C2") for n, e in certificate["perf"].items() if e]
+    rows += [(f"{n} ≤ Perf", e, "C4") for n, e in certificate.get("perf_lower", {}).items() if e]
+    rows += [(f"≤ {n}", e, "C3") for n, e in certificate["upper"].items() if e]
+    rows += [("doing nothing", e, "C7") for e in certificate["baseline"].values() if e]
+    figure = blank_figure(7.0, 1.2 + 0.32 * max(len(rows), 1))
+    axis = figure.subplots()
+    lows, highs = ([e["value"] for e in certificate[side].values() if e] for side in ("lower", "perf"))
+    highs = highs or [e["value"] for e in certificate["upper"].values() if e]
+    ends = ([max(lows)] if lows else []) + ([min(highs)] if highs else [])
+    ends += [certificate["exact"]] if certificate["exact"] is not None else []
+    ends += [end for name, e, _ in rows if name.startswith("Perf") for end in e["interval"]]
+    left, right = min(ends, default=0.0), max(ends, default=1.0)
+    room = max(2.0 * (right - left), 1e-3 * max(abs(left), abs(right)), 1e-12)
+    left, right = left - room, right + room
+    axis.set_xlim(left, right)
+    for y, (_, e, color) in enumerate(rows):
+        outside = min(max(e["value"], left), right)
+        if outside != e["value"]:
+            marker, side, at = ("<", 1, "left") if outside == left else (">", -1, "right")
+            axis.plot(outside, y, marker, color=color, clip_on=False)
+            offset: dict[str, Any] = {"xytext": (8 * side, 0), "textcoords": "offset points"}
+            axis.annotate(f"{e['value']:.5g}", (outside, y), va="center", ha=at, **offset)
+            continue
+        axis.errorbar(e["value"], y, xerr=0.5 * (e["interval"][1] - e["interval"][0]), fmt="o", capsize=3, color=color)
+    if certificate["exact"] is not None:
+        axis.axvline(certificate["exact"], color="k", linestyle=":", label="OPT")
+        axis.legend(loc="upper right")
+    # A name may come from a file: its signs are not a formula.
+    axis.set_yticks(range(len(rows)), [visible(name, LONGEST_NAME) for name, *_ in rows], parse_math=False)
+    axis.invert_yaxis()
+    title = f"{visible(certificate['problem'], LONGEST_NAME)}, {100 * certificate['confidence']:.4g} % intervals"
+    axis.set_title(title, parse_math=False)
+    return figure
+
+
+def draw(problem: Problem, fields: Fields, constants: Constants, occupation: str | None) -> dict[str, Figure]:
+    """A figure per quantity; in three and more dimensions a cut along the first two coordinates through 1/2."""
+    if problem.dim == 1:
+        x = torch.linspace(0.0, 1.0, LINE_POINTS, dtype=torch.float64).unsqueeze(-1)
+    else:
+        middles = (torch.arange(MAP_POINTS, dtype=torch.float64) + 0.5) / MAP_POINTS
+        x = torch.full((MAP_POINTS**2, problem.dim), 0.5, dtype=torch.float64)
+        x[:, :2] = torch.cartesian_prod(middles, middles)
+    figures = {}
+    for name, functions in quantities(problem, fields, constants, occupation).items():
+        values = {label: _columns(function, x) for label, function in functions.items()}
+        known = {label: v for label, v in values.items() if v is not None}
+        figures[name] = (_curve if problem.dim == 1 else _map)(TITLES[name], x, known)
+    return figures
+
+
+def quantities(problem: Problem, fields: Fields, constants: Constants, occupation: str | None) -> dict[str, dict]:
+    """Name -> the learned, the exact and the simulated function, or `None`, for what the fields give."""
     fields = in_float64(fields)
     policies = trained_policies(occupation, problem, fields, constants)
-    drawn: dict[str, tuple] = {}
+    drawn: dict[str, dict] = {}
     if fields.value is not None:
-        drawn["value"] = (fields.value, problem.exact_value)
+        drawn["value"] = {"learned": fields.value, "exact": problem.exact_value}
         if problem.has_simulator:
-            drawn["slack"] = (slack_function(problem, fields.value), None)
+            drawn["slack"] = {"learned": slack_function(problem, fields.value)}
     for kind, policy in policies.items():
         if kind != "value" or problem.knows_control_matrix:
-            drawn[f"control_{kind}"] = (policy, problem.exact_control)
+            drawn[f"control_{kind}"] = {"learned": policy, "exact": problem.exact_control}
+    learned, simulated = None, None
     if occupation is not None and (problem.has_simulator or occupation == NETWORK):
-        drawn["occupation"] = (occupation_density(occupation, problem, fields, constants), problem.exact_occupation)
+        learned = occupation_density(occupation, problem, fields, constants)
     if problem.dim in BINS and problem.has_simulator:
-        learned, exact = drawn.get("occupation", (None, problem.exact_occupation))
-        drawn["occupation"] = (learned, exact, simulated_occupation(problem, next(iter(policies.values()))))
+        simulated = simulated_occupation(problem, next(iter(policies.values())))
+    if learned is not None or simulated is not None:
+        drawn["occupation"] = {"learned": learned, "exact": problem.exact_occupation, "simulated": simulated}
     return drawn
 
 
 @torch.no_grad()
-def simulated_occupation(
-    problem: Problem, policy: Callable[[Tensor], Tensor], seed: int = 0
-) -> Callable[[Tensor], Tensor]:
-    """A histogram of `mu^u`, for one or two coordinates: where the closed loop of ``policy`` is at a time `T ~ Exp(rho)`.
-
-    Starts weigh `mu0`; their number and the bins are few enough for a fraction of a second.
-    """
+def simulated_occupation(problem: Problem, policy: Function) -> Function:
+    """A histogram of `mu^u`, for one or two coordinates: where the closed loop of ``policy`` is at a time `T ~ Exp(rho)`,
+    from starts that weigh `mu0`, few enough for a fraction of a second."""
     bins = BINS[problem.dim]
-    points, start_mass = initial_points(problem, STARTS, 0, derive_seed(seed, Branch.FIGURES), extra=1)
+    points, start_mass = initial_points(problem, STARTS, 0, derive_seed(0, Branch.FIGURES), extra=1)
     x0, times = points[:, :-1], -torch.log1p(-points[:, -1]) / problem.discount
     _, end = rate_at(lambda x: (problem.velocity(x, policy(x)), x[:, 0]), x0, problem.discount, times, FIGURE_STEPS)
     cell = lambda x: ((x * bins).long().clamp(0, bins - 1) * bins ** torch.arange(problem.dim)).sum(dim=-1)
@@ -77,67 +127,41 @@ def simulated_occupation(
     return lambda x: density[cell(x.remainder(1.0))]
 
 
-def draw(problem: Problem, fields: Fields, constants: Constants, occupation: str | None) -> dict[str, Figure]:
-    """A figure per quantity; in three and more dimensions a cut along the first two coordinates through 1/2."""
-    plot = _curve if problem.dim == 1 else _map
-    drawn = quantities(problem, fields, constants, occupation)
-    return {name: plot(problem.dim, TITLES[name], *functions) for name, functions in drawn.items()}
-
-
-def save(figures: dict[str, Figure], folder: Path) -> None:
-    """Write `figures/<name>.png`."""
-    for name, figure in figures.items():
-        write_atomically(folder / f"{name}.png", partial(figure.savefig, dpi=120, format="png"))
-
-
-def _figure(columns: int):
-    figure = blank_figure(5.2 * columns, 4.0)
-    return figure, figure.subplots(1, columns, squeeze=False)[0]
-
-
-def _components(function: Callable[[Tensor], Any] | None, x: Tensor) -> Tensor | None:
+@torch.no_grad()
+def _columns(function: Function | None, x: Tensor) -> Tensor | None:
     """Values as columns ``(N, k)``; an infinite one becomes a gap in the plot."""
-    with torch.no_grad():
-        if function is None or function(x[:1]) is None:
-            return None
-        values = batched(function, x)
-    return values.reshape(len(x), -1).where(torch.isfinite(values.reshape(len(x), -1)), torch.nan)
+    if function is None or function(x[:1]) is None:
+        return None
+    values = batched(function, x).reshape(len(x), -1)
+    return values.where(torch.isfinite(values), torch.nan)
 
 
-def _curve(dim: int, title: str, learned, exact, simulated=None) -> Figure:
-    x = torch.linspace(0.0, 1.0, LINE_POINTS, dtype=torch.float64).unsqueeze(-1)
-    figure, (axis,) = _figure(1)
-    forms = (("simulated", simulated, "C7"), ("learned", learned, "C0"), ("exact", exact, "k:"))
-    for label, function, form in forms:
-        values = _components(function, x)
-        if values is not None:
-            axis.plot(x, values, form, label=label)
+def _curve(title: str, x: Tensor, values: dict[str, Tensor]) -> Figure:
+    figure = blank_figure(5.2, 4.0)
+    axis = figure.subplots()
+    for label, form in (("simulated", "C7"), ("learned", "C0"), ("exact", "k:")):
+        if label in values:
+            axis.plot(x, values[label], form, label=label)
     if len(axis.lines) > 1:
         axis.legend()
     axis.set(title=title, xlabel="x")
     return figure
 
 
-def _map(dim: int, title: str, learned, exact, simulated=None) -> Figure:
-    line = (torch.arange(MAP_POINTS, dtype=torch.float64) + 0.5) / MAP_POINTS
-    x = torch.full((MAP_POINTS**2, dim), 0.5, dtype=torch.float64)
-    x[:, :2] = torch.cartesian_prod(line, line)
-    functions = {"": learned, ", exact": exact, ", simulated": simulated}
-    known = {suffix: _components(function, x) for suffix, function in functions.items()}
-    panels = {suffix: values for suffix, values in known.items() if values is not None}
+def _map(title: str, x: Tensor, panels: dict[str, Tensor]) -> Figure:
+    stride = MAP_POINTS // 16
+    some = lambda t: t[:, :2].reshape(MAP_POINTS, MAP_POINTS, 2)[::stride, ::stride].unbind(-1)
     # A control of several components is drawn as its size, with arrows for its first two.
-    sizes = {suffix: v.norm(dim=-1) if v.shape[1] > 1 else v[:, 0] for suffix, v in panels.items()}
+    sizes = {label: v.norm(dim=-1) if v.shape[1] > 1 else v[:, 0] for label, v in panels.items()}
     low = min(float(s.nan_to_num(nan=torch.inf).min()) for s in sizes.values())
     high = max(float(s.nan_to_num(nan=-torch.inf).max()) for s in sizes.values())
-    figure, axes = _figure(len(panels))
-    for axis, (suffix, values) in zip(axes, panels.items(), strict=True):
-        grid = sizes[suffix].reshape(MAP_POINTS, MAP_POINTS).T
+    figure = blank_figure(5.2 * len(panels), 4.0)
+    for axis, (label, values) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
+        grid = sizes[label].reshape(MAP_POINTS, MAP_POINTS).T
         image = axis.imshow(grid, origin="lower", extent=(0, 1, 0, 1), vmin=low, vmax=high)
         if values.shape[1] > 1:
-            stride = MAP_POINTS // 16
-            arrows = values[:, :2].reshape(MAP_POINTS, MAP_POINTS, 2)[::stride, ::stride]
-            axis.quiver(line[::stride], line[::stride], arrows[..., 0].T, arrows[..., 1].T, color="w")
+            axis.quiver(*some(x), *some(values), color="w")
         name = f"|{title}|" if values.shape[1] > 1 else title
-        axis.set(title=name + suffix, xlabel="$x_1$", ylabel="$x_2$")
+        axis.set(title=name if label == "learned" else f"{name}, {label}", xlabel="$x_1$", ylabel="$x_2$")
         figure.colorbar(image, ax=axis)
     return figure

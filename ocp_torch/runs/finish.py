@@ -1,6 +1,4 @@
-"""The end of a run: what it hands out, also where it could not go on."""
-
-from __future__ import annotations
+"""The end of a run: what it hands out, also where it could not go on, and whether all of that is there."""
 
 import contextlib
 import json
@@ -8,22 +6,28 @@ from dataclasses import replace
 from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings
-from ocp_torch.certificate.trained import in_float64
 from ocp_torch.control.controller import Controller
-from ocp_torch.control.policies import Policy, trained_policies
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.fields import Fields
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.problems.blame import blamed
-from ocp_torch.runs import completion, figures
-from ocp_torch.runs.interval import interval_figure
-from ocp_torch.runs.pictures import practical_figures
+from ocp_torch.runs import canvas
+from ocp_torch.runs.figures import draw, interval_figure
+from ocp_torch.runs.loading import policy_of
+from ocp_torch.runs.metrics.measures import has_metrics
+from ocp_torch.runs.metrics.trial import METRICS
+from ocp_torch.runs.pictures.picture import motion
+from ocp_torch.runs.pictures.scenes import scene
 from ocp_torch.steppers import NonFiniteError
 from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM
 from ocp_torch.training.health import sanity_warnings
 from ocp_torch.training.monitor import Monitor
 from ocp_torch.training.stopping import FAILED, NOT_FINITE
 from ocp_torch.training.trainer import Trainer
+
+# Lies beside the checkpoints from before the first file of the end is written until after the last: a start may have been
+# killed between two of them.
+MARK = "checkpoints/unfinished"
 
 
 def failure_of(trainer: Trainer, error: BaseException) -> str | None:
@@ -85,38 +89,26 @@ def with_warnings(trainer: Trainer, certificate: Certificate, notes: list[str]) 
 
 
 def hand_out(
-    trainer: Trainer,
-    certificate: Certificate,
-    fields: Fields,
-    folder: Path,
-    monitor: Monitor,
-    failure: str | None,
-) -> tuple[str, Policy]:
-    """Write controller, certificate and figures; the kind of the policy that the controller follows, and that policy in
-    float64."""
-    completion.begin(folder)
-    kind = policy_kind(certificate, fields)
-    controller_of(trainer, certificate, kind, fields).save(folder / "controller.safetensors")
+    trainer: Trainer, certificate: Certificate, fields: Fields, folder: Path, monitor: Monitor, failure: str | None
+) -> Controller:
+    """Write the controller that ``certificate`` speaks of, the certificate and figures; that controller."""
+    write_atomically(folder / MARK, lambda path: path.write_text("a resume makes what is missing\n"))
+    named = certificate.controller or certificate.subject
+    kind = named or ("value" if fields.value is not None else "density")
+    controller = controller_of(trainer, certificate, kind, fields)
+    controller.save(folder / "controller.safetensors")
     write_atomically(folder / "certificate.json", certificate.save)
-    policy = trained_policies(trainer.objective.occupation, trainer.problem, in_float64(fields), trainer.constants)[
-        kind
-    ]
     drawn = {}
     if trainer.settings.figures:
         monitor.stages("figures")
         drawn = {"certificate": interval_figure(certificate.to_dict())}
         with unless_it_failed(failure, trainer):
-            drawn |= figures.draw(trainer.problem, fields, trainer.constants, trainer.objective.occupation)
-            drawn |= practical_figures(trainer.problem, policy, trainer.seed)
-        figures.save(drawn, folder / "figures")
-    monitor.finish(certificate, drawn, flatten(trainer.config), trainer.step)
-    return kind, policy
-
-
-def policy_kind(certificate: Certificate, fields: Fields) -> str:
-    """The policy that ``certificate`` speaks of: ``value`` or ``density``."""
-    named = certificate.controller or certificate.subject
-    return named or ("value" if fields.value is not None else "density")
+            drawn |= draw(trainer.problem, fields, trainer.constants, trainer.objective.occupation)
+            moved = motion(trainer.problem, policy_of(controller), trainer.seed)
+            drawn |= {} if moved is None else {"motion": moved}
+        canvas.save(drawn, folder / "figures")
+    monitor.finish(certificate, drawn, _flat(trainer.config), trainer.step)
+    return controller
 
 
 def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields: Fields) -> Controller:
@@ -133,14 +125,30 @@ def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields:
     )
 
 
-def flatten(config: dict, prefix: str = "") -> dict:
-    """A nested configuration as one level with dotted names."""
+def _flat(config: dict, prefix: str = "") -> dict:
+    """A nested configuration as one level with dotted names; what TensorBoard does not take is in JSON."""
     flat: dict = {}
     for key, value in config.items():
-        name = f"{prefix}{key}"
-        flat |= flatten(value, f"{name}.") if isinstance(value, dict) else {name: json_safe(value)}
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value if isinstance(value, bool | int | float | str) else json.dumps(value)
     return flat
 
 
-def json_safe(value):
-    return value if isinstance(value, bool | int | float | str) else json.dumps(value)
+def complete(folder: Path) -> None:
+    """All files of the end are written."""
+    (folder / MARK).unlink(missing_ok=True)
+
+
+def missing(folder: Path, trainer: Trainer, settings: CertificateSettings) -> str | None:
+    """What the end of the run in ``folder`` lacks, in words, or `None`."""
+    files = ["certificate.json", "controller.safetensors"]
+    if trainer.settings.figures:
+        files += ["figures/certificate.png", *(["figures/motion.png"] if scene(trainer.problem) is not None else [])]
+    if settings.trajectories and has_metrics(trainer.problem):
+        files.append(METRICS)
+    absent = [file for file in files if not (folder / file).is_file()]
+    if absent:
+        return ", ".join(absent)
+    return "some of its last files" if (folder / MARK).exists() else None

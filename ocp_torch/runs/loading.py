@@ -1,6 +1,4 @@
-"""Controllers by what the command line names: a function in a file, a run of ours, ONNX, TorchScript."""
-
-from __future__ import annotations
+"""Controllers by what the command line names: a function in a file, a run of ours, ONNX, TorchScript; and their policies."""
 
 import importlib.util
 import logging
@@ -10,13 +8,20 @@ from pathlib import Path
 
 import torch
 
-from ocp_torch.control.controller import Controller, problem_name
-from ocp_torch.control.loading import load_controller
+from ocp_torch.certificate.trained import in_float64
+from ocp_torch.control.controller import Controller, load_controller, problem_name
+from ocp_torch.control.policies import Policy, trained_policies
 from ocp_torch.errors import InputError, nearest
 from ocp_torch.files.reading import FOLDER, kind, require_file
 from ocp_torch.problems import PROBLEMS, Problem
 
 log = logging.getLogger(__name__)
+
+
+def policy_of(controller: Controller) -> Policy:
+    """The policy that ``controller`` follows, in float64."""
+    fields = in_float64(controller.fields)
+    return trained_policies(controller.occupation, controller.problem, fields, controller.constants)[controller.kind]
 
 
 def load_policy(source: str, problem: Problem) -> Callable | Controller:
@@ -44,8 +49,7 @@ def load_policy(source: str, problem: Problem) -> Callable | Controller:
 
 
 def load_saved(path: Path, problem: Problem) -> Controller:
-    """A controller of ours, by its file or its run's folder; of the same problem, and for one of the package's, which the
-    file makes again, whatever its parameters were."""
+    """A controller of ours, by its file or its run's folder, for ``problem``, or, of one of the package's, for its class."""
     file = path / "controller.safetensors" if kind(path) == FOLDER else path
     if problem_name(problem) not in PROBLEMS:
         return load_controller(file, problem=problem)
@@ -89,8 +93,7 @@ def _onnx(path: Path) -> Callable:
 
 
 def _torchscript(path: Path) -> Callable:
-    """A program of its own, which may write wherever the user may."""
-    warn_of_code(path)
+    _warn_of_code(path)
     try:
         return torch.jit.load(str(path), map_location="cpu").eval()
     except Exception as error:  # the loader has no one type for a bad file
@@ -99,8 +102,7 @@ def _torchscript(path: Path) -> Callable:
 
 
 @cache
-def warn_of_code(path: Path) -> None:
+def _warn_of_code(path: Path) -> None:
     """Say once what TorchScript can do."""
-    log.warning(
-        "warning: %s is TorchScript, code that can write your files; load it if you trust it, or take ONNX.", path
-    )
+    said = "warning: %s is TorchScript, code that can write your files; load it if you trust it, or take ONNX."
+    log.warning(said, path)

@@ -1,9 +1,4 @@
-"""What a resumed run is made of: its own configuration, and what the command line may change in it.
-
-A problem that is not the package's own is never imported because a file names it.
-"""
-
-from __future__ import annotations
+"""What a resumed run is made of: its own configuration, and what the command line may change in it."""
 
 import copy
 from collections.abc import Iterable
@@ -13,10 +8,10 @@ from typing import Any
 from ocp_torch.certificate import table
 from ocp_torch.errors import InputError
 from ocp_torch.files.limits import require_modest_problem, require_modest_run
+from ocp_torch.files.plain import value_at
 from ocp_torch.files.reading import read_json
 from ocp_torch.problems import PROBLEMS
-from ocp_torch.problems.commands import UNKNOWN, ForeignProblem, naming
-from ocp_torch.problems.renamed import PACKAGE
+from ocp_torch.problems.commands import PACKAGE, UNKNOWN, ForeignProblem, naming
 from ocp_torch.runs.configuration import current, saved_configuration
 from ocp_torch.training.checkpoint import LAST
 
@@ -66,6 +61,7 @@ def resumed_configuration(composed: dict, named: Iterable[str]) -> dict:
     problem: Any = result.get("problem")
     target = problem.get("_target_") if isinstance(problem, dict) else None
     if target not in OWN_TARGETS and not {"problem", "problem._target_"} & set(named):
+        # A problem that is not the package's own is never imported because a file names it.
         raise ForeignProblem(
             f"the configuration of {path} names the problem {str(target)[:80]!r}, which is not part of ocp_torch and is not "
             f"imported for a file; name it yourself: problem._target_={UNKNOWN}.",
@@ -108,25 +104,18 @@ def filled_from(config: dict, made: object) -> dict:
 def require_same_run(config: dict, made: dict) -> None:
     """Raise `InputError` when a field that the checkpoint's tensors belong to differs between ``config`` and ``made``."""
     for field in FIXED:
-        for name, (own, other) in _differences(_at(config, field), _at(made, field), field):
-            if not name.endswith("._target_"):
-                raise InputError(
-                    f"{name} is {own!r}, but the run has {repr(other)[:80]}, and it cannot change at a resume; "
-                    "fields of trainer, certificate, optimizer, schedule and stepper can."
-                )
+        _require_same(field, value_at(config, field), value_at(made, field))
 
 
-def _at(config: object, field: str):
-    for key in field.split("."):
-        config = config.get(key) if isinstance(config, dict) else None
-    return config
-
-
-def _differences(one: object, other: object, name: str) -> list[tuple[str, tuple]]:
-    if isinstance(one, dict) and isinstance(other, dict):
-        keys = list(dict.fromkeys([*one, *other]))
-        return [d for k in keys for d in _differences(one.get(k), other.get(k), f"{name}.{k}")]
-    return [] if one == other else [(name, (one, other))]
+def _require_same(name: str, own: object, other: object) -> None:
+    if isinstance(own, dict) and isinstance(other, dict):
+        for key in dict.fromkeys([*own, *other]):
+            _require_same(f"{name}.{key}", own.get(key), other.get(key))
+    elif own != other and not name.endswith("._target_"):
+        raise InputError(
+            f"{name} is {own!r}, but the run has {repr(other)[:80]}, and it cannot change at a resume; "
+            "fields of trainer, certificate, optimizer, schedule and stepper can."
+        )
 
 
 def result_of(folder: Path, state: dict, config: dict) -> str | None:

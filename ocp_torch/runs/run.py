@@ -1,31 +1,72 @@
-"""One run in its folder, from wherever it is to its end: it begins or goes on, trains, and is finished."""
-
-from __future__ import annotations
+"""One run in its folder: made from a configuration, it begins or goes on, trains, and is finished."""
 
 import logging
 import shutil
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
+from torch import Tensor
+
 from ocp_torch.certificate import Certificate, CertificateSettings, table
-from ocp_torch.errors import InputError, StorageError
+from ocp_torch.certificate.settings import require_possible
+from ocp_torch.errors import InputError, StorageError, require_integer
 from ocp_torch.fields import Fields
+from ocp_torch.files.limits import require_held
 from ocp_torch.files.reading import require_unlinked
 from ocp_torch.files.storage import sweep_temporaries
-from ocp_torch.runs import completion
-from ocp_torch.runs.configuration import keep_configuration, latest_subfolder
-from ocp_torch.runs.finish import failure_of, hand_out, salvaged, unless_it_failed, with_warnings
-from ocp_torch.runs.metrics import write_metrics
-from ocp_torch.runs.resume import result_of
-from ocp_torch.runs.training_run import TrainingRun
+from ocp_torch.runs.build import build_certificate_settings, build_trainer
+from ocp_torch.runs.configuration import keep_configuration, load_state, starts
+from ocp_torch.runs.finish import complete, failure_of, hand_out, missing, salvaged, unless_it_failed, with_warnings
+from ocp_torch.runs.loading import policy_of
+from ocp_torch.runs.metrics.trial import write_metrics
+from ocp_torch.runs.resume import filled_from, require_same_run, result_of
 from ocp_torch.training.checkpoint import LAST
-from ocp_torch.training.generators import seed_generators
 from ocp_torch.training.monitor import Monitor
-from ocp_torch.training.signals import Signals
-from ocp_torch.training.stopping import TARGET_GAP, postpone
+from ocp_torch.training.state import seed_generators
+from ocp_torch.training.stopping import TARGET_GAP, Signals, postpone
 from ocp_torch.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """A run that is ready to go: its trainer, where it begins or where its checkpoint left it; and of one that was resumed
+    the ``state`` it was given, and a sentence on each newer checkpoint that is damaged."""
+
+    config: dict
+    trainer: Trainer
+    settings: CertificateSettings
+    state: dict | None = None
+    notes: tuple[str, ...] = ()
+
+
+def training_run(config: dict) -> TrainingRun:
+    """The run that the plain ``config`` describes, at the checkpoint that its ``resume`` names, which is read once.
+
+    Raises `InputError` for any wrong field, damaged file, or change that a resume cannot make; writes nothing.
+    """
+    own = {name: value for name, value in config.items() if name != "resume"}
+    state, notes = None, list[str]()
+    if config.get("resume") is not None:
+        state, checkpoint, notes = load_state(Path(config["resume"]))
+        if not isinstance(state, dict) or not isinstance(state.get("config"), dict):
+            raise InputError(f"{checkpoint} is not the state of a run.")
+        made = state["config"]
+        own = filled_from(own, made)
+        fields = state.get("fields")
+        held = [t.numel() for t in fields.values() if isinstance(t, Tensor)] if isinstance(fields, dict) else []
+        require_held(checkpoint, own.get("model"), sum(held))
+    # A problem that draws random numbers while it is made draws the same ones in every process.
+    seed_generators(require_integer("seed", own["seed"], 0))
+    trainer = build_trainer(own)
+    if state is not None:
+        require_same_run(trainer.config, made)
+        trainer.resume(checkpoint, state)
+    settings = build_certificate_settings(trainer.config)
+    require_possible(trainer.problem, settings, trains_value=trainer.fields.value is not None)
+    return TrainingRun(config, trainer, settings, state, tuple(notes))
 
 
 def train(run: TrainingRun, folder: Path) -> None:
@@ -34,20 +75,20 @@ def train(run: TrainingRun, folder: Path) -> None:
     for note in run.notes:
         log.warning("warning: %s", note)
     # What Hydra wrote is what was asked for, not what the run is.
-    if run.state is not None or latest_subfolder(folder) != folder / ".hydra":
+    if run.state is not None or len(starts(folder)) > 1:
         keep_configuration(folder, run.config)
     if run.state is not None:
         result = result_of(folder, run.state, run.trainer.config)
-        lacking = completion.missing(folder, run.trainer, run.certificate_settings)
+        lacking = missing(folder, run.trainer, run.settings)
         if result is not None and lacking is not None:
             log.info("%s lacks %s; what is missing is made.", folder, lacking)
         elif result is not None:
             log.info("\n%s\n%s is finished; a larger trainer.steps would go on.", result, folder)
             return
-    run_to_end(run.trainer, run.certificate_settings, folder)
+    run_to_end(run.trainer, run.settings, folder)
 
 
-def run_to_end(trainer: Trainer, certificate_settings: CertificateSettings, folder: Path) -> Certificate:
+def run_to_end(trainer: Trainer, settings: CertificateSettings, folder: Path) -> Certificate:
     """Fill ``folder`` with a run: events, `checkpoints/`, `certificate.json`, `controller.safetensors`, figures, and
     `metrics.json` for problems with numbers of their own.
 
@@ -64,23 +105,23 @@ def run_to_end(trainer: Trainer, certificate_settings: CertificateSettings, fold
     log.info(summary(trainer))
     try:
         with Signals() as signals, Monitor(folder, trainer) as monitor:
-            trainer.tell, failure = monitor.certifying, None
+            trainer.tell, failure = lambda stage: monitor.stages(f"certifying: {stage}"), None
             try:
-                certificate, fields = _trained(trainer, certificate_settings, monitor, last, signals)
+                certificate, fields = _trained(trainer, settings, monitor, last, signals)
             except (Exception, SystemExit) as error:
                 failure = failure_of(trainer, error)
                 if failure is None:
                     raise
-                certificate, fields = salvaged(trainer, certificate_settings, failure, monitor)
-            kind, policy = hand_out(trainer, certificate, fields, folder, monitor, failure)
+                certificate, fields = salvaged(trainer, settings, failure, monitor)
+            controller = hand_out(trainer, certificate, fields, folder, monitor, failure)
     except OSError as error:
         raise StorageError(f"{folder} cannot be written to: {error.strerror or error}.") from None
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
-    if certificate_settings.trajectories:
+    if settings.trajectories:
         with unless_it_failed(failure, trainer):
-            write_metrics(trainer.problem, policy, trainer.seed, folder)
-    completion.complete(folder)
-    log.info("controller from %s, %.0f s in all, in %s", kind, time.perf_counter() - started, folder)
+            write_metrics(trainer.problem, policy_of(controller), trainer.seed, folder)
+    complete(folder)
+    log.info("controller from %s, %.0f s in all, in %s", controller.kind, time.perf_counter() - started, folder)
     if failure is not None:
         which = "the best look before" if trainer.health.best else f"step {trainer.step}, without any look"
         raise InputError(f"{failure.rstrip('.')}; the controller in {folder} is that of {which}.")

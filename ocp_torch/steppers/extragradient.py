@@ -1,12 +1,10 @@
 """Extragradient (stochastic mirror-prox, equations 18 and 19 of the paper) around any optimiser."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch
 
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.objectives.objective import Phase
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers.stepper import Stepper, StepReport
 
@@ -23,8 +21,8 @@ class Extragradient(Stepper):
     def step(self, batches: Sequence[Samples], phase: Phase) -> StepReport:
         first, second = batches
         origin = self._parameters()
-        ahead, _ = self._differentiate(first, phase)
-        self._update(ahead)
+        players, _ = self._differentiate(first, phase)
+        self._update(players, ahead=True)
         counted = self._parameters()
         try:
             losses, norms = self._differentiate(second, phase)
@@ -33,5 +31,4 @@ class Extragradient(Stepper):
             with torch.no_grad():
                 torch._foreach_copy_(list(self.fields.parameters()), origin)
         self._update(losses)
-        self._advance_schedules(losses)
         return StepReport(losses, norms, batches, counted)

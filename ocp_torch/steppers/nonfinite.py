@@ -1,15 +1,9 @@
 """Where a loss or a gradient first is not finite: whose it is, of which field, and at which state of the batch."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-
 import torch
-from torch import Tensor
 
-from ocp_torch.fields.fields import Fields
-from ocp_torch.objectives.objective import Objective
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.fields import Fields
+from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems.samples import Samples
 
 DATA = {"f": "the state cost", "a": "the drift", "B": "the control matrix", "mu0": "the initial density"}
@@ -25,35 +19,30 @@ class NonFiniteError(ArithmeticError):
 
 def first_nonfinite(objective: Objective, fields: Fields, samples: Samples, phase: Phase) -> str:
     """The first thing that is not finite, in words; one state at a time, as slow as that is: the run is over anyway."""
+    owners = {field: player for player, names in objective.players.items() for field in names}
     for name, parameter in fields.named_parameters():
-        if not torch.isfinite(parameter).all():
-            return (
-                f"the loss of player {_player(objective, name)!r} is not finite at any x: the weights of {name} are not"
-            )
+        if not parameter.isfinite().all():
+            player = owners.get(name.split(".")[1], "?")  # as in networks.value.hidden.0.weight
+            return f"the loss of player {player!r} is not finite at any x: the weights of {name} are not"
     losses = objective.losses(fields, samples, phase)
-    bad = [player for player, loss in losses.items() if not torch.isfinite(loss)]
+    bad = [player for player, loss in losses.items() if not loss.isfinite()]
+    what = f"the loss of player {bad[0]!r} is not finite" if bad else "a gradient is not finite"
     for one in samples.split(1):
-        where = f"at x = {[round(c, 6) for c in one.x[0].tolist()]}"
-        cause = _bad_data(one)
+        where = f"at x = {[round(c, 6) for c in one.x[0].tolist()]}{_bad_data(one)}"
         try:
             alone = objective.losses(fields, one, phase)
         except RuntimeError:  # the loss is not a mean over states
-            return f"the loss of player {bad[0]!r} is not finite" if bad else "a gradient is not finite"
+            return what
         for player in bad:
-            if not torch.isfinite(alone[player]):
-                return f"the loss of player {player!r} is not finite {where}{cause}"
+            if not alone[player].isfinite():
+                return f"the loss of player {player!r} is not finite {where}"
         for player in () if bad else alone:
             for field in objective.players[player]:
-                if not _finite_gradient(alone[player], fields.parameters_of([field])):
-                    return f"a gradient is not finite: that of player {player!r} for its {field} {where}{cause}"
-    if bad:
-        return f"the loss of player {bad[0]!r} is not finite: its terms are, but too large to be added up"
-    return "a gradient is not finite: its terms are, but too large to be added up"
-
-
-def _player(objective: Objective, parameter: str) -> str:
-    owners = {field: player for player, names in objective.players.items() for field in names}
-    return next((player for field, player in owners.items() if f".{field}." in f".{parameter}"), "?")
+                parameters = fields.parameters_of([field])
+                gradients = torch.autograd.grad(alone[player], parameters, retain_graph=True, allow_unused=True)
+                if not all(g is None or g.isfinite().all() for g in gradients):
+                    return f"{what}: that of player {player!r} for its {field} {where}"
+    return f"{what}: its terms are, but too large to be added up"
 
 
 def _bad_data(one: Samples) -> str:
@@ -62,8 +51,3 @@ def _bad_data(one: Samples) -> str:
         if values is not None and not torch.isfinite(values).all():
             return f", where {words} of the problem is not finite{BROKEN_PROBLEM}"
     return ""
-
-
-def _finite_gradient(loss: Tensor, parameters: Sequence[Tensor]) -> bool:
-    gradients = torch.autograd.grad(loss, parameters, retain_graph=True, allow_unused=True)
-    return all(g is None or bool(torch.isfinite(g).all()) for g in gradients)

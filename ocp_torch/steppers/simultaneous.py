@@ -1,10 +1,8 @@
 """Simultaneous gradient steps: every player moves at once, from the same point and the same samples."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.objectives.objective import Phase
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers.stepper import Stepper, StepReport
 
@@ -17,5 +15,4 @@ class Simultaneous(Stepper):
         losses, norms = self._differentiate(samples, phase)
         counted = self._parameters()
         self._update(losses)
-        self._advance_schedules(losses)
         return StepReport(losses, norms, batches, counted)

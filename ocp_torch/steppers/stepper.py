@@ -1,7 +1,5 @@
 """One step of the game: what simultaneous and extragradient steps share. The arithmetic is `torch.optim`'s."""
 
-from __future__ import annotations
-
 import copy
 import warnings
 from abc import ABC, abstractmethod
@@ -15,9 +13,8 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from ocp_torch.errors import InputError
-from ocp_torch.fields.fields import Fields
-from ocp_torch.objectives.objective import Objective
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.fields import Fields
+from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM, NonFiniteError, first_nonfinite
 
@@ -63,14 +60,11 @@ class Stepper(ABC):
         unit: float = 1.0,
     ) -> None:
         self.fields, self.objective, self.radius, self.clip, self.unit = fields, objective, radius, clip, unit
-        self.parameters: dict[str, list[Any]] = {
-            player: fields.parameters_of(names) for player, names in objective.players.items()
-        }
-        self.optimizers = {player: optimizers[player](self.parameters[player]) for player in objective.players}
-        delays = objective.delays
-        self.schedules = {p: schedule(optimizer, delays.get(p, 0.0)) for p, optimizer in self.optimizers.items()}
-        self._configured = {p: _hyper_parameters(optimizer) for p, optimizer in self.optimizers.items()}
-        self._unmoved = {p: copy.deepcopy(s.state_dict()) for p, s in self.schedules.items()}
+        self.parameters: dict[str, list[Any]] = {p: fields.parameters_of(n) for p, n in objective.players.items()}
+        self.optimizers = {player: optimizers[player](own) for player, own in self.parameters.items()}
+        self.delays = {player: objective.delays.get(player, 0.0) for player in objective.players}
+        self.schedules = {player: schedule(o, self.delays[player]) for player, o in self.optimizers.items()}
+        self._start = copy.deepcopy(self.state_dict())
 
     @abstractmethod
     def step(self, batches: Sequence[Samples], phase: Phase) -> StepReport:
@@ -92,18 +86,21 @@ class Stepper(ABC):
     def load_state_dict(self, state: dict, moves: dict[str, int] | None = None) -> None:
         """Go on from ``state`` exactly; or, with ``moves``, with its moments but with this stepper's own hyper-parameters and
         schedules, those after so many moves of each player."""
+        start = copy.deepcopy(self._start)
         for player, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][player])
+            schedule = self.schedules[player]
             if moves is None:
-                self.schedules[player].load_state_dict(state["schedules"][player])
+                schedule.load_state_dict(state["schedules"][player])
                 continue
-            self.schedules[player].load_state_dict(copy.deepcopy(self._unmoved[player]))
-            for group, configured in zip(optimizer.param_groups, self._configured[player], strict=True):
-                group.update(configured)
+            schedule.load_state_dict(start["schedules"][player])
+            configured = start["optimizers"][player]["param_groups"]
+            for group, own in zip(optimizer.param_groups, configured, strict=True):
+                group.update(own, params=group["params"])
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # that the optimiser did not step in between
                 for _ in range(moves[player]):
-                    self.schedules[player].step()
+                    schedule.step()
 
     def _parameters(self) -> list[Tensor]:
         """A copy of all parameters as they stand."""
@@ -112,48 +109,34 @@ class Stepper(ABC):
     def _differentiate(self, samples: Samples, phase: Phase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Set each parameter's gradient to that of its own player's loss; losses and gradient norms per player."""
         losses = self.objective.losses(self.fields, samples, phase)
-        moving = {player: self.parameters[player] for player in losses}
-        gradients = {}
-        for i, (player, parameters) in enumerate(moving.items()):
-            more = i < len(moving) - 1
-            loss = losses[player] if self.unit == 1.0 else losses[player] / self.unit
-            gradients[player] = torch.autograd.grad(loss, parameters, retain_graph=more, allow_unused=True)
+        *_, last = losses
         norms = {}
-        for player, parameters in moving.items():
-            for parameter, gradient in zip(parameters, gradients[player], strict=True):
+        for player, loss in losses.items():
+            own = self.parameters[player]
+            more = player != last
+            gradients = torch.autograd.grad(loss / self.unit, own, retain_graph=more, allow_unused=True)
+            for parameter, gradient in zip(own, gradients, strict=True):
                 # A bias that only shifts V gets no gradient where only grad V matters.
                 parameter.grad = torch.zeros_like(parameter) if gradient is None else gradient
-            norms[player] = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
-        self._require_finite(losses, norms, samples, phase)
-        if self.clip is not None:
-            for player, parameters in moving.items():
-                torch.nn.utils.clip_grads_with_norm_(parameters, self.clip, norms[player])
-        return {player: loss.detach() for player, loss in losses.items()}, norms
-
-    def _require_finite(
-        self, losses: dict[str, Tensor], norms: dict[str, Tensor], samples: Samples, phase: Phase
-    ) -> None:
-        checks = torch.stack([*losses.values(), *norms.values()])
-        if not torch.isfinite(checks).all():
+            norms[player] = torch.nn.utils.get_total_norm([p.grad for p in own])
+        if not torch.stack([*losses.values(), *norms.values()]).isfinite().all():
             what = first_nonfinite(self.objective, self.fields, samples, phase)
             advice = "" if what.endswith(BROKEN_PROBLEM) else "; try a smaller optimizer.lr, or stepper.clip"
             raise NonFiniteError(f"{what}{advice}.")
+        if self.clip is not None:
+            for player, norm in norms.items():
+                torch.nn.utils.clip_grads_with_norm_(self.parameters[player], self.clip, norm)
+        return {player: loss.detach() for player, loss in losses.items()}, norms
 
-    def _update(self, players: Iterable[str]) -> None:
-        """One update of ``players`` with the gradients in place, then the projection."""
+    def _update(self, players: Iterable[str], ahead: bool = False) -> None:
+        """One update of ``players`` with the gradients in place, then the projection. A player's schedule counts its own
+        moves, but not those that only look ``ahead``."""
         for player in players:
             self.optimizers[player].step()
             if self.radius is not None:
                 project_on_ball(self.parameters[player], self.radius)
-
-    def _advance_schedules(self, players: Iterable[str]) -> None:
-        """A player's schedule counts its own moves."""
-        for player in players:
-            self.schedules[player].step()
-
-
-def _hyper_parameters(optimizer: Optimizer) -> list[dict]:
-    return [{k: v for k, v in group.items() if k != "params"} for group in optimizer.param_groups]
+            if not ahead:
+                self.schedules[player].step()
 
 
 @torch.no_grad()

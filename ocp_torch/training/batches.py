@@ -1,8 +1,7 @@
 """Training batches: states of a sampler and, where that pays, states that the controller in training visits."""
 
-from __future__ import annotations
-
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,6 +24,7 @@ MOST_VISITED = 0.9
 STEP_TIME, LONGEST_STEP = 0.05, 0.05
 
 
+@dataclass(eq=False)
 class Batches:
     r"""``size`` states a batch for ``objective``; the part ``visited`` of them comes from the closed loop of the present `V`.
 
@@ -38,47 +38,38 @@ class Batches:
     [0, 0.9], or above 0 for a method without `V` or a problem that has data only where it was recorded.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        fields: Fields,
-        objective: Objective,
-        sampler,
-        size: int,
-        seed: int,
-        visited: float | None = None,
-    ) -> None:
-        self.problem, self.fields, self.objective, self.sampler, self.size = problem, fields, objective, sampler, size
-        self.visited = (
-            None if visited is None else require_number("sampler.visited", visited, at_least=0.0, at_most=MOST_VISITED)
-        )
-        self._possible = VALUE in objective.fields and problem.has_simulator
+    problem: Problem
+    fields: Fields
+    objective: Objective
+    sampler: Any  # one of `SAMPLERS`, or of the rows of a data set
+    size: int
+    seed: int
+    visited: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.visited is not None:
+            self.visited = require_number("sampler.visited", self.visited, at_least=0.0, at_most=MOST_VISITED)
+        self._possible = VALUE in self.objective.fields and self.problem.has_simulator
         if self.visited and not self._possible:
-            lacks = (
-                "a data set has no data at other states"
-                if not problem.has_simulator
-                else "this method has no V to follow"
-            )
-            raise InputError(f"sampler.visited is {visited:g}, but {lacks}; leave it out.")
-        self.generator = torch.Generator().manual_seed(derive_seed(seed, Branch.VISITS))
+            elsewhere = "a data set has no data at other states"
+            lacks = "this method has no V to follow" if self.problem.has_simulator else elsewhere
+            raise InputError(f"sampler.visited is {self.visited:g}, but {lacks}; leave it out.")
+        self.generator = torch.Generator().manual_seed(derive_seed(self.seed, Branch.VISITS))
         self.states: Tensor | None = None  # (k, d), where the visited states are now
 
     def draw(self, phase: Phase) -> Samples:
         """The next batch, with what the objective needs at ``phase``, in the precision and on the device of the fields."""
         like = next(self.fields.parameters())
-        count = self._count(phase)
+        part = self.visited
+        if part is None:
+            part = VISITED if self._possible and phase.constants.unbounded else 0.0
+        count = min(int(part * self.size), self.size - 1)
         places = self.sampler.draw(self.size - count).to(like.device)
         divergences = self.objective.needs_divergences(phase)
         drawn = self.problem.samples(places, divergences=divergences)
         if not self.problem.has_simulator:
             return drawn.to(like)
         return self._with_visited(drawn, count, like, divergences) if count else drawn
-
-    def _count(self, phase: Phase) -> int:
-        part = self.visited
-        if part is None:
-            part = VISITED if self._possible and phase.constants.unbounded else 0.0
-        return min(int(part * self.size), self.size - 1)
 
     def _with_visited(self, drawn: Samples, count: int, like: Tensor, divergences: bool) -> Samples:
         if self.states is None or len(self.states) != count:
@@ -117,11 +108,7 @@ class Batches:
         """The way back from `state_dict`. Raises `InputError` where the visited states are none."""
         self.sampler.load_state_dict(state["sampler"])
         self.generator.set_state(state["generator"])
-        states = state["states"]
-        if states is not None and (
-            states.ndim != 2 or states.shape[1] != self.problem.dim or not states.isfinite().all()
-        ):
-            raise InputError(
-                f"the checkpoint holds visited states that are no states of {self.problem.dim} coordinates."
-            )
+        states, dim = state["states"], self.problem.dim
+        if states is not None and (states.ndim != 2 or states.shape[1] != dim or not states.isfinite().all()):
+            raise InputError(f"the checkpoint holds visited states that are no states of {dim} coordinates.")
         self.states = states

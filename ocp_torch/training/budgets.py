@@ -1,7 +1,5 @@
 """Training budgets by dimension, for every field of the configuration that is null: what won in measurements."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass, replace
 from math import inf
@@ -54,27 +52,26 @@ def fill(config: dict, problem: Problem) -> dict:
     method = require_section("method", config.get("method") or {})
     model = MODELS[require_choice("model.name", config["model"].get("name"), MODELS)]
     unbounded = is_unbounded(problem, method.get("occupation_bound"))
-    of_method: dict[tuple[str, ...], object] = {}
     if unbounded:
-        if method.get("name") == "pd" and config["trainer"].get("batch") is None:
-            of_method = {("method", "density_batch"): DENSITY_BATCH}
         budget = replace(budget, batch=max(budget.batch, LARGE_BATCH), steps=max(budget.steps, MANY_STEPS))
-    defaults: dict[tuple[str, ...], object] = {
-        **{("model", name): value for name, value in model.defaults(problem.dim, worst_state=unbounded).items()},
-        ("trainer", "rounds"): 2 if config["trainer"].get("steps") is None else 1,
-        ("trainer", "good_gap"): budget.good_gap,
-        ("trainer", "steps"): budget.steps,
-        ("trainer", "batch"): budget.batch,
-        ("optimizer", "lr"): LEARNING_RATE,
-        ("sampler", "name"): WORST_STATE_SAMPLER if unbounded else SAMPLER,
-        ("certificate", "stage", "steps"): budget.stage_steps,
-        **of_method,
+    defaults: dict[str, object] = {
+        **{f"model.{name}": value for name, value in model.defaults(problem.dim, worst_state=unbounded).items()},
+        "trainer.rounds": 2 if config["trainer"].get("steps") is None else 1,
+        "trainer.good_gap": budget.good_gap,
+        "trainer.steps": budget.steps,
+        "trainer.batch": budget.batch,
+        "optimizer.lr": LEARNING_RATE,
+        "sampler.name": WORST_STATE_SAMPLER if unbounded else SAMPLER,
+        "certificate.stage.steps": budget.stage_steps,
     }
-    for (*path, name), value in defaults.items():
+    if unbounded and method.get("name") == "pd" and config["trainer"].get("batch") is None:
+        defaults["method.density_batch"] = DENSITY_BATCH
+    for path, value in defaults.items():
+        *groups, name = path.split(".")
         section = filled
-        for depth, key in enumerate(path, start=1):
-            require_section(".".join(path[:depth]), section.setdefault(key, {}))
-            section = section[key]
+        for depth, group in enumerate(groups, start=1):
+            require_section(".".join(groups[:depth]), section.setdefault(group, {}))
+            section = section[group]
         if section.get(name) is None:
             section[name] = value
     return filled

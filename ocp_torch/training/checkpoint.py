@@ -1,7 +1,5 @@
 """`checkpoints/*.pt`: written atomically behind a digest, read without running code from them."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import io
@@ -36,7 +34,6 @@ def save_checkpoint(path: Path, state: dict, keep: int = 1) -> None:
     if len(content) + LONGEST_HEADER > LARGEST_FILE:
         raise StorageError(f"{path} would have {len(content):,} bytes, but none above {LARGEST_FILE:,} is read back.")
     header = f"{MAGIC} {SCHEMA} {hashlib.sha256(content).hexdigest()}\n".encode()
-
     # Older files move only once the new one is safe: a full disk must not cost one of them.
     write_atomically(path, lambda temporary: temporary.write_bytes(header + content), lambda: _make_room(path, keep))
 
@@ -91,9 +88,8 @@ def newest(folder: Path) -> tuple[dict, Path, list[str]]:
 
     Raises `InputError` when none is.
     """
-    ages = sorted(folder.glob("last*.pt"), key=_age)
     refused: list[str] = []
-    for path in [*ages, folder / BEST]:
+    for path in [*sorted(folder.glob("last*.pt"), key=_age), folder / BEST]:
         try:
             return load_checkpoint(path), path, refused
         except InputError as error:
@@ -105,5 +101,5 @@ def newest(folder: Path) -> tuple[dict, Path, list[str]]:
 
 
 def _age(path: Path) -> int:
-    suffix = path.stem.removeprefix("last").removeprefix("-")
+    suffix = path.stem.removeprefix("last-")
     return int(suffix) if suffix.isdecimal() else 0

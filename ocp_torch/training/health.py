@@ -1,17 +1,16 @@
 """Whether a run is going anywhere: its best evaluation so far, and signs that it diverges or learns nothing."""
 
-from __future__ import annotations
-
 import copy
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 
 import torch
 from torch import Tensor
 
 from ocp_torch.certificate import Certificate
+from ocp_torch.certificate.estimate import known
 from ocp_torch.errors import notes
-from ocp_torch.fields.fields import typical_sizes
+from ocp_torch.fields.fields import Fields, typical_sizes
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
@@ -39,27 +38,26 @@ class Evaluation:
     noise: float
 
     @classmethod
-    def at(cls, step: int, certificate: Certificate) -> Evaluation:
-        lower, perf = certificate.best_lower, certificate.best_perf
+    def at(cls, step: int, certificate: Certificate) -> "Evaluation":
+        lower, perf, gap = certificate.best_lower, certificate.best_perf, certificate.gap["simulated"]
         ends = [certificate.lower[lower[0]]] if lower else []
         ends += [certificate.perf[perf[0]]] if perf else []
         errors = sum(e.half_width(certificate.confidence) for e in ends if e is not None)
-        gap = certificate.gap["simulated"]
         unit = lower[1] if lower and gap is not None else perf[1] if perf else 1.0
         return cls(step, gap, perf[1] if perf else None, errors / abs(unit) if unit else 0.0)
 
-    def better_than(self, other: Evaluation | None, sure: bool = False) -> bool:
+    def better_than(self, other: "Evaluation | None", sure: bool = False) -> bool:
         """By the gap, or by the performance where neither has one; with ``sure``, by more than the noise of both."""
         if other is None:
             return self.gap is not None or self.perf is not None
         margin = self.noise + other.noise if sure else 0.0
-        if self.gap is None and other.gap is None:
-            if self.perf is None or other.perf is None:
-                return self.perf is not None
-            return self.perf + margin * abs(other.perf) < other.perf
-        if self.gap is None or other.gap is None:
+        if self.gap is not None and other.gap is not None:
+            return self.gap + margin < other.gap
+        if self.gap is not None or other.gap is not None:
             return self.gap is not None
-        return self.gap + margin < other.gap
+        if self.perf is not None and other.perf is not None:
+            return self.perf + margin * abs(other.perf) < other.perf
+        return self.perf is not None
 
     def in_words(self) -> str:
         """What fields are judged by, as a user is told."""
@@ -68,29 +66,25 @@ class Evaluation:
         return f"a performance of {self.perf or float('nan'):.6g}"
 
 
+@dataclass(eq=False)
 class Health:
-    """Follows a run. ``best`` is the best `Evaluation` so far, ``fields`` the averaged fields it was of and ``certificate``
-    what it said (not kept in checkpoints); ``notes`` are what a user should be told of the run's health; ``unit`` is the
-    size of the problem's costs."""
+    """Follows a run."""
 
-    def __init__(self, unit: float) -> None:
-        self.best: Evaluation | None = None
-        self.fields: dict | None = None
-        self.certificate: Certificate | None = None
-        self.notes: list[str] = []
-        self.warned = False  # that a certificate was no better than not having trained
-        self._unit = unit
-        self._start: dict[str, float] = {}
+    unit: float  # the size of the problem's costs
+    best: Evaluation | None = None  # so far
+    fields: dict | None = None  # the averaged fields it was of
+    certificate: Certificate | None = None  # what it said; not kept in checkpoints
+    notes: list[str] = field(default_factory=list)  # what a user should be told of the run's health
+    warned: bool = False  # that a certificate was no better than not having trained
+    start: dict[str, float] = field(default_factory=dict)  # how large losses and weights were
 
     @classmethod
-    def of(cls, problem: Problem) -> Health:
+    def of(cls, problem: Problem) -> "Health":
         """Of a run on ``problem``, before its first step."""
         (mean, spread), _ = typical_sizes(problem)
         return cls(unit=abs(mean) + spread)
 
-    def evaluated(
-        self, evaluation: Evaluation, fields: torch.nn.Module, certificate: Certificate | None = None
-    ) -> bool:
+    def evaluated(self, evaluation: Evaluation, fields: Fields, certificate: Certificate | None = None) -> bool:
         """Take note of an evaluation of ``fields``; whether it is the best so far."""
         if not evaluation.better_than(self.best):
             return False
@@ -100,13 +94,13 @@ class Health:
 
     def stepped(self, step: int, losses: dict[str, Tensor], parameters: Mapping[str, Sequence[Tensor]]) -> list[str]:
         """Hold sizes against those at the start; a sentence, once, on each that has grown without end."""
-        sizes = {f"the loss of player {p!r}": (abs(float(loss)), GROWN_LOSS, self._unit) for p, loss in losses.items()}
+        sizes = {f"the loss of player {p!r}": (abs(float(loss)), GROWN_LOSS, self.unit) for p, loss in losses.items()}
         for player in losses:
             norm = float(torch.nn.utils.get_total_norm(parameters[player]))
             sizes[f"the norm of the weights of player {player!r}"] = (norm, GROWN_WEIGHTS, 1e-12)
         fresh = []
         for what, (size, limit, unit) in sizes.items():
-            start = self._start.setdefault(what, max(size, unit))
+            start = self.start.setdefault(what, max(size, unit))
             if size > limit * start and not any(note.startswith(what) for note in self.notes):
                 fresh.append(
                     f"{what} grew from {start:.3g} to {size:.3g} by step {step}: this run diverges; "
@@ -115,43 +109,40 @@ class Health:
         self.notes += fresh
         return fresh
 
-    def doubts(self, step: int, contradiction: str | None, sanity: Callable[[], list[str]]) -> list[str]:
+    def doubts(self, step: int, contradiction: str | None, found: list[str]) -> list[str]:
         """What the certificate at ``step`` gives reason to doubt, each said once in a run: a ``contradiction`` of bounds, and
-        whatever ``sanity`` finds (see `sanity_warnings`)."""
+        what was ``found`` to be no better than not having trained."""
         fresh = []
         if contradiction is not None and not any(note.startswith(CONTRADICTED) for note in self.notes):
             fresh = [f"{CONTRADICTED} {step}: {contradiction}"]
             self.notes += fresh
-        found = [] if self.warned else sanity()
-        self.warned = self.warned or bool(found)
+        self.warned |= bool(found)
         return [*fresh, *(f"step {step}: {sentence}" for sentence in found)]
 
     def state_dict(self) -> dict:
-        best = asdict(self.best) if self.best else None
         told = {"notes": list(self.notes), "warned": self.warned}
-        return {"best": best, "fields": self.fields, "start": dict(self._start), **told}
+        return {"best": self.best and asdict(self.best), "fields": self.fields, "start": dict(self.start), **told}
 
     def load_state_dict(self, state: dict) -> None:
         self.best, self.certificate = Evaluation(**state["best"]) if state["best"] else None, None
         self.fields = copy.deepcopy(state["fields"])
         self.notes, self.warned = list(notes(state["notes"])), bool(state["warned"])
-        self._start = dict(state["start"])
+        self.start = dict(state["start"])
 
 
 def sanity_warnings(problem: Problem, constants: Constants, certificate: Certificate, seed: int) -> list[str]:
     """What ``certificate`` shows to be no better than not having trained."""
-    notes = []
+    found = []
     lower, zero, perf = certificate.best_lower, certificate.baseline.get("zero"), certificate.best_perf
-    trained = [e for e in certificate.lower.values() if e is not None]
-    constant = best_constant(problem, constants, seed) if trained else None
-    if constant is not None and certificate.counts("F_M"):
+    if certificate.counts("F_M") and any(e is not None for e in certificate.lower.values()):
+        constant = best_constant(problem, constants, seed)
         estimate = certificate.lower[lower[0]] if lower else None
         if estimate is None or estimate.above < constant - ROUNDING * abs(constant):
             value = f"{estimate.value:.6g}" if estimate else "not finite"
-            notes.append(f"the lower bound, {value}, is worse than {constant:.6g}, that of the best constant V.")
-    if perf is not None and zero is not None and zero.finite and perf[1] > zero.above:
-        notes.append("the best controller is worse than doing nothing.")
-    return notes
+            found.append(f"the lower bound, {value}, is worse than {constant:.6g}, that of the best constant V.")
+    if perf is not None and known(zero) and perf[1] > zero.above:
+        found.append("the best controller is worse than doing nothing.")
+    return found
 
 
 @torch.no_grad()

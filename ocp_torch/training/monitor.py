@@ -1,10 +1,10 @@
 """What a run shows while it goes: a progress bar, the log, and TensorBoard."""
 
-from __future__ import annotations
-
 import logging
+import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,37 +13,37 @@ from torch.utils.tensorboard.summary import hparams
 from tqdm import tqdm
 
 from ocp_torch.certificate import Certificate, CertificateSettings
+from ocp_torch.certificate.estimate import known_of
 from ocp_torch.control.policies import admissible_density, occupation_density
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import StepReport
 from ocp_torch.training.observer import Silent
-from ocp_torch.training.stages import Stages, in_words, rough_seconds
 from ocp_torch.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
 # How the names of TensorBoard's files begin.
 EVENTS = "events.out.tfevents."
+# A full certificate has cost 5 to 10 times a quick one, beside its own fit (measured on the circle, the pendulum and a
+# manufactured problem in four dimensions).
+QUICK_CERTIFICATES = 6.0
+TICK = 1.0  # seconds between two movements of the clock
+CLOCK = "{desc}: {elapsed}{postfix}"
 
 
 @torch.no_grad()
 def liouville_residual(trainer: Trainer, batch: Samples) -> dict[str, Tensor]:
     """`mean |mu0 - mu - div(a mu + B w) / rho|` on ``batch``, whatever gives `mu`: also where the loss needs no divergences
     (a player does not move yet, the plain saddle) or `mu` is in closed form. Nothing where the problem gives none."""
-    problem, fields = trainer.problem, trainer.fields
+    problem = trainer.problem
     samples = Samples.of(problem, batch.x) if problem.has_simulator else batch
     if samples.div_a is None or samples.div_B is None:
         return {}
-    form = (trainer.objective.occupation, problem, fields, trainer.constants)
-    generator = Generator.of(problem, samples)
+    form = (trainer.objective.occupation, problem, trainer.fields, trainer.constants)
+    generator, density = Generator.of(problem, samples), occupation_density(*form)
     _, inflow = generator.control_inflow(admissible_density(*form))
-    density = occupation_density(*form)
-    if problem.driftless:
-        outflow = density(samples.x)
-    else:
-        mu, drifted = generator.drift_flux_divergence(density)
-        outflow = mu + drifted / problem.discount
-    return {"residual_mean_absolute": samples.mean((inflow - outflow).abs())}
+    mu, drifted = (density(samples.x), 0.0) if problem.driftless else generator.drift_flux_divergence(density)
+    return {"residual_mean_absolute": samples.mean((inflow - (mu + drifted / problem.discount)).abs())}
 
 
 class Monitor(Silent):
@@ -56,14 +56,13 @@ class Monitor(Silent):
         self.writer = SummaryWriter(str(folder), purge_step=done + 1 if done else None)
         # disable=None: no bar where the output is not a terminal.
         hidden = None if trainer.settings.progress else True
-        options = dict(unit="step", dynamic_ncols=True, disable=hidden)
-        self.bar = tqdm(total=max(trainer.end, done), initial=done, **options)
+        self.bar = tqdm(total=max(trainer.end, done), initial=done, unit="step", dynamic_ncols=True, disable=hidden)
         self.stages = Stages(hidden)
         self._folder = folder
         self._shown: dict[str, str] = {}
         self._mark = (time.perf_counter(), trainer.samples)
 
-    def __enter__(self) -> Monitor:
+    def __enter__(self) -> "Monitor":
         return self
 
     def __exit__(self, *_) -> None:
@@ -76,30 +75,27 @@ class Monitor(Silent):
         if not log:
             return
         step, batch = trainer.step, report.batches[-1]
-        for player in report.losses:
-            self.writer.add_scalar(f"loss/{player}", float(report.losses[player]), step)
-            self.writer.add_scalar(f"gradient_norm/{player}", float(report.gradient_norms[player]), step)
-        shown = trainer.objective.diagnostics(trainer.fields, batch)
-        if "residual_mean_absolute" not in shown and trainer.fields.control_density is not None:
-            shown |= liouville_residual(trainer, batch)
-        for name, value in shown.items():
-            self.writer.add_scalar(f"violation/{name}", float(value), step)
-        for player, rate in trainer.stepper.learning_rates().items():
-            self.writer.add_scalar(f"lr/{player}", rate, step)
+        violation = trainer.objective.diagnostics(trainer.fields, batch)
+        if "residual_mean_absolute" not in violation and trainer.fields.control_density is not None:
+            violation |= liouville_residual(trainer, batch)
+        shown: dict[str, dict] = {"loss": report.losses, "gradient_norm": report.gradient_norms, "violation": violation}
+        for group, values in {**shown, "lr": trainer.stepper.learning_rates()}.items():
+            for name, value in values.items():
+                self.writer.add_scalar(f"{group}/{name}", float(value), step)
         now, (then, before) = time.perf_counter(), self._mark
         speed = (trainer.samples - before) / max(now - then, 1e-9)
         self._mark = (now, trainer.samples)
         self.writer.add_scalar("throughput/samples_per_second", speed, step)
-        self._show(**{"samples/s": f"{speed:,.0f}"})
+        self._show({"samples/s": f"{speed:,.0f}"})
 
     def evaluated(self, trainer: Trainer, certificate: Certificate) -> None:
         record(self.writer, certificate, trainer.step)
-        shown = {name: e for name, e in {**certificate.lower, **certificate.upper}.items() if e is not None}
-        values: dict[str, str] = {name: f"{shown[name].value:.6f}" for name in ("F_M", "J") if name in shown}
-        gaps = [gap for gap in (certificate.gap["certified"], certificate.gap["simulated"]) if gap is not None]
+        shown = certificate.lower | certificate.upper
+        values = {name: f"{e.value:.6f}" for name in ("F_M", "J") if (e := shown.get(name)) is not None}
+        gaps = [gap for kind in ("certified", "simulated") if (gap := certificate.gap[kind]) is not None]
         if gaps:
             values["gap"] = f"{100 * min(gaps):.2f}%"
-        self._show(**values)
+        self._show(values)
         # To train.log, not to the terminal.
         log.debug("step %d: %s", trainer.step, ", ".join(f"{k} {v}" for k, v in values.items()))
 
@@ -112,17 +108,13 @@ class Monitor(Silent):
 
     def stopped(self, trainer: Trainer, why: str, settings: CertificateSettings) -> None:
         """Training stopped, and the certificate is about to be made; says why, and about how long that takes."""
-        per_step = trainer.state.seconds / max(trainer.step, 1)
-        seconds = rough_seconds(trainer.evaluator.seconds, per_step, settings.stage.steps)
+        quick, per_step = trainer.evaluator.seconds, trainer.state.seconds / max(trainer.step, 1)
+        seconds = None if quick is None else QUICK_CERTIFICATES * quick + settings.stage.steps * per_step
         self.bar.clear()
         rest = f", in about {in_words(seconds)}" if seconds else ""
         log.info("%s; the certificate is next%s", why.rstrip("."), rest)
         self.bar.refresh()
         self.stages.begin(seconds)
-
-    def certifying(self, stage: str) -> None:
-        """A stage of the certificate begins."""
-        self.stages(f"certifying: {stage}")
 
     def finish(self, certificate: Certificate, figures: dict, settings: dict, step: int) -> None:
         """The last points: all numbers of ``certificate``, the Matplotlib ``figures`` by name, and the run's ``settings``,
@@ -142,22 +134,53 @@ class Monitor(Silent):
             for name, value in results.items():
                 writer.add_scalar(name, value)
 
-    def _show(self, **values: str) -> None:
+    def _show(self, values: dict[str, str]) -> None:
         self._shown |= values
         self.bar.set_postfix(self._shown, refresh=False)
 
 
 def record(writer: SummaryWriter, certificate: Certificate, step: int) -> None:
     """All numbers of ``certificate`` as scalars at ``step``."""
-    scalars = {f"bounds/{n}": e for g in ("lower", "upper") for n, e in getattr(certificate, g).items()}
-    scalars |= {f"performance/{n}": e for g in ("perf", "baseline") for n, e in getattr(certificate, g).items()}
-    for name, estimate in scalars.items():
-        if estimate is not None and estimate.finite:
-            writer.add_scalar(name, estimate.value, step)
-    if certificate.exact is not None:
-        writer.add_scalar("bounds/exact", certificate.exact, step)
-    for group in ("gap", "share"):
-        for kind in ("certified", "simulated"):
-            value = getattr(certificate, group)[kind]
-            if value is not None:
-                writer.add_scalar(f"{group}/{kind}", value, step)
+    bounds, simulated = certificate.lower | certificate.upper, certificate.perf | certificate.baseline
+    values = {f"bounds/{name}": estimate.value for name, estimate in known_of(bounds).items()}
+    values |= {f"performance/{name}": estimate.value for name, estimate in known_of(simulated).items()}
+    parts = {"gap": certificate.gap, "share": certificate.share}
+    shares = {f"{group}/{kind}": part[kind] for group, part in parts.items() for kind in ("certified", "simulated")}
+    for name, value in {**values, "bounds/exact": certificate.exact, **shares}.items():
+        if value is not None:
+            writer.add_scalar(name, value, step)
+
+
+def in_words(seconds: float) -> str:
+    """A duration as one says it."""
+    return f"{max(1, round(seconds))} s" if seconds < 90.0 else f"{round(seconds / 60.0)} min"
+
+
+class Stages:
+    """A clock with the name of the stage, in terminals; elsewhere, and in the log, a line per stage. Call it with a name."""
+
+    def __init__(self, hidden: bool | None) -> None:
+        self._hidden = hidden
+        self._clock: Any = None  # the bar, once the first has begun
+        self._over = threading.Event()
+
+    def begin(self, seconds: float | None) -> None:
+        """The first stage is about to begin, and all of them take about ``seconds``."""
+        if self._clock is None:
+            self._clock = tqdm(bar_format=CLOCK, dynamic_ncols=True, disable=self._hidden)
+            if not self._clock.disable:
+                threading.Thread(target=self._tick, daemon=True).start()
+        self._clock.set_postfix_str(f"about {in_words(seconds)} in all" if seconds else "", refresh=False)
+
+    def __call__(self, stage: str) -> None:
+        self._clock.set_description_str(stage)
+        log.log(logging.INFO if self._clock.disable else logging.DEBUG, "%s ...", stage)
+
+    def close(self) -> None:
+        self._over.set()
+        if self._clock is not None:
+            self._clock.close()
+
+    def _tick(self) -> None:
+        while not self._over.wait(TICK):
+            self._clock.refresh()

@@ -1,7 +1,5 @@
 """What is told of a run while it goes on."""
 
-from __future__ import annotations
-
 from ocp_torch.certificate import Certificate
 from ocp_torch.steppers import StepReport
 

@@ -1,7 +1,6 @@
-"""The trainer's own settings, validated where they are made."""
+"""The trainer's own settings, validated where they are made, and the rounds of steps that follow from them."""
 
-from __future__ import annotations
-
+import math
 from dataclasses import dataclass
 
 import torch
@@ -61,3 +60,23 @@ class TrainerSettings:
     def torch_device(self) -> torch.device:
         available = "cuda" if torch.cuda.is_available() else "cpu"
         return torch.device(available if self.device == "auto" else self.device)
+
+    def end(self, k: int) -> int:
+        """The number of steps after which round ``k`` (from 0), which has `2^k` times as many as the first, is over."""
+        return self.steps * (2 ** (k + 1) - 1)
+
+    def part_done(self, step: int, k: int) -> float:
+        """The part of round ``k`` that is done after ``step`` steps."""
+        return 1.0 - (self.end(k) - step) / (self.steps * 2**k)
+
+    def round_at(self, step: int) -> int:
+        """The round that a run is in after ``step`` steps."""
+        return next((k for k in range(self.rounds - 1) if step < self.end(k)), self.rounds - 1)
+
+    def moves(self, step: int, k: int, delay: float) -> int:
+        """How often a player has moved after ``step`` steps, in round ``k``, that waits for the part ``delay`` of each."""
+        count = 0
+        for j in range(k + 1):
+            length = self.steps * 2**j
+            count += max(0, min(length, step - self.end(j - 1)) - math.ceil(delay * length))
+        return count

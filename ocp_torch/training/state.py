@@ -1,23 +1,26 @@
 """Everything of a run that changes while it goes on: to be saved as plain data and tensors, and put back."""
 
-from __future__ import annotations
-
 import copy
+import random
 from dataclasses import dataclass, replace
+from typing import Any
 
+import numpy as np
 import torch
 
 from ocp_torch.errors import InputError, notes, require_integer, require_number, visible
 from ocp_torch.fields import Fields
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.constants import Constants
 from ocp_torch.steppers import Average, NonFiniteError, Stepper
 from ocp_torch.training.batches import Batches
-from ocp_torch.training.generators import generator_states, restore_generators
 from ocp_torch.training.health import Health
-from ocp_torch.training.rounds import Rounds
+from ocp_torch.training.settings import TrainerSettings
 
 # What decides the learning rates: where one of these differs at a resume, they are those of the new configuration.
-RATES = (("optimizer",), ("schedule",), ("trainer", "steps"))
+rates_of = lambda config: (config["optimizer"], config["schedule"], config["trainer"]["steps"])
+# What is saved just as it is.
+PLAIN = ("config", "step", "round", "samples", "seconds", "elapsed", "pending", "retry", "ended")
 
 
 @dataclass
@@ -43,20 +46,11 @@ class TrainState:
 
     def state_dict(self) -> dict:
         """All of it as plain data and tensors."""
-        (problem, method), constants = self.names, self.constants
+        constants = self.constants
         return {
-            "problem": problem,
-            "method": method,
-            "config": self.config,
-            "step": self.step,
-            "round": self.round,
+            **dict(zip(("problem", "method"), self.names, strict=True)),
+            **{name: getattr(self, name) for name in PLAIN},
             "bounds": {"M": constants.M, "warnings": list(constants.warnings), "unbounded": constants.unbounded},
-            "samples": self.samples,
-            "seconds": self.seconds,
-            "elapsed": self.elapsed,
-            "ended": self.ended,
-            "pending": self.pending,
-            "retry": self.retry,
             "fields": self.fields.state_dict(),
             "average": self.average.state_dict(),
             "stepper": self.stepper.state_dict(),
@@ -65,10 +59,10 @@ class TrainState:
             "generators": generator_states(),
         }
 
-    def load_state_dict(self, saved: dict, rounds: Rounds) -> None:
+    def load_state_dict(self, saved: dict, settings: TrainerSettings) -> None:
         """The way back from `state_dict`: with the same configuration the run goes on to the same bits.
 
-        With another `optimizer`, `schedule` or `trainer.steps` the run is taken as one of these ``rounds``: its round, warm
+        With another `optimizer`, `schedule` or `trainer.steps` the run is taken as one of these ``settings``: its round, warm
         start and learning rates are those such a run would have at this step. Raises `InputError` for a state of another
         problem or method, or weights that are none; a state that does not fit raises whatever its odd part leads to.
         """
@@ -86,17 +80,15 @@ class TrainState:
         constants = saved["bounds"]
         warnings, unbounded = notes(constants["warnings"]), bool(constants["unbounded"])
         self.constants = replace(self.constants, M=constants["M"], warnings=warnings, unbounded=unbounded)
-        best = saved["watch"]["fields"]
         for module, weights in ((self.fields, saved["fields"]), (self.average, saved["average"])):
             _require_weights(module, weights)
             module.load_state_dict(weights)
-        if best is not None:
-            _require_weights(self.fields, best)
+        if saved["watch"]["fields"] is not None:
+            _require_weights(self.fields, saved["watch"]["fields"])
         moves = None
-        if any(_at(saved["config"], path) != _at(self.config, path) for path in RATES):
-            self.round, objective = rounds.at(self.step), self.stepper.objective
-            delays = {player: objective.delays.get(player, 0.0) for player in objective.players}
-            moves = {player: rounds.moves(self.step, self.round, delay) for player, delay in delays.items()}
+        if rates_of(saved["config"]) != rates_of(self.config):
+            self.round = settings.round_at(self.step)
+            moves = {player: settings.moves(self.step, self.round, d) for player, d in self.stepper.delays.items()}
         self.stepper.load_state_dict(saved["stepper"], moves=moves)
         self.batches.load_state_dict(saved["batches"])
         self.health.load_state_dict(saved["watch"])
@@ -105,11 +97,9 @@ class TrainState:
 
     def require_finite(self) -> None:
         """Raise `NonFiniteError` where a weight is not finite: such a state is neither evaluated nor saved."""
-        for name, parameter in self.fields.named_parameters():
-            if not torch.isfinite(parameter).all():
-                raise NonFiniteError(
-                    f"the weights of {name} are not finite; try a smaller optimizer.lr, or stepper.clip."
-                )
+        name = next((n for n, parameter in self.fields.named_parameters() if not parameter.isfinite().all()), None)
+        if name is not None:
+            raise NonFiniteError(f"the weights of {name} are not finite; try a smaller optimizer.lr, or stepper.clip.")
 
 
 def _require_weights(module: torch.nn.Module, weights: dict) -> None:
@@ -125,7 +115,39 @@ def _require_weights(module: torch.nn.Module, weights: dict) -> None:
             raise InputError(f"the checkpoint holds weights that are not finite ({visible(name, 80)}).")
 
 
-def _at(config: dict, path: tuple[str, ...]):
-    for key in path:
-        config = config[key]
-    return config
+# The process's own random generators: a problem of a user's may draw from them, so a run seeds and keeps them too.
+
+
+def seed_generators(seed: int) -> None:
+    """Start every global generator from ``seed`` alone."""
+    branch = derive_seed(seed, Branch.GLOBAL_GENERATORS)
+    torch.manual_seed(branch)
+    np.random.seed(branch % 2**32)  # noqa: NPY002 (the global one is what a user's code draws from)
+    random.seed(branch)
+
+
+def generator_states() -> dict:
+    """Their states, as tensors and plain numbers that a checkpoint can hold."""
+    state: Any = np.random.get_state()  # noqa: NPY002
+    name, keys, *rest = state
+    version, words, spare = random.getstate()
+    states = {
+        "torch": torch.get_rng_state(),
+        "numpy": [name, keys.tolist(), *map(float, rest)],
+        "python": [version, list(words), spare],
+    }
+    if torch.cuda.is_initialized():
+        states["cuda"] = torch.cuda.get_rng_state_all()
+    return states
+
+
+def restore_generators(states: dict) -> None:
+    """Put every global generator where `generator_states` found it."""
+    torch.set_rng_state(states["torch"])
+    name, keys, position, has_gauss, cached = states["numpy"]
+    state = (str(name), np.array(keys, dtype=np.uint32), int(position), int(has_gauss), float(cached))
+    np.random.set_state(state)  # noqa: NPY002
+    version, words, spare = states["python"]
+    random.setstate((int(version), tuple(map(int, words)), spare))
+    if "cuda" in states and torch.cuda.is_available():
+        torch.cuda.set_rng_state_all(states["cuda"])

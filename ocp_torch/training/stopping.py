@@ -1,9 +1,11 @@
-"""Why a run stops, and what a user is told of it."""
+"""Why a run stops: its steps are done, a limit is reached, or SIGTERM or Ctrl-C came, of which the first lets the step in
+hand finish and the state be saved, and the second stops at once."""
 
-from __future__ import annotations
+import os
+import signal
+import threading
+from types import FrameType
 
-from ocp_torch.certificate import Certificate
-from ocp_torch.training.rounds import Rounds
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.state import TrainState
 
@@ -12,6 +14,7 @@ NOT_FINITE, FAILED = "not_finite", "failed"
 # After a certificate that did not reach the target gap, the next is tried at so many times the step: there are then few of
 # them, also in a long run, and it stops at most a quarter later than it could.
 RETRY = 1.25
+CAUGHT = (signal.SIGTERM, signal.SIGINT)
 
 
 def reason_to_stop(settings: TrainerSettings, state: TrainState) -> str | None:
@@ -22,25 +25,62 @@ def reason_to_stop(settings: TrainerSettings, state: TrainState) -> str | None:
     return MAX_SECONDS if limit is not None and state.elapsed >= limit else None
 
 
-def in_words(reason: str, settings: TrainerSettings, rounds: Rounds, state: TrainState) -> str:
+def in_words(reason: str, settings: TrainerSettings, state: TrainState) -> str:
     """``reason`` as a user is told."""
     at = f"step {state.step:,}"
     if reason == MAX_SECONDS:
-        return f"trainer.max_seconds = {settings.max_seconds:g} are over, at {at} of {rounds.end(state.round):,}"
+        return f"trainer.max_seconds = {settings.max_seconds:g} are over, at {at} of {settings.end(state.round):,}"
     if reason == TARGET_GAP:
         return f"a quick evaluation at {at} finds trainer.target_gap = {settings.target_gap:g} reached"
-    more = state.round + 1 < rounds.most
-    return f"all {state.step:,} steps are done" + (
-        f", and trainer.good_gap = {settings.good_gap:g} is met" if more else ""
-    )
-
-
-def may_be_reached(settings: TrainerSettings, state: TrainState, certificate: Certificate) -> bool:
-    """Whether the quick ``certificate`` has the target gap, and enough steps were taken since the last try."""
-    target, gap = settings.target_gap, certificate.plain_gap
-    return target is not None and gap is not None and gap <= target and state.step >= state.retry
+    met = f", and trainer.good_gap = {settings.good_gap:g} is met" if state.round + 1 < settings.rounds else ""
+    return f"all {state.step:,} steps are done{met}"
 
 
 def postpone(state: TrainState) -> None:
     """The full certificate did not reach the target gap: training goes on, and it is tried again later."""
     state.pending, state.retry = False, round(RETRY * state.step)
+
+
+class Preempted(BaseException):
+    """The run was asked to stop, and its state is saved. No `Exception`: nothing on the way may swallow it."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+    @property
+    def status(self) -> int:
+        """The conventional exit status: 143 for SIGTERM, 130 for Ctrl-C."""
+        return 128 + self.number
+
+
+class Signals:
+    """While it is entered, holds back the first signal for the trainer to `take`; where no step is in hand and the state is
+    saved (``saved = True``) the first one already raises `Preempted`."""
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self.saved = False
+        self._before: dict = {}
+
+    def __enter__(self) -> "Signals":
+        # Only the main thread may; elsewhere whoever runs this decides what a signal does.
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._caught) for number in CAUGHT}
+        return self
+
+    def __exit__(self, *_) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _caught(self, number: int, frame: FrameType | None) -> None:
+        if self.received is not None:
+            os._exit(128 + number)  # every file is replaced in one step, so there is nothing to tidy
+        self.received = number
+        if self.saved:
+            raise Preempted(number)
+
+    def take(self) -> None:
+        """Raise `Preempted` if a signal came."""
+        if self.received is not None:
+            raise Preempted(self.received)

@@ -1,16 +1,15 @@
 """The loop: draw, step, average; evaluate, log and save on the way. It does not know its method."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torch import nn
 
-from ocp_torch.certificate import Certificate, CertificateSettings, Run
-from ocp_torch.certificate.progress import Progress, silent
+from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields
+from ocp_torch.certificate.settings import Progress, silent
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.objectives import Objective, Phase
@@ -22,53 +21,47 @@ from ocp_torch.training.checkpoint import BEST, load_checkpoint, save_checkpoint
 from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.health import Evaluation, sanity_warnings
 from ocp_torch.training.observer import Silent
-from ocp_torch.training.rounds import Rounds
 from ocp_torch.training.settings import TrainerSettings
-from ocp_torch.training.signals import Signals
 from ocp_torch.training.state import TrainState
-from ocp_torch.training.stopping import STEPS, in_words, may_be_reached, reason_to_stop
+from ocp_torch.training.stopping import STEPS, Signals, in_words, reason_to_stop
 
 
+@dataclass(eq=False)
 class Trainer:
-    """A run of ``objective`` on ``problem``. What changes while it goes on is in ``state``; ``network`` makes networks for
-    what its certificates fit, and ``tell`` is given the name of each stage of the full one."""
+    """A run of ``objective`` on ``problem``. What changes while it goes on is in ``state``."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        objective: Objective,
-        settings: TrainerSettings,
-        network: Callable[..., nn.Module],
-        seed: int,
-        state: TrainState,
-    ) -> None:
-        self.problem, self.objective, self.settings, self.seed, self.state = problem, objective, settings, seed, state
+    problem: Problem
+    objective: Objective
+    settings: TrainerSettings
+    network: Callable[..., nn.Module]  # makes networks for what its certificates fit
+    seed: int
+    state: TrainState
+    tell: Progress = silent  # is given the name of each stage of the full certificate
+    stopped: str = STEPS  # why
+
+    def __post_init__(self) -> None:
+        state = self.state
         self.fields, self.stepper, self.batches = state.fields, state.stepper, state.batches
         self.health, self.names, self.config = state.health, state.names, state.config
-        self.rounds = Rounds(settings.steps, settings.rounds)
-        self.evaluator = Evaluator(problem, network, objective.occupation, seed, state)
-        self.tell: Progress = silent
-        self.stopped = STEPS  # why
+        self.trained = Trained(state.average.module, self.objective.occupation, self.network)
+        self.evaluator = Evaluator(self.problem, self.trained, state)
 
     @property
     def step(self) -> int:
-        """How many steps were taken."""
         return self.state.step
 
     @property
     def samples(self) -> int:
-        """How many states were drawn."""
         return self.state.samples
 
     @property
     def constants(self) -> Constants:
-        """Those in force."""
         return self.state.constants
 
     @property
     def averaged_fields(self) -> Fields:
         """The fields that are handed out."""
-        return self.evaluator.fields
+        return self.trained.fields
 
     @property
     def run(self) -> Run:
@@ -77,13 +70,13 @@ class Trainer:
 
     @property
     def end(self) -> int:
-        """The number of steps after which the present round is over."""
-        return self.rounds.end(self.state.round)
+        """Of the present round."""
+        return self.settings.end(self.state.round)
 
     @property
     def phase(self) -> Phase:
         """What the next step's losses may know of time."""
-        return Phase(self.constants, self.rounds.progress(self.step, self.state.round))
+        return Phase(self.constants, self.settings.part_done(self.step, self.state.round))
 
     def fit(self, monitor: Silent, checkpoint: Path | None = None, signals: Signals | None = None) -> str:
         """Train until there is a reason to stop, and return it; save to ``checkpoint`` on the way and at the end.
@@ -112,22 +105,23 @@ class Trainer:
     @property
     def why_stopped(self) -> str:
         """The reason for which `fit` stopped, in words."""
-        return in_words(self.stopped, self.settings, self.rounds, self.state)
+        return in_words(self.stopped, self.settings, self.state)
 
     def _advance(self, monitor: Silent, checkpoint: Path | None) -> None:
         """One step, and what is due after it."""
         settings, state = self.settings, self.state
         started = time.perf_counter()
-        report = advance(self.stepper, self.state.average, self.batches.draw, self.phase)
+        report = advance(self.stepper, state.average, self.batches.draw, self.phase)
         state.step += 1
         state.samples += report.samples
         state.seconds += time.perf_counter() - started
         due = lambda every: every > 0 and state.step % every == 0
         last = state.step == self.end
-        if due(settings.log_every) or last:
+        log = due(settings.log_every) or last
+        if log:
             for sentence in self.health.stepped(state.step, report.losses, self.stepper.parameters):
                 monitor.noticed(sentence)
-        monitor.stepped(self, report, log=due(settings.log_every) or last)
+        monitor.stepped(self, report, log)
         if due(settings.evaluate_every) and not last:
             self._evaluate(monitor, checkpoint)
         state.elapsed += time.perf_counter() - started
@@ -141,10 +135,13 @@ class Trainer:
         monitor.evaluated(self, certificate)
         best = self.health.evaluated(Evaluation.at(self.step, certificate), self.averaged_fields, certificate)
         late = 2 * self.step >= self.settings.steps  # early on, what is not learnt yet says nothing
-        sanity = lambda: sanity_warnings(self.problem, self.constants, certificate, self.seed) if late else []
-        for sentence in self.health.doubts(self.step, certificate.contradiction, sanity):
+        tell = late and not self.health.warned
+        found = sanity_warnings(self.problem, self.constants, certificate, self.seed) if tell else []
+        for sentence in self.health.doubts(self.step, certificate.contradiction, found):
             monitor.noticed(sentence)
-        self.state.pending = may_be_reached(self.settings, self.state, certificate)
+        target, gap = self.settings.target_gap, certificate.plain_gap
+        tried = self.step < self.state.retry  # too short a time ago
+        self.state.pending = target is not None and gap is not None and gap <= target and not tried
         if best and checkpoint is not None:
             save_checkpoint(checkpoint.with_name(BEST), self.state_dict())
 
@@ -158,7 +155,8 @@ class Trainer:
 
     def certify(self, settings: CertificateSettings, fields: Fields | None = None) -> Certificate:
         """The full certificate of ``fields``, or of the averaged ones as they stand."""
-        return self.evaluator.certify(self.run, settings, fields, self.tell)
+        trained = replace(self.trained, fields=fields or self.averaged_fields)
+        return certify_fields(self.problem, trained, self.constants, settings, self.run, self.tell)
 
     def save(self, checkpoint: Path | None) -> None:
         """Write the state to ``checkpoint``, never one that is not finite. Raises `NonFiniteError`, `StorageError`."""
@@ -170,11 +168,6 @@ class Trainer:
         """Everything needed to go on exactly."""
         return self.state.state_dict()
 
-    def load_state_dict(self, saved: dict) -> None:
-        """The way back from `state_dict`, and as `TrainState.load_state_dict` has it."""
-        self.evaluator.forget()
-        self.state.load_state_dict(saved, self.rounds)
-
     def resume(self, checkpoint: Path, state: dict | None = None) -> None:
         """Go on from ``checkpoint`` exactly where it was saved; ``state`` is what it holds, where that has been read already.
 
@@ -182,9 +175,12 @@ class Trainer:
         """
         try:
             state = load_checkpoint(checkpoint) if state is None else state
-            self.load_state_dict(state)
-            self._try_step()
-            self.load_state_dict(state)
+            self.state.load_state_dict(state, self.settings)
+            with suppress(NonFiniteError):  # the run itself will say so
+                # One step of all players for nothing shows whether their optimisers can work with what they were given.
+                advance(self.stepper, self.state.average, self.batches.draw, replace(self.phase, progress=1.0))
+            self.state.load_state_dict(state, self.settings)
+            self.evaluator.latest = None  # what was seen of another state at the same step says nothing
         except Exception as error:  # a crafted state raises whatever its odd part leads to
             if isinstance(error, InputError):
                 raise
@@ -192,10 +188,3 @@ class Trainer:
                 raise told from None
             reason = next(iter(str(error).splitlines()), "empty").rstrip(".")
             raise InputError(f"{checkpoint} does not fit this run ({type(error).__name__}: {reason}).") from None
-
-    def _try_step(self) -> None:
-        """One step of all players for nothing: shows whether an optimiser can work with the state it was given."""
-        try:
-            advance(self.stepper, self.state.average, self.batches.draw, replace(self.phase, progress=1.0))
-        except NonFiniteError:
-            pass  # the run itself will say so

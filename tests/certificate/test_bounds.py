@@ -26,8 +26,7 @@ from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems import Manufactured
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.needs import GIVEN, GUESSED, Need
-from ocp_torch.studies.benchmark.curve import Curve, Point
-from ocp_torch.studies.benchmark.measure import Judge
+from ocp_torch.studies.benchmark.measure import Curve, Judge, Point
 from ocp_torch.studies.benchmark.report import contest_table
 
 PROBLEM = Manufactured(dim=1)

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from ocp_torch.certificate import Run, Trained, certify_fields
-from ocp_torch.certificate.checks.check import occupation_holds
-from ocp_torch.certificate.checks.observed import Observed
+from ocp_torch.certificate.checks.assumptions import occupation_holds
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.policies import ValuePolicy
@@ -120,7 +119,7 @@ def test_an_M_that_the_density_comes_close_to_is_not_believed(reached, times, be
     """Trained with an `M` that is too small, a controller keeps its density just below it."""
     problem = Anonymous(dim=1)
     constants = resolve_constants(problem, times * reached, value_bound=1.0, control_bound=1.0)
-    assert occupation_holds(problem, constants, Observed(sup_occupation=reached))[0] is believed
+    assert occupation_holds(problem, constants, reached)[0] is believed
 
 
 def rounds_of(*overrides: str):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from ocp_torch.certificate import Run
-from ocp_torch.certificate.checks.contradictions import examined
+from ocp_torch.certificate.certify import examined
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.report import table
 from ocp_torch.runs.compare import compare

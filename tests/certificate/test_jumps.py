@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from ocp_torch.certificate.checks.regularity import largest_jump
+from ocp_torch.certificate.checks.observed import largest_jump
 from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.problems import Circle, Problem
 from support import zoo

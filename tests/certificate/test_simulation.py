@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from ocp_torch.certificate.simulated.occupation import occupation_along_flow
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
+from ocp_torch.certificate.simulated.trajectories import backward_flow
 from ocp_torch.maths.runge_kutta import discounted_integral, refined
 from ocp_torch.maths.sampling import evaluation_points
 from ocp_torch.problems import Problem
@@ -116,7 +116,8 @@ def test_a_controller_loses_half_its_squared_distance_from_the_optimal_one(probl
 def test_the_occupation_density_along_the_exact_flow_is_the_exact_one(problem):
     """Truncation leaves `e^{-12}`, below 1e-5, of it."""
     x = zoo.states(problem, 16, seed=4)
-    found = occupation_along_flow(problem, problem.exact_control, x, horizon=12.0 / problem.discount, steps=100)
+    flow, start = backward_flow(problem, problem.exact_control), torch.cat([x, torch.zeros_like(x[:, :1])], dim=-1)
+    found, _ = discounted_integral(flow, start, problem.discount, 12.0 / problem.discount, 100)
     torch.testing.assert_close(found, problem.exact_occupation(x), rtol=1e-4, atol=1e-4)
 
 

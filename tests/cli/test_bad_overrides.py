@@ -164,7 +164,7 @@ REFUSED = {
 @pytest.mark.parametrize("arguments", REFUSED, ids=" ".join)
 def test_what_would_fail_late_or_silently_is_refused_by_name(arguments, tmp_path, monkeypatch):
     # As on a machine of 25 GB, whatever this one has.
-    monkeypatch.setattr("ocp_torch.files.memory.memory", lambda: 25e9)
+    monkeypatch.setattr("ocp_torch.files.limits.memory", lambda: 25e9)
     monkeypatch.chdir(tmp_path)
     assert_refused("train", list(arguments))
     assert REFUSED[arguments] in entered("train", *arguments)[2]

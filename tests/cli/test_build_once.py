@@ -18,7 +18,7 @@ UNUSED = ("matplotlib", "scipy.stats", "sympy", "torch._dynamo", "torch.distribu
 def telling():
     """In the child: says when it composes, builds a trainer, and unpacks a checkpoint."""
     from ocp_torch.cli import compose
-    from ocp_torch.runs import training_run
+    from ocp_torch.runs import run
     from ocp_torch.training import checkpoint
 
     def told(module, name: str, word: str) -> None:
@@ -31,7 +31,7 @@ def telling():
         setattr(module, name, tell)
 
     told(compose, "compose", "composed")
-    told(training_run, "build_trainer", "built")
+    told(run, "build_trainer", "built")
     told(checkpoint, "unpacked", "read")
 
 

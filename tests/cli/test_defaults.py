@@ -15,8 +15,8 @@ from ocp_torch.objectives import METHODS
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.runs.build import BOUND_FIELDS, build_problem, problem_class
 from ocp_torch.steppers import STEPPERS, averaged, schedule_maker
-from ocp_torch.steppers.optimizers import OPTIMIZERS
-from ocp_torch.studies.benchmark.kernels import KernelContender
+from ocp_torch.steppers.fitting import OPTIMIZERS
+from ocp_torch.studies.benchmark.contenders import KernelContender
 from ocp_torch.studies.reference.reference import solve_reference
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.budgets import fill

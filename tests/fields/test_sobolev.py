@@ -12,7 +12,7 @@ from ocp_torch.fields.sobolev import COMFORTABLE_FREQUENCIES, MOST_FREQUENCIES, 
 from ocp_torch.maths import jets
 from ocp_torch.problems import Problem
 from ocp_torch.steppers.stepper import project_on_ball
-from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
+from ocp_torch.studies.kernel.expansions import BernoulliKernel
 from support import zoo
 
 

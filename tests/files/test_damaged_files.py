@@ -11,7 +11,7 @@ import torch
 from ocp_torch.cli.compose import composed
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.files import storage
-from ocp_torch.runs.training_run import training_run
+from ocp_torch.runs.run import training_run
 from ocp_torch.training.checkpoint import MAGIC, SCHEMA, load_checkpoint, newest, save_checkpoint
 from ocp_torch.training.monitor import Silent
 from support.forked import TINY, completed, train
@@ -110,10 +110,10 @@ def half_written(path: Path, content: bytes) -> int:
 
 
 FAILING = {
-    "no room for the name": (storage.tempfile, "mkstemp", full, "No space left"),
+    "no room for the name": (storage.tempfile, "NamedTemporaryFile", full, "No space left"),
     "no room for the contents": (Path, "write_bytes", half_written, "No space left"),
     "no room when it is flushed": (storage.os, "fsync", full, "No space left"),
-    "a folder that must not be written": (storage.tempfile, "mkstemp", forbidden, "Permission denied"),
+    "a folder that must not be written": (storage.tempfile, "NamedTemporaryFile", forbidden, "Permission denied"),
     "no folder": (Path, "mkdir", forbidden, "Permission denied"),
 }
 

@@ -13,7 +13,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ocp_torch.control.loading import load_controller
+from ocp_torch.control.controller import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.files.plain import NotPlain, json_object, looked_up, require_plain, yaml_mapping
 from ocp_torch.files.reading import read_json
@@ -232,7 +232,7 @@ def test_any_field_of_a_certificate_replaced_by_anything_is_shown_or_named(run, 
 @pytest.mark.nightly
 def test_any_entry_of_a_checkpoint_replaced_by_anything_is_refused_or_goes_on(run, tmp_path):
     from ocp_torch.cli.compose import composed
-    from ocp_torch.runs.training_run import training_run
+    from ocp_torch.runs.run import training_run
 
     chance, folder = random.Random(4), tmp_path / "run"
     shutil.copytree(run, folder)

@@ -18,7 +18,7 @@ from ocp_torch.cli.compose import composed
 from ocp_torch.errors import InputError
 from ocp_torch.files.storage import load_tensors, save_tensors
 from ocp_torch.runs.finish import controller_of
-from ocp_torch.runs.training_run import training_run
+from ocp_torch.runs.run import training_run
 from ocp_torch.training.checkpoint import MAGIC, SCHEMA, load_checkpoint
 from support.forked import command
 from support.looks import certificate

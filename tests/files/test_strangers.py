@@ -27,16 +27,15 @@ from ocp_torch.files.storage import digest, load_tensors, save_tensors
 from ocp_torch.problems import Kuramoto, Torus
 from ocp_torch.problems.recorded.recording import read
 from ocp_torch.problems.simulator.target import resolved
-from ocp_torch.problems.systems.urdf import read_chain
-from ocp_torch.runs import figures
+from ocp_torch.problems.systems.robot import read_chain
+from ocp_torch.runs import canvas
 from ocp_torch.runs.compare import compare
 from ocp_torch.runs.configuration import read_configuration, saved_configuration
 from ocp_torch.runs.evaluate import certify_saved, load_run, settings_for
-from ocp_torch.runs.interval import interval_figure
+from ocp_torch.runs.figures import interval_figure
 from ocp_torch.runs.loading import load_policy
-from ocp_torch.runs.run import summary
-from ocp_torch.runs.training_run import training_run
-from ocp_torch.studies.reference.session import reference_job
+from ocp_torch.runs.run import summary, training_run
+from ocp_torch.studies.reference.session import ReferenceJob
 from ocp_torch.training.checkpoint import load_checkpoint
 from support.forked import command
 from support.guarded import guarded, refusal
@@ -132,9 +131,9 @@ def test_a_reference_is_not_drawn_through_a_link(run, tmp_path):
     (run / "figures").symlink_to(tmp_path / "mine")
     config = {"run": str(run), "problem": {}, "side": None, "memory": 1.0, "threads": 1, "save": None}
     for named in (run, run / "controller.safetensors"):
-        assert "link" in refusal(lambda named=named: reference_job({**config, "run": str(named)}))
+        assert "link" in refusal(lambda named=named: ReferenceJob({**config, "run": str(named)}))
     (run / "figures").unlink()
-    assert reference_job(config).figure == run / "figures" / "reference.png"
+    assert ReferenceJob(config).figure == run / "figures" / "reference.png"
 
 
 def test_links_of_the_users_own_are_no_matter(run, tmp_path):
@@ -169,7 +168,7 @@ def test_a_name_in_a_figure_is_no_formula(run, tmp_path):
     certificate = json.loads((run / "certificate.json").read_text())
     for name in ("$\\nothing{", "$x$", ESCAPE, "x" * 10**5):
         figure = interval_figure({**certificate, "problem": name})
-        figures.save({"certificate": figure}, tmp_path)
+        canvas.save({"certificate": figure}, tmp_path)
         assert figure.axes[0].get_title().startswith(visible(name)[:20])
     (tmp_path / "runs" / "$\\bad{").mkdir(parents=True)
     (tmp_path / "runs" / "$\\bad{" / "certificate.json").write_text(json.dumps(certificate))

@@ -10,11 +10,10 @@ import torch
 from PIL import Image
 
 from ocp_torch.errors import InputError
-from ocp_torch.gym.agent import Agent
-from ocp_torch.gym.environment import clocks, make_environment, observe, require_gymnasium, state_of
-from ocp_torch.gym.rollout import made, play, rollout_job, save_gif
+from ocp_torch.gym.environment import ControlEnvironment, clocks, observe, require_gymnasium, state_of
+from ocp_torch.gym.rollout import Agent, RolloutJob, made, play, save_gif
 from ocp_torch.problems import PROBLEMS, Dataset, Manufactured
-from ocp_torch.runs.record import Recorder
+from ocp_torch.runs.record import record
 from support import zoo
 from support.small import session, small
 
@@ -91,7 +90,7 @@ def test_episodes_repeat_by_seed_and_differ_without(gymnasium):
 
 def test_actions_beyond_the_limit_are_cut_to_the_ball(gymnasium):
     problem = Manufactured(control_limit=0.3)
-    env = make_environment(problem)
+    env = ControlEnvironment(problem)
     env.reset(seed=0)
     paid = env.step(np.ones(2, dtype=np.float32))[4]["cost"]
     x = env.x.clone()
@@ -103,9 +102,9 @@ def test_actions_beyond_the_limit_are_cut_to_the_ball(gymnasium):
 
 def test_a_data_set_is_no_environment(tmp_path):
     path = tmp_path / "a.npz"
-    Recorder(zoo.build("circle rho=2"), 300, path, 0, True, 0.0).run()
+    record(zoo.build("circle rho=2"), 300, path, 0, True, 0.0)
     with pytest.raises(InputError, match="cannot be simulated"):
-        make_environment(Dataset(str(path)))
+        ControlEnvironment(Dataset(str(path)))
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +117,7 @@ def run(tmp_path_factory):
 
 
 def asked(run, **changes):
-    return rollout_job({"run": str(run), "problem": {}, "episodes": 8, "seed": 0, "video": None, **changes})
+    return RolloutJob({"run": str(run), "problem": {}, "episodes": 8, "seed": 0, "video": None, **changes})
 
 
 def test_a_controller_acts_in_an_environment_of_ours(gymnasium, run, tmp_path):
@@ -129,7 +128,7 @@ def test_a_controller_acts_in_an_environment_of_ours(gymnasium, run, tmp_path):
     assert len(found.returns) == 8
     assert (found.lengths == 50).all()
     # Better than doing nothing from the same starts.
-    env = made("ocp_torch/Circle-v0", None)
+    env = made("ocp_torch/Circle-v0")
     idle = []
     for k in range(8):
         env.reset(seed=k)
@@ -138,7 +137,7 @@ def test_a_controller_acts_in_an_environment_of_ours(gymnasium, run, tmp_path):
             _, reward, _, over, _ = env.step(np.zeros(1, dtype=np.float32))
             total += reward
         idle.append(total)
-    assert found.mean > np.mean(idle)
+    assert found.returns.mean() > np.mean(idle)
     assert "standard error of 8 episodes" in str(found)
 
 
@@ -200,7 +199,7 @@ def test_a_problem_maps_a_foreign_environment(gymnasium, foreign, run, monkeypat
     # The cost is least at x = 1/2, half a turn: the dial is turned there.
     job = asked(run, env=foreign)
     acted = job.run()
-    env = made(foreign, None)
+    env = made(foreign)
     last = []
     for k in range(8):
         agent = Agent(job.controller, env, foreign)
@@ -230,7 +229,7 @@ def test_gifs_hold_their_frames(tmp_path):
 
 
 def test_actions_apply_the_controls_they_are_made_of(gymnasium):
-    env = make_environment(Manufactured(control_size=0.4))
+    env = ControlEnvironment(Manufactured(control_size=0.4))
     u = np.array([0.1, -0.2])
     assert env.to_action(u) * env.control_bound == pytest.approx(u)
     assert env.to_action(9.0 * u).tolist() == [1.0, -1.0]
@@ -271,7 +270,7 @@ def test_the_pendulum_is_gymnasiums_over_a_short_time(theirs):
 
 def test_a_saved_pendulum_controller_plays_gymnasiums_untouched(gymnasium, tmp_path):
     """The classical swing-up through the same maps: what does not swing up returns about -1200."""
-    from ocp_torch.runs.metrics import classical_policy
+    from ocp_torch.runs.metrics.classical import classical_policy
 
     pendulum = PROBLEMS["pendulum"](torque_cost=0.001, control_limit=1.0)
     policy = classical_policy(pendulum)
@@ -282,11 +281,11 @@ def test_a_saved_pendulum_controller_plays_gymnasiums_untouched(gymnasium, tmp_p
         def __call__(self, x):
             return policy(torch.from_numpy(x)).numpy()
 
-    env = made("Pendulum-v1", None)
+    env = made("Pendulum-v1")
     found = play(Classical(), env, "Pendulum-v1", 20, 0)
     env.close()
     assert (found.lengths == 200).all()
-    assert found.mean > -500.0
+    assert found.returns.mean() > -500.0
     folder = tmp_path / "run"
     few = ("certificate.points=64", "certificate.trajectories=4", "certificate.ascents=2", "trainer.figures=false")
     small_run = ("trainer.steps=5", "trainer.batch=32", "trainer.rounds=1", "model.width=16", "model.waves=0")

@@ -18,7 +18,7 @@ BARE = {
     "certificate/upper/policy_evaluation.py",  # `Drawn`, handed a derived seed
     "fields/fields.py",  # `Fields.build`, handed a derived seed
     "maths/sampling.py",  # `evaluation_points`, whose seed is derived in the line before
-    "training/generators.py",  # the process's own generators, from a derived seed
+    "training/state.py",  # the process's own generators, from a derived seed
     "runs/metrics/trial.py",  # `random_starts`, handed a derived seed
     "problems/exact/manufactured.py",
     "problems/exact/torus.py",

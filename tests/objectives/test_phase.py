@@ -9,7 +9,6 @@ import torch
 from ocp_torch.objectives import Phase
 from ocp_torch.problems.samples import Samples
 from ocp_torch.training.monitor import Silent
-from ocp_torch.training.rounds import Rounds
 from support.bits import differences
 from support.small import METHODS, small
 
@@ -55,12 +54,12 @@ def test_a_run_changes_nothing_of_its_objective(method):
 
 @pytest.mark.parametrize("delay", [0.0, 0.5, 0.6, 1.0])
 def test_rounds_are_counted_as_a_loop_over_all_steps_counts_them(delay):
-    rounds, k, moves, begin = Rounds(length=7, most=3), 0, 0, 0
-    for step in range(rounds.end(2)):
-        if step == rounds.end(k):
+    settings, k, moves, begin = replace(small().settings, steps=7, rounds=3), 0, 0, 0
+    for step in range(settings.end(2)):
+        if step == settings.end(k):
             k, begin = k + 1, step
-        assert rounds.at(step) == k
-        assert rounds.progress(step, k) == pytest.approx((step - begin) / (7 * 2**k))
-        assert rounds.moves(step, k, delay) == moves
-        moves += rounds.progress(step, k) >= delay
-    assert rounds.at(rounds.end(2)) == 2
+        assert settings.round_at(step) == k
+        assert settings.part_done(step, k) == pytest.approx((step - begin) / (7 * 2**k))
+        assert settings.moves(step, k, delay) == moves
+        moves += settings.part_done(step, k) >= delay
+    assert settings.round_at(settings.end(2)) == 2

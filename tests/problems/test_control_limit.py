@@ -18,7 +18,7 @@ from ocp_torch.certificate.proof.models import Box
 from ocp_torch.certificate.proof.rigorous import obstacle, rigorous_lower_bound
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.certificate.upper.penalised import density_bounds
-from ocp_torch.control.loading import load_controller
+from ocp_torch.control.controller import load_controller
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, admissible_density, occupation_density, trained_policies
 from ocp_torch.errors import InputError
 from ocp_torch.maths import jets
@@ -35,7 +35,7 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.external import certify
 from ocp_torch.runs.finish import controller_of
 from ocp_torch.studies.kernel.rules import DualRule
-from ocp_torch.studies.reference import solve_reference
+from ocp_torch.studies.reference.reference import solve_reference
 from support import zoo
 from support.brute_force import BOUND, central_differences, columns, lowest, two_dimensional, value_and_gradients
 from support.exact import ROUNDING, exact_slack, lattice

@@ -13,7 +13,7 @@ from ocp_torch.errors import InputError
 from ocp_torch.maths.jets import Jet, jet
 from ocp_torch.problems.generator import Generator, hjb_slack
 from ocp_torch.problems.samples import Samples
-from ocp_torch.studies.kernel.stream import Datum
+from ocp_torch.studies.kernel.rules import Datum
 from support import zoo
 
 STEP, TOLERANCE = 1e-5, dict(rtol=1e-5, atol=1e-5)

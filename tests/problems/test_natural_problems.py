@@ -13,9 +13,9 @@ from ocp_torch.errors import InputError
 from ocp_torch.maths.runge_kutta import discounted_integral
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems import PROBLEMS, Arm, Dubins, Kuramoto, Pendulum, PhaseNeurons, RobotArm, Unicycle
-from ocp_torch.problems.exact.local import occupation_bound_at_rest, optimal_contraction
 from ocp_torch.problems.samples import Samples
-from ocp_torch.runs.metrics import metrics
+from ocp_torch.problems.systems.pendulum import occupation_bound_at_rest, optimal_contraction
+from ocp_torch.runs.metrics.trial import metrics
 from ocp_torch.studies.reference.reference import solve_reference
 from support import zoo
 

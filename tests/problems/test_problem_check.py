@@ -5,7 +5,7 @@ import torch
 
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Simulator
-from ocp_torch.problems.checks import check_once
+from ocp_torch.problems.checks.check import check_once
 from ocp_torch.problems.checks.mass import sampled_mass
 from ocp_torch.runs.build import build_problem
 from support import hostile_problems

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.external.dataset import groups
 from ocp_torch.certificate.upper.recorded import closed_loop_samples
-from ocp_torch.control.loading import load_controller
+from ocp_torch.control.controller import load_controller
 from ocp_torch.control.policies import NETWORK, trained_policies
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
@@ -27,10 +27,10 @@ from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.recorded import recording
 from ocp_torch.problems.samples import Samples
+from ocp_torch.runs import record as recording_command
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.evaluate import certify_saved, load_run
 from ocp_torch.runs.external import certify as certify_given
-from ocp_torch.runs.record import recorder
 from ocp_torch.training.checkpoint import load_checkpoint
 from ocp_torch.training.monitor import Silent
 from support import zoo
@@ -420,10 +420,10 @@ def test_recording_is_checked_before_anything_is_written(tmp_path):
     good |= {"seed": 0, "divergences": True, "contrast": 0.0}
     for field, value in (("out", "a.csv"), ("samples", 3), ("contrast", 1.0), ("seed", -1), ("divergences", 1)):
         with pytest.raises(InputError, match=field):
-            recorder({**good, field: value})
-    path = recorder(good).run()
+            recording_command.arguments({**good, field: value})
+    path = recording_command.record(**recording_command.arguments(good))
     with pytest.raises(InputError, match="data set already"):
-        recorder({**good, "problem": {"_target_": "ocp_torch.problems.Dataset", "path": str(path)}})
+        recording_command.arguments({**good, "problem": {"_target_": "ocp_torch.problems.Dataset", "path": str(path)}})
 
 
 @pytest.mark.nightly

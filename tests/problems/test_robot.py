@@ -8,8 +8,9 @@ from PIL import Image
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Arm, RobotArm
 from ocp_torch.problems.systems.linkage import Linkage
-from ocp_torch.runs.metrics import classical_policy, metrics
-from ocp_torch.runs.pictures import motion
+from ocp_torch.runs.metrics.classical import classical_policy
+from ocp_torch.runs.metrics.trial import metrics
+from ocp_torch.runs.pictures.picture import motion
 
 IDENTITY = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]
 
@@ -115,7 +116,7 @@ def test_without_a_file_it_is_a_six_joint_arm_that_can_reach_its_target():
 
 def test_a_linkage_without_joints_is_no_problem():
     with pytest.raises(TypeError, match="abstract.*jacobian.*joints"):
-        Linkage(2, 2, [0.0, 0.0], [], 0.1, 1.0, 1.0, 1.0, 1.0, 2.0, None)
+        Linkage(2)
 
 
 def test_wrong_arguments_are_refused():

@@ -11,7 +11,7 @@ from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
 from ocp_torch.control.policies import zero_policy
-from ocp_torch.gym.environment import make_environment
+from ocp_torch.gym.environment import ControlEnvironment
 from ocp_torch.maths.mixture_fit import fitted_mixture
 from ocp_torch.maths.mixtures import Mixture, effective_part
 from ocp_torch.maths.sampling import evaluation_points
@@ -175,7 +175,7 @@ def test_the_guess_of_M_knows_how_high_a_narrow_start_is(name):
 
 def test_episodes_of_the_environment_start_there():
     pytest.importorskip("gymnasium")
-    environment = make_environment(NarrowStart(*NARROW["2-d"]), control_bound=1.0)
+    environment = ControlEnvironment(NarrowStart(*NARROW["2-d"]), control_bound=1.0)
     states = [environment.reset(seed=k)[1]["state"] for k in range(20)]
     assert all(float(short_way(torch.as_tensor(x), [0.37, 0.91]).abs().max()) < 0.03 for x in states)
 

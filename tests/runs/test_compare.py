@@ -9,8 +9,7 @@ from matplotlib.image import imread
 
 from ocp_torch.certificate import Run
 from ocp_torch.errors import InputError
-from ocp_torch.runs.compare import compare
-from ocp_torch.runs.comparison import COLUMNS
+from ocp_torch.runs.compare import COLUMNS, compare
 from ocp_torch.training.checkpoint import save_checkpoint
 from support.forked import command
 from support.looks import certificate

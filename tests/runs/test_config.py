@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from ocp_torch.cli.launch import CONFIGS, known_fields
 from ocp_torch.problems import Circle
 from ocp_torch.runs.build import build_trainer
-from ocp_torch.runs.record import Recorder
+from ocp_torch.runs.record import record
 from ocp_torch.training.trainer import Trainer
 from support.small import configured, outcome
 
@@ -30,7 +30,7 @@ def test_every_choice_of_every_group_composes_and_builds_a_trainer(choice, tmp_p
     group, name = choice.split("=")
     file = tmp_path / "recording.npz"
     if choice == "problem=dataset":
-        Recorder(Circle(), 200, file, seed=0, divergences=True, contrast=0.0).run()
+        record(Circle(), 200, file, seed=0, divergences=True, contrast=0.0)
     config = configured(choice, *(need.format(recording=file) for need in NEEDS.get(choice, ())))
     assert isinstance(build_trainer(config), Trainer)
     assert config.get(group, {}).get("name", name) in (name, None)  # null: chosen by what the problem is

@@ -103,7 +103,7 @@ def killed_in(name: str):
     """In the child: no further than the middle of this step of the end."""
 
     def before():
-        from ocp_torch.runs import completion, figures, finish, run
+        from ocp_torch.runs import canvas, finish, run
         from ocp_torch.training import monitor
 
         def die(*_, **__):
@@ -120,10 +120,10 @@ def killed_in(name: str):
             die()
 
         where, what, how = {
-            "figures": (figures, "save", half_a_figure),
+            "figures": (canvas, "save", half_a_figure),
             "points": (monitor, "record", half_the_points),
             "metrics": (run, "write_metrics", die),
-            "the last of it": (completion, "complete", die),
+            "the last of it": (run, "complete", die),
             "the controller": (finish, "controller_of", die),
         }[name]
         setattr(where, what, how)

@@ -5,10 +5,10 @@ import json
 import pytest
 import torch
 
-from ocp_torch.control.loading import load_controller
+from ocp_torch.control.controller import load_controller
 from ocp_torch.maths.seeds import Branch, derive_seed
-from ocp_torch.runs.evaluate import policy_of
-from ocp_torch.runs.metrics import METRICS, metrics
+from ocp_torch.runs.loading import policy_of
+from ocp_torch.runs.metrics.trial import METRICS, metrics
 from support.small import session, small
 
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")

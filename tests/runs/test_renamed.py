@@ -10,8 +10,7 @@ import yaml
 from ocp_torch import InputError, Simulator, load_controller
 from ocp_torch.cli.compose import composed, register_resolvers
 from ocp_torch.files.storage import load_tensors, save_tensors
-from ocp_torch.problems.commands import ForeignProblem
-from ocp_torch.problems.renamed import current_name, current_target
+from ocp_torch.problems.commands import ForeignProblem, current_name, current_target
 from ocp_torch.runs.resume import find_run
 from ocp_torch.training.checkpoint import load_checkpoint, save_checkpoint
 from support.forked import TINY, train

@@ -16,7 +16,7 @@ from ocp_torch.runs.build import build_trainer
 from ocp_torch.runs.configuration import saved_configuration
 from ocp_torch.runs.resume import find_run
 from ocp_torch.runs.run import train as start
-from ocp_torch.runs.training_run import training_run
+from ocp_torch.runs.run import training_run
 from ocp_torch.training.checkpoint import load_checkpoint, save_checkpoint
 from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.monitor import Silent

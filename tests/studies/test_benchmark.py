@@ -11,22 +11,18 @@ from ocp_torch.cli.launch import composed
 from ocp_torch.control import policies
 from ocp_torch.errors import InputError
 from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields, SobolevField
-from ocp_torch.gym.environment import make_environment, observe
+from ocp_torch.gym.environment import ControlEnvironment, observe
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.studies.benchmark import measure
-from ocp_torch.studies.benchmark.contest import build, contest
-from ocp_torch.studies.benchmark.curve import Curve, Point, due, median_and_spread
-from ocp_torch.studies.benchmark.kernels import KernelContender
-from ocp_torch.studies.benchmark.measure import Judge, relative, tabulated
-from ocp_torch.studies.benchmark.networks import NetworkContender
-from ocp_torch.studies.benchmark.report import contest_table, load, reference, save
-from ocp_torch.studies.benchmark.require import require_rl
+from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender, RLContender, require_rl
+from ocp_torch.studies.benchmark.contest import Contest
+from ocp_torch.studies.benchmark.measure import Curve, Judge, Point, due, median_and_spread, relative, tabulated
+from ocp_torch.studies.benchmark.report import contest_table, reference, save
 from ocp_torch.studies.paper import figures
-from ocp_torch.studies.paper.recipes import RECIPES
 from ocp_torch.studies.paper.reproduce import check, report, reproduce
-from ocp_torch.studies.paper.runs import carry_out, circle, compare_with_exact
+from ocp_torch.studies.paper.runs import RECIPES, carry_out, circle, compare_with_exact
 from support import zoo
 
 TINY = (
@@ -147,14 +143,14 @@ def test_looks_grow_by_a_factor_and_spreads_are_medians():
     assert median_and_spread([3.0, 1.0, 2.0]) == (2.0, 1.0, 3.0)
 
 
-def test_the_report_says_what_was_reached_and_comes_back_from_its_file(tmp_path):
+def test_the_report_says_what_was_reached_and_its_file_holds_the_curves(tmp_path):
     curves = [curve("slow", s, [1.5, 1.2, 1.1]) for s in (0, 1)] + [curve("fast", 0, [1.5, 1.005, 1.004], 0.003)]
     text = save(curves, 1.0, tmp_path)
     assert "not reached" in text
     assert "0.3 %" in text
     row = next(line for line in text.splitlines() if line.startswith("| fast"))
     assert "| 20 |" in row
-    assert load(tmp_path / "curves.json") == curves
+    assert json.loads((tmp_path / "curves.json").read_text()) == [dataclasses.asdict(c) for c in curves]
     assert "1 % on Perf in the fewest samples: fast, 20." in text
     assert "slow" not in text.rsplit("\n\n", 1)[1]
     assert reference(curves, None) == (0.9, "the best lower bound found")
@@ -181,19 +177,18 @@ def test_a_kernel_method_without_a_time_of_its_own_gets_that_of_the_longest_run_
     for made in (KernelContender, NetworkContender):
         monkeypatch.setattr(made, "run", run)
     free = [o for o in TINY if "kernel.seconds" not in o]
-    contest(
-        build(composed("benchmark", [*free, "seeds=[0,2]", "contenders=[kernel_pd,network_dual,kernel_dual]"])),
-        tmp_path,
+    Contest(composed("benchmark", [*free, "seeds=[0,2]", "contenders=[kernel_pd,network_dual,kernel_dual]"])).run(
+        tmp_path
     )
     assert given == [30.0, 30.0, None, None, 9.0, 9.0]
-    contest(build(composed("benchmark", [*TINY, "seeds=[0]", "contenders=[network_dual,kernel_dual]"])), tmp_path)
+    Contest(composed("benchmark", [*TINY, "seeds=[0]", "contenders=[network_dual,kernel_dual]"])).run(tmp_path)
     assert given[6:] == [None, 0.01]
 
 
 @pytest.mark.nightly
 def test_a_whole_contest_in_small(tmp_path, quick):
     config = composed("benchmark", [*TINY, "seeds=[0,1]", "contenders=[kernel_dual,network_dual]"])
-    curves = contest(build(config), tmp_path)
+    curves = Contest(config).run(tmp_path)
     assert [(c.contender, c.seed) for c in curves] == [
         (name, seed) for name in ("kernel dual", "mlp dual") for seed in (0, 1)
     ]
@@ -209,7 +204,7 @@ def test_a_whole_contest_in_small(tmp_path, quick):
 
 def test_a_problem_with_drift_loses_the_kernel_primal_alone():
     config = composed("benchmark", [*TINY, "problem=manufactured", "problem.dim=1"])
-    assert [m.name for m in build(config).contenders] == [
+    assert [m.name for m in Contest(config).contenders] == [
         "mlp dual",
         "mlp primal",
         "mlp pd",
@@ -234,7 +229,7 @@ def test_a_problem_with_drift_loses_the_kernel_primal_alone():
 )
 def test_wrong_fields_of_a_benchmark_are_refused_before_it_runs(contender, override, words):
     with pytest.raises(InputError, match=words):
-        build(composed("benchmark", [*TINY, f"contenders=[{contender}]", override]))
+        Contest(composed("benchmark", [*TINY, f"contenders=[{contender}]", override]))
 
 
 def test_without_the_extra_packages_one_sentence_says_how_to_get_them(monkeypatch):
@@ -242,7 +237,7 @@ def test_without_the_extra_packages_one_sentence_says_how_to_get_them(monkeypatc
     with pytest.raises(InputError, match=r"\[rl\]"):
         require_rl()
     with pytest.raises(InputError, match=r"\[rl\]"):
-        build(composed("benchmark", [*TINY, "contenders=[sac]"]))
+        Contest(composed("benchmark", [*TINY, "contenders=[sac]"]))
 
 
 def test_the_environment_pays_the_performance_of_a_controller():
@@ -252,7 +247,7 @@ def test_the_environment_pays_the_performance_of_a_controller():
     problem = zoo.build("circle rho=2")
     errors = []
     for dt in (0.2, 0.05):
-        environment = make_environment(problem, 1.0, dt, horizon=4.0, seed=0)
+        environment = ControlEnvironment(problem, 1.0, dt, horizon=4.0, seed=0)
         total, factor, episodes = 0.0, math.exp(-problem.discount * dt), 0
         for start in (torch.arange(40, dtype=torch.float64) + 0.5) / 40:
             observation, _ = environment.reset(seed=1)
@@ -273,7 +268,7 @@ def test_the_environment_starts_from_the_initial_density():
     pytest.importorskip("gymnasium")
     pytest.importorskip("stable_baselines3")
     problem = zoo.Swing()
-    environment = make_environment(problem, 1.0, 0.1, horizon=1.0, seed=3)
+    environment = ControlEnvironment(problem, 1.0, 0.1, horizon=1.0, seed=3)
     starts = torch.cat([environment.reset()[0] is not None and environment.x.clone() for _ in range(1500)])
     found = (2 * math.pi * (starts[:, 0] + 2 * starts[:, 1])).cos().mean()
     assert found == pytest.approx(0.25, abs=0.08)
@@ -283,8 +278,6 @@ def test_the_environment_starts_from_the_initial_density():
 def test_sac_runs_as_a_contender():
     pytest.importorskip("gymnasium")
     pytest.importorskip("stable_baselines3")
-    from ocp_torch.studies.benchmark.rl import RLContender
-
     problem, constants = circle()
     made = RLContender("sac", problem, 0.5, steps=150, time_step=0.1, horizon=4.0)
     result = made.run(0, Judge(problem, constants), None)
@@ -300,7 +293,7 @@ def test_observations_are_periodic():
 
 
 def small(name):
-    return dataclasses.replace(RECIPES[name], looks=(20, 60), drawn=(20, 60), tabled=(60,), known={})
+    return dataclasses.replace(RECIPES[name], looks=(20, 60), drawn=(20, 60), known={60: {}})
 
 
 @pytest.mark.parametrize("name", RECIPES)
@@ -334,10 +327,9 @@ def test_a_recipe_in_small_gives_its_numbers_and_figures(name, quick):
 def test_the_exact_kernel_does_more_work_at_each_step_and_features_do_not():
     """Counted instead of timed: the numbers that enter one evaluation."""
     problem, constants = circle()
-    from ocp_torch.studies.kernel import Iteration, step_sizes
-    from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
-    from ocp_torch.studies.kernel.expansions import FeatureExpansion, KernelExpansion
-    from ocp_torch.studies.kernel.iterations import SobolevFeatures
+    from ocp_torch.fields.sobolev import SobolevFeatures
+    from ocp_torch.studies.kernel.expansions import BernoulliKernel, FeatureExpansion, KernelExpansion
+    from ocp_torch.studies.kernel.iterations import Iteration, step_sizes
 
     exact = Iteration(problem, "dual", constants, (0,), kernel=BernoulliKernel(2), capacity=60)
     truncated = Iteration(problem, "dual", constants, (0,), features=SobolevFeatures(1, modes=8))

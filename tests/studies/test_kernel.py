@@ -14,12 +14,11 @@ from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_trainer
 from ocp_torch.steppers import schedule_maker
-from ocp_torch.studies.benchmark.kernels import OCCUPATION
+from ocp_torch.studies.benchmark.contenders import OCCUPATION
 from ocp_torch.studies.benchmark.measure import Judge, relative
-from ocp_torch.studies.kernel import Iteration, step_sizes
-from ocp_torch.studies.kernel.bernoulli import BernoulliKernel, bernoulli_polynomial
-from ocp_torch.studies.kernel.rules import RULES
-from ocp_torch.studies.kernel.stream import Datum
+from ocp_torch.studies.kernel.expansions import BernoulliKernel, bernoulli_polynomial
+from ocp_torch.studies.kernel.iterations import Iteration, step_sizes
+from ocp_torch.studies.kernel.rules import RULES, Datum
 from ocp_torch.studies.paper.runs import circle
 from ocp_torch.training.monitor import Silent
 from support import zoo
@@ -175,8 +174,8 @@ def iterations(problem, method, steps, modes, radius=None, regularity=2, seeds=(
 
 def distance(exact: Iteration, truncated: Iteration) -> float:
     """The largest difference of the averaged fields on a grid."""
-    dim = exact.stream.problem.dim
-    grid = zoo.states(exact.stream.problem, 100).numpy()[None] if dim > 1 else np.linspace(0, 1, 101)[None, :, None]
+    dim = exact.problem.dim
+    grid = zoo.states(exact.problem, 100).numpy()[None] if dim > 1 else np.linspace(0, 1, 101)[None, :, None]
     found = 0.0
     for name, expansion in exact.expansions.items():
         values = expansion.at(grid, average=True)[:, :, 0]

@@ -10,13 +10,13 @@ import torch
 
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Circle, Manufactured, Problem, Torus
-from ocp_torch.studies.reference import linear, policy_iteration, solve_reference
-from ocp_torch.studies.reference.files import save_reference
+from ocp_torch.studies.reference import policy_iteration
+from ocp_torch.studies.reference.error import extrapolate
 from ocp_torch.studies.reference.grid import Grid
-from ocp_torch.studies.reference.policy_iteration import solve
-from ocp_torch.studies.reference.richardson import extrapolate
+from ocp_torch.studies.reference.policy_iteration import solve, solve_fixed_point
+from ocp_torch.studies.reference.reference import solve_reference
 from ocp_torch.studies.reference.semi_lagrangian import SemiLagrangian, discounted_weights
-from ocp_torch.studies.reference.session import reference_job, reference_table
+from ocp_torch.studies.reference.session import ReferenceJob, reference_table, save_reference
 from support import zoo
 from support.controllers import controllers
 
@@ -291,11 +291,10 @@ def test_the_discount_weights_integrate_parabolas(rho, tau):
 def test_iteration_and_factorisation_solve_the_same_system(beta, monkeypatch):
     scheme, solution = solved(Manufactured(seed=5), 16)
     stencil = solution.grid.stencil(scheme.move(slice(0, solution.grid.count), solution.control)[1])
-    W = solution.grid.matrix(stencil.index, stencil.linear)
     start = torch.zeros_like(scheme.f)
-    direct = linear.solve_fixed_point(W, beta, scheme.f, start, 1e-10)
-    monkeypatch.setattr(linear, "DIRECT", 0)
-    iterated = linear.solve_fixed_point(W, beta, scheme.f, start, 1e-10)
+    direct = solve_fixed_point(stencil.index, stencil.linear, beta, scheme.f, start, 1e-10)
+    monkeypatch.setattr(policy_iteration, "DIRECT", 0)
+    iterated = solve_fixed_point(stencil.index, stencil.linear, beta, scheme.f, start, 1e-10)
     torch.testing.assert_close(iterated, direct, rtol=0.0, atol=1e-9 / (1.0 - beta))
 
 
@@ -330,7 +329,7 @@ CONFIG = {"problem": {}, "run": None, "side": 64, "memory": 4.0, "threads": 1, "
 
 def test_a_saved_reference_loads_without_pickle(tmp_path):
     file = tmp_path / "deep" / "circle.npz"
-    job = reference_job(CONFIG | {"problem": {"_target_": "ocp_torch.problems.Circle"}, "save": str(file)})
+    job = ReferenceJob(CONFIG | {"problem": {"_target_": "ocp_torch.problems.Circle"}, "save": str(file)})
     reference = job.run()
     with np.load(file, allow_pickle=False) as saved:
         assert float(saved["optimum"]) == reference.optimum
@@ -353,7 +352,7 @@ def test_a_saved_reference_loads_without_pickle(tmp_path):
 )
 def test_a_wrong_field_is_refused_before_anything_is_solved(change, words):
     with pytest.raises(InputError, match=words):
-        reference_job(CONFIG | change)
+        ReferenceJob(CONFIG | change)
 
 
 @pytest.mark.nightly
@@ -361,7 +360,7 @@ def test_a_wrong_field_is_refused_before_anything_is_solved(change, words):
 def test_a_run_is_drawn_beside_the_grid_in_its_own_folder(method, tmp_path):
     """With a `V` network and without one."""
     controllers(method)[0].save(tmp_path / "controller.safetensors")
-    reference_job(CONFIG | {"run": str(tmp_path), "side": 32}).run()
+    ReferenceJob(CONFIG | {"run": str(tmp_path), "side": 32}).run()
     drawn = tmp_path / "figures" / "reference.png"
     assert drawn.read_bytes().startswith(b"\x89PNG")
     assert {p.name for p in tmp_path.iterdir()} == {"controller.safetensors", "figures"}

@@ -5,15 +5,14 @@ from __future__ import annotations
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems.constants import resolve_constants
-from ocp_torch.runs.record import Recorder
+from ocp_torch.runs import record as recording
 from support.formulas import Exactly
 
 
 def record(folder, problem, count=1500, name="data.npz", **fields):
     """Samples of ``problem`` in a file, by the code behind scripts/record.py."""
     out = folder / name
-    Recorder(problem, count, out, **{"seed": 0, "divergences": True, "contrast": 0.0, **fields}).run()
-    return out
+    return recording.record(problem, count, out, **{"seed": 0, "divergences": True, "contrast": 0.0, **fields})
 
 
 def certificate_of(data, problem, seed, value=None, steps=0):

@@ -20,10 +20,10 @@ CHECKS = {
     "train": "training_run",
     "certify": "arguments",
     "evaluate": "recertification",
-    "reference": "reference_job",
-    "record": "recorder",
-    "rollout": "rollout_job",
-    "benchmark": "build",
+    "reference": "ReferenceJob",
+    "record": "arguments",
+    "rollout": "RolloutJob",
+    "benchmark": "Contest",
     "reproduce_paper": "check",
 }
 

@@ -31,7 +31,6 @@ class Alternating(Stepper):
             if player in all_losses:
                 losses[player], norms[player] = all_losses[player], all_norms[player]
                 self._update([player])
-                self._advance_schedules([player])
         return StepReport(losses, norms, batches, counted)
 
 
@@ -93,5 +92,5 @@ def test_an_architecture_of_ones_own_brings_its_sizes_and_leaves_all_that_a_run_
 
 def test_an_architecture_nobody_knows_is_refused_by_name():
     config = configured(*SMALL)
-    with pytest.raises(InputError, match=r"model\.name is 'ripples', but must be one of mlp, sobolev"):
-        build_trainer({**config, "model": {"name": "ripples"}})
+    with pytest.raises(InputError, match=rf"model\.name is 'nobodys', but must be one of {', '.join(sorted(MODELS))}"):
+        build_trainer({**config, "model": {"name": "nobodys"}})

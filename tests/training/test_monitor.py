@@ -8,8 +8,7 @@ from ocp_torch.control.policies import occupation_density
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.run import run_to_end
-from ocp_torch.training.monitor import Monitor, liouville_residual
-from ocp_torch.training.stages import Stages
+from ocp_torch.training.monitor import Monitor, Stages, liouville_residual
 from support.small import METHODS, small
 
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")

@@ -9,8 +9,8 @@ import torch
 from matplotlib.image import imread
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ocp_torch.certificate import trained_context
-from ocp_torch.control.loading import load_controller
+from ocp_torch.certificate import trained
+from ocp_torch.control.controller import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.training.checkpoint import load_checkpoint
@@ -73,7 +73,7 @@ def test_no_state_of_a_training_batch_is_ever_used_for_evaluation(sampler, seed,
     way = ("problem=torus", "method=dual", f"sampler={sampler}", "trainer.dtype=float64", f"seed={seed}")
     trainer = small(*way, *little)
     met: dict[str, set] = {"training": set(), "stage": set(), "evaluation": set()}
-    phase, cost, fit = ["training"], trainer.problem.state_cost, trained_context.fit_closed_loop
+    phase, cost, fit = ["training"], trainer.problem.state_cost, trained.fit_closed_loop
 
     def state_cost(x):
         met[phase[-1]].update(tuple(row) for row in x.tolist())
@@ -86,7 +86,7 @@ def test_no_state_of_a_training_batch_is_ever_used_for_evaluation(sampler, seed,
         return fitted
 
     monkeypatch.setattr(trainer.problem, "state_cost", state_cost)
-    monkeypatch.setattr(trained_context, "fit_closed_loop", fit_closed_loop)
+    monkeypatch.setattr(trained, "fit_closed_loop", fit_closed_loop)
     trainer.fit(Silent())
     phase.append("evaluation")
     trainer.certify(build_certificate_settings(trainer.config))

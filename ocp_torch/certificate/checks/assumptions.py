@@ -1,16 +1,29 @@
-r"""The assumptions the bounds rest on, and whether what was observed under the controller contradicts them."""
-
-from __future__ import annotations
+"""The assumptions the bounds rest on, and whether what was observed under the controller contradicts them."""
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 
+import torch
+
+from ocp_torch.certificate.checks.observed import Observed
+from ocp_torch.certificate.checks.wellposed import WellPosed
+from ocp_torch.problems.constants import FROM_PROBLEM, Constants
 from ocp_torch.problems.needs import GIVEN, GUESSED, SEARCHED, Need
+from ocp_torch.problems.problem import Problem
+
+# An estimated supremum may exceed a bound by so much, relative to it, before it contradicts it; and a simulated value by so
+# much before it contradicts C_V, since both carry numerical errors.
+TOLERANCE, ROUGH = 0.02, 1e-3
+# An M that somebody gave must be so much above the density observed. Trained with an M that is too small, a controller does
+# not exceed it: the dual keeps its density just below, and F_M is then above OPT.
+CLEARANCE = 1.1
+# A sup mu* that a problem declares, but does not show to be exact, may be exceeded by an imperfect controller's density.
+DECLARED = 1.25
 
 
 @dataclass(frozen=True)
 class Assumptions:
-    """The constants used, what was estimated beside them, and whether every check passed.
+    """The constants used, what was estimated beside them, whether every check passed, and a warning for each that did not.
 
     The flags say which bounds stand: `F_M` needs ``occupation_holds``; `J` and `G` need ``value_holds`` and
     ``cost_holds``; `J` and the Lagrangian bound ``regular_holds``; everything needs ``problem_holds``.
@@ -32,9 +45,8 @@ class Assumptions:
     largest_jump: float | None = None
     smallest_state_cost: float | None = None
     initial_mass: float | None = None
-    basis: dict[str, str] = field(
-        default_factory=dict
-    )  # of M and C_V (see `ocp_torch.problems.needs`); given if absent
+    basis: dict[str, str] = field(default_factory=dict)  # of M and C_V (`ocp_torch.problems.needs`); given if absent
+    warnings: list[str] = field(default_factory=list)
 
     @property
     def hold(self) -> bool:
@@ -62,13 +74,13 @@ class Assumptions:
         """No jumps, where a divergence is used."""
         return Need("regular", SEARCHED, "neither a, B nor the controller jumps", self.regular_holds)
 
-    def with_value_bound(self, C_V: float) -> Assumptions:
+    def with_value_bound(self, C_V: float) -> "Assumptions":
         """With the `C_V` that the suprema found of `V` and its slack prove for the controller at hand."""
         return replace(self, C_V=C_V, value_holds=True, control_holds=True, basis=self.basis | {"C_V": SEARCHED})
 
     def to_dict(self) -> dict:
-        """JSON form; a supremum that grew beyond all numbers is null."""
-        numbers = {k: v for k, v in asdict(self).items() if not k.endswith("_holds") and k != "basis"}
+        """JSON form of the numbers; a supremum that grew beyond all numbers is null."""
+        numbers = {k: v for k, v in vars(self).items() if not k.endswith("_holds") and k not in ("basis", "warnings")}
         finite = {k: v if v is None or math.isfinite(v) else None for k, v in numbers.items()}
         return {**finite, "hold": self.hold}
 
@@ -80,3 +92,85 @@ def found_by_search(what: str) -> Need:
 
 def _number(value: float | None) -> str:
     return "?" if value is None else f"{value:.4g}"
+
+
+def check_assumptions(
+    problem: Problem, constants: Constants, posed: WellPosed, observed: Observed, uses: tuple[bool, bool]
+) -> Assumptions:
+    """Hold what was ``observed`` against ``constants``: the assumptions, with a warning for each that fails.
+
+    ``uses`` says whether the certificate has a lower side, which rests on `M`, and an upper one that rests on `C_V`.
+    """
+    uses_M, uses_C_V = uses
+    jump, reached = observed.jump, observed.largest_value
+    warnings = list(posed.warnings)
+    M_holds, why = occupation_holds(problem, constants, observed.sup_occupation, posed.mass)
+    if uses_M and not M_holds:
+        warnings.append(f"F_M is not used: {why}.")
+    elif uses_M and constants.basis("M") == GUESSED:
+        warnings.append(f"F_M is a bound only if sup mu* <= {constants.M:.4g}, a guess: no gap uses it.")
+    value_holds = reached is None or reached <= constants.C_V * (1.0 + ROUGH)
+    if uses_C_V and not value_holds:
+        warnings.append(
+            f"J with C_V = {constants.C_V:.4g} and G are not used: the controller's value reaches {reached:.4g}."
+        )
+    control_holds = observed.sup_control is None or observed.sup_control <= constants.C_u * (1.0 + TOLERANCE)
+    if not control_holds:
+        warnings.append(f"the control reaches {observed.sup_control:.4g}, beyond C_u = {constants.C_u:.4g}.")
+    jumps = jump is not None and jump.size > 0.0
+    if jump is not None and jumps:
+        at = [round(c, 4) for c in jump.x[:6].tolist()] + (["..."] if len(jump.x) > 6 else [])
+        warnings.append(
+            f"J and the Lagrangian bound are not used: the {jump.what} {jump.verb} by {jump.size:.3g}, at "
+            f"x = {at} for one, and they need all to be without jumps."
+        )
+    return Assumptions(
+        constants.M if uses_M else None,
+        constants.C_V if uses_C_V else None,
+        constants.C_u,
+        observed.sup_occupation,
+        observed.sup_control,
+        occupation_holds=M_holds or not uses_M,
+        value_holds=value_holds or not uses_C_V,
+        control_holds=control_holds or not uses_C_V,
+        regular_holds=not jumps and posed.smooth_seam,
+        cost_holds=posed.nonnegative,
+        problem_holds=posed.sound,
+        a_priori_sup_occupation=observed.a_priori_occupation,
+        largest_value=reached,
+        largest_jump=jump.size if jump else None,
+        smallest_state_cost=posed.smallest_cost,
+        initial_mass=posed.mass,
+        basis={"M": constants.basis("M"), "C_V": constants.basis("C_V")},
+        warnings=warnings,
+    )
+
+
+def occupation_holds(
+    problem: Problem, constants: Constants, estimate: float | None, mass: float = 1.0
+) -> tuple[bool, str]:
+    """Whether nothing speaks against `M >= sup mu*`, and what does. An `M` that was given must have been held against the
+    density under the controller, of which ``estimate`` is the supremum, unless the problem knows `mu*` exactly; a guess stays
+    one whatever it was held against. ``mass`` is the integral of `mu0`, and so of every occupation density."""
+    true = problem.occupation_bound
+    if true is not None and math.isinf(true):
+        return False, "mu* is unbounded for this problem, so no M is large enough"
+    point = torch.full((1, problem.dim), 0.5, dtype=torch.float64)
+    if true is not None and constants.M >= true and problem.exact_occupation(point) is not None:
+        return True, ""
+    if constants.M < mass * (1.0 - 1e-6):
+        return False, f"M = {constants.M:.4g} is below the mean of every occupation density, {mass:.4g}"
+    if constants.sources["M"] != FROM_PROBLEM and true is not None and constants.M < true * (1.0 - TOLERANCE):
+        return False, f"M = {constants.M:.4g} is below this problem's sup mu*, {true:.4g}"
+    if estimate is None:
+        blind = "was held against no occupation density: certificate.occupation_states is 0, or nothing was simulated"
+        return constants.basis("M") == GUESSED, f"M = {constants.M:.4g} {blind}"
+    reached = f"the occupation density under the controller reaches about {estimate:.4g}"
+    if not math.isfinite(estimate):
+        return False, "the occupation density under the controller grows beyond all bounds, so no M can be believed"
+    if true is not None and constants.M >= true:
+        return estimate <= DECLARED * constants.M, f"M = {constants.M:.4g}, as the problem declares, but {reached}"
+    return (
+        estimate * CLEARANCE <= constants.M,
+        f"M = {constants.M:.4g}, but {reached}, and must stay clearly below M to say that M did not shape it",
+    )

@@ -5,8 +5,6 @@ changes within a layer narrower than the distances between states, what pointwis
 from 0 by. Here `phi` are plane waves, the constant among them: `E[r] = E[mu0] - E[mu]` for every Liouville residual `r`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -16,6 +14,7 @@ from torch import Tensor
 from ocp_torch.certificate.estimate import t_factor
 from ocp_torch.maths.seeds import fixed_generator
 
+TURN = 2.0 * math.pi
 # Waves along each of the first axes, and in random directions.
 ALONG, MOST_AXES, RANDOM, LARGEST = (1, 2, 3, 4, 6, 8, 12), 8, 24, 4
 # Groups of states whose scatter gives the standard error, at least; how rarely all tests together may err.
@@ -62,7 +61,9 @@ def hidden_divergence(fluxes: list[Flux]) -> Hidden | None:
         for columns in zip(*(c.chunk(parts) for c in (f.x, f.weight, f.divergence, f.flux)), strict=True)
     ]
     found = torch.stack([_against(waves, group) for group in groups])  # (groups, waves), complex
-    sizes = torch.stack([_sizes(waves, f) for f in fluxes]).mean(dim=0)
+    seen = [(f.weight * f.divergence.abs()).mean() for f in fluxes]
+    moved = [(f.weight.unsqueeze(-1) * TURN * (f.flux @ waves.T).abs()).mean(dim=0) for f in fluxes]
+    sizes = torch.stack([s + m for s, m in zip(seen, moved, strict=True)]).mean(dim=0)
     tests = torch.cat([found.real, found.imag], dim=1)
     mean, error = tests.mean(dim=0), tests.std(dim=0) / math.sqrt(len(groups))
     allowed = t_factor(1.0 - LEVEL / tests.shape[1], len(groups) - 1) * error + MATERIAL * sizes.repeat(2)
@@ -75,9 +76,6 @@ def hidden_divergence(fluxes: list[Flux]) -> Hidden | None:
     return Hidden(float(mean[worst].abs()), states[int(shape.abs().argmax())].remainder(1.0))
 
 
-TURN = 2.0 * math.pi
-
-
 def _against(waves: Tensor, f: Flux) -> Tensor:
     """`E[e^{-2 pi i k . x} (div F - 2 pi i k . F)]`: 0 for each wave ``(K,)`` where nothing is hidden."""
     phi = torch.polar(torch.ones(()).to(f.x), -TURN * f.x @ waves.T)
@@ -85,14 +83,8 @@ def _against(waves: Tensor, f: Flux) -> Tensor:
     return (f.weight.unsqueeze(-1) * terms).mean(dim=0)
 
 
-def _sizes(waves: Tensor, f: Flux) -> Tensor:
-    seen = (f.weight * f.divergence.abs()).mean()
-    return seen + (f.weight.unsqueeze(-1) * TURN * (f.flux @ waves.T).abs()).mean(dim=0)
-
-
 def _waves(dim: int) -> Tensor:
     """Whole vectors ``(K, d)``: 0, some along the axes, some at random."""
     axes = torch.eye(dim, dtype=torch.float64)[:MOST_AXES]
-    along = [k * axes for k in ALONG]
     draw = torch.randint(-LARGEST, LARGEST + 1, (RANDOM, dim), generator=fixed_generator()).to(axes)
-    return torch.cat([torch.zeros(1, dim, dtype=torch.float64), *along, draw]).unique(dim=0)
+    return torch.cat([torch.zeros_like(draw[:1]), *(k * axes for k in ALONG), draw]).unique(dim=0)

@@ -1,23 +1,59 @@
-"""What was observed of a controller, for the assumptions to be held against."""
+"""What is observed of a controller: how large it gets, where it leads, and whether it and the problem are regular.
 
-from __future__ import annotations
+Jumps and layers are found by halving segments until only they are left to see.
+"""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
+from torch import Tensor
+from torch.nn.functional import normalize, one_hot
 
-from ocp_torch.certificate.checks.regularity import Jump, largest_jump
-from ocp_torch.certificate.checks.wellposed import WellPosed
-from ocp_torch.certificate.simulated.occupation import a_priori_sup_occupation, estimated_sup_occupation
 from ocp_torch.certificate.simulated.performance import Simulated
+from ocp_torch.certificate.simulated.trajectories import a_priori_sup_occupation, estimated_sup_occupation
 from ocp_torch.control.policies import Policy
+from ocp_torch.maths.seeds import fixed_generator
+from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
 # Of each set of samples: states at which the control is looked at, and states that lines are drawn through in search of
 # jumps. More find rarer ones and take longer.
 CONTROLLED, CROSSED = 4096, 256
+SEGMENTS = 768
+# Lines of each length, half of them along an axis, the states on each, and how many of their pieces are followed by kind.
+LINES, LENGTHS, ON_LINE, FOLLOWED = 48, (1.0, 0.1, 0.01, 1e-3), 65, 64
+# Halvings, after which the longest segment is 3e-11 long: what still changes across it is no slope. After the first of them
+# those with the largest change go on.
+HALVINGS, FIRST_HALVINGS, KEPT = 34, 14, 384
+# A change relative to the largest value met that counts as a jump; above the noise of a controller in float32.
+NOTICEABLE = 1e-5
+# A layer across which so much of the largest value changes within that length is to sampled states the same as a jump.
+LAYER, STEEP = 1e-4, 0.5
+
+CONTROLLER, DRIFT, MATRIX, LOOP = "controller", "drift", "control matrix", "closed loop"
+
+
+@dataclass(frozen=True)
+class Jump:
+    """The largest jump found, `|u(x+) - u(x-)|`, where, and of what; ``size`` is 0 where none was. ``width`` is the length of
+    the segment it was seen across."""
+
+    size: float
+    x: Tensor
+    what: str = CONTROLLER
+    width: float = 0.0
+
+    @property
+    def in_problem(self) -> bool:
+        return self.what in (DRIFT, MATRIX)
+
+    @property
+    def verb(self) -> str:
+        return "jumps" if self.width < 0.1 * LAYER else f"changes within {self.width:.1g}"
 
 
 @dataclass(frozen=True)
@@ -29,30 +65,107 @@ class Observed:
     sup_control: float | None = None
     largest_value: float | None = None  # V^u at a simulated start
     jump: Jump | None = None
-    problem: WellPosed | None = None
 
 
 def observe(
-    problem: Problem,
-    policy: Policy,
-    simulated: Simulated | None,
-    sets: list[Samples],
-    posed: WellPosed,
-    occupation_states: int,
+    problem: Problem, policy: Policy, simulated: Simulated | None, sets: list[Samples], occupation_states: int
 ) -> Observed:
-    """Look at the controller ``policy`` at the states of ``sets``, and where the trajectories of ``simulated`` end.
-
-    ``occupation_states`` is the number of states at which its occupation density is computed; 0 skips that.
-    """
+    """Look at the controller ``policy`` at the states of ``sets``, and where the trajectories of ``simulated`` end; its
+    occupation density is computed at so many ``occupation_states``, 0 for not at all."""
     with torch.no_grad():
         sup_control = max(float(policy(samples.x[:CONTROLLED]).norm(dim=-1).max()) for samples in sets)
-    states = torch.cat([samples.x[:CROSSED] for samples in sets])
-    near = states if simulated is None else torch.cat([states, simulated.end_states[:CONTROLLED]])
+    near = torch.cat([samples.x[:CROSSED] for samples in sets])
+    occupation = a_priori = largest_value = None
+    if simulated is not None:
+        near, largest_value = torch.cat([near, simulated.end_states[:CONTROLLED]]), simulated.largest_value
+        # Where the problem says that mu* is unbounded there is no M to hold a largest density against.
+        if occupation_states and problem.occupation_bound != math.inf:
+            occupation = estimated_sup_occupation(problem, policy, simulated.end_states, occupation_states)
+            a_priori = a_priori_sup_occupation(problem, policy, sets[0].x[:CONTROLLED])
     jump = largest_jump(policy, problem.dim, problem=problem, near=near)
-    occupation = a_priori = None
-    # Where the problem says that mu* is unbounded there is no M to hold a largest density against.
-    if simulated is not None and occupation_states and problem.occupation_bound != math.inf:
-        occupation = estimated_sup_occupation(problem, policy, simulated.end_states, occupation_states)
-        a_priori = a_priori_sup_occupation(problem, policy, sets[0].x[:CONTROLLED])
-    largest_value = simulated.largest_value if simulated is not None else None
-    return Observed(occupation, a_priori, sup_control, largest_value, jump, posed)
+    return Observed(occupation, a_priori, sup_control, largest_value, jump)
+
+
+@torch.no_grad()
+def largest_jump(policy: Policy, dim: int, problem: Problem | None = None, near: Tensor | None = None) -> Jump:
+    """Follow, on segments of all lengths, the half across which the control changes more; with ``problem`` also its drift,
+    control matrix and closed loop, and layers of them too steep for sampled states to resolve.
+
+    Pieces come from random segments and lines, half of these through states of ``near`` ``(N, d)``, on which the pieces that
+    change most and most unlike their neighbours are followed. For a Lipschitz function the change halves with the length; a
+    jump that is followed stays. One much smaller than what changes nearby anyway, or on a tiny set, can be missed.
+    """
+    functions: dict[str, Callable[[Tensor], Tensor]] = {CONTROLLER: policy}
+    if problem is not None:
+        functions[LOOP] = lambda x: problem.velocity(x, policy(x))
+        functions[MATRIX] = lambda x: problem.control_matrix(x).flatten(1)
+        if not problem.driftless:
+            functions[DRIFT] = problem.drift
+    generator = fixed_generator()
+    draw = partial(torch.rand, dtype=torch.float64, generator=generator)
+    left = draw(SEGMENTS, dim)
+    direction = normalize(torch.randn(SEGMENTS, dim, dtype=torch.float64, generator=generator))
+    right = left + direction * 10.0 ** (-3.0 * draw(SEGMENTS, 1)) * 0.5
+    sizes = {name: max(float(batched(f, left).norm(dim=-1).max()), 1e-300) for name, f in functions.items()}
+    together = lambda x: torch.cat([f(x) / sizes[name] for name, f in functions.items()], dim=-1)
+    first, last = _pieces(together, dim, generator, near)
+    left, right = torch.cat([left, first]), torch.cat([right, last])
+    steepest, steep_at = 0.0, left[0]
+    value_left, value_right = batched(together, left), batched(together, right)
+    for k in range(HALVINGS):
+        middle = 0.5 * (left + right)
+        value = batched(together, middle)
+        nearer = ((value - value_left).norm(dim=-1) > (value_right - value).norm(dim=-1)).unsqueeze(-1)
+        left, value_left = torch.where(nearer, left, middle), torch.where(nearer, value_left, value)
+        right, value_right = torch.where(nearer, middle, right), torch.where(nearer, value, value_right)
+        change = (value_right - value_left).norm(dim=-1).nan_to_num(nan=0.0)
+        narrow = torch.where((right - left).norm(dim=-1) <= LAYER, change, 0.0)
+        if float(narrow.max()) > steepest:
+            steepest, steep_at = float(narrow.max()), left[int(narrow.argmax())].clone()
+        if k == FIRST_HALVINGS:
+            top = change.topk(min(KEPT, len(change))).indices
+            left, right, value_left, value_right = (part[top] for part in (left, right, value_left, value_right))
+    jump = _largest(functions, sizes, left, right, NOTICEABLE)
+    if jump.size > 0.0 or problem is None or steepest < STEEP:
+        return jump
+    away = 0.5 * LAYER * normalize(torch.ones(1, dim, dtype=torch.float64))
+    return _largest(functions, sizes, steep_at - away, steep_at + away, 0.5 * STEEP, LAYER)
+
+
+def _largest(functions, sizes: dict[str, float], left: Tensor, right: Tensor, least: float, width: float = 0.0) -> Jump:
+    """Of which function the change from ``left`` to ``right`` is largest for its size, if above ``least`` of it."""
+    best, relative = Jump(0.0, left[0].remainder(1.0)), least
+    # The data come first: what jumps in them jumps in the closed loop too.
+    for name in (n for n in (DRIFT, MATRIX, CONTROLLER, LOOP) if n in functions):
+        change = (functions[name](right) - functions[name](left)).norm(dim=-1).nan_to_num(nan=0.0)
+        worst = int(change.argmax())
+        if float(change[worst]) > relative * sizes[name]:
+            relative = 2.0 * float(change[worst]) / sizes[name]
+            best = Jump(float(change[worst]), left[worst].remainder(1.0), name, width)
+    return best
+
+
+def _pieces(function, dim: int, generator: torch.Generator, near: Tensor | None) -> tuple[Tensor, Tensor]:
+    """The ends of pieces of lines across which ``function`` changes most, and most unlike the pieces beside them."""
+    draw = partial(torch.rand, dtype=torch.float64, generator=generator)
+    starts, ends = [], []
+    for length in LENGTHS:
+        middle = draw(LINES, dim)
+        if near is not None and len(near):
+            rows = torch.randint(len(near), (LINES // 2,), generator=generator)
+            # Somewhere on the line, not always on the same of its states.
+            middle[: LINES // 2] = near[rows] + 0.3 * length * (draw(LINES // 2, dim) - 0.5) / dim**0.5
+        direction = torch.randn(LINES, dim, dtype=torch.float64, generator=generator)
+        axis = torch.randint(dim, (LINES,), generator=generator)
+        direction[::2] = one_hot(axis[::2], dim).to(direction)
+        along = length * torch.linspace(-0.5, 0.5, ON_LINE, dtype=torch.float64)
+        x = middle.unsqueeze(1) + along[:, None] * normalize(direction).unsqueeze(1)  # (LINES, ON_LINE, d)
+        step = batched(function, x.flatten(0, 1)).unflatten(0, (LINES, ON_LINE)).diff(dim=1)
+        change = step.norm(dim=-1).nan_to_num(nan=0.0)
+        unlike = torch.zeros_like(change)
+        unlike[:, 1:-1] = (step[:, 1:-1] - 0.5 * (step[:, :-2] + step[:, 2:])).norm(dim=-1).nan_to_num(nan=0.0)
+        for score in (change, unlike):
+            picked = score.flatten().topk(FOLLOWED).indices
+            starts.append(x[:, :-1].flatten(0, 1)[picked])
+            ends.append(x[:, 1:].flatten(0, 1)[picked])
+    return torch.cat(starts), torch.cat(ends)

@@ -5,8 +5,6 @@ is few, states are drawn from a density fitted to what is rare, with exact weigh
 `n` were met there may be `n + 2 sqrt(n) + 3` (Poisson).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,10 +24,8 @@ from ocp_torch.problems.starts import UNIFORM_STATES, evaluation_distribution
 
 # Below so many states behind the scatter a mean is carried by a few; smaller kurtoses than that say nothing.
 FEW, KURTOSIS = 30.0, 30.0
-# What a few carry is let pass up to that part of the answer.
-MATERIAL = 1e-3
-# How often states are drawn anew.
-ROUNDS = 3
+# What a few carry is let pass up to that part of the answer; and how often states are drawn anew.
+MATERIAL, ROUNDS = 1e-3, 3
 
 
 def rarity(contributions: Tensor, size: float) -> float:
@@ -53,15 +49,6 @@ def widened(estimate: Estimate, contributions: list[Tensor]) -> Estimate:
     return replace(estimate, bias=(estimate.bias or 0.0) + rare) if rare > 0.0 else estimate
 
 
-def notes_on(estimates: dict[str, Estimate | None]) -> list[str]:
-    """Which of ``estimates``, without a bias of their own, were `widened`."""
-    return [
-        f"a few sampled states carry {name}: its interval is widened by {e.bias:.2g}."
-        for name, e in estimates.items()
-        if e is not None and e.bias
-    ]
-
-
 class Judged(Protocol):
     """A result with the weighted integrands per set of each of its means, as parts of the answer."""
 
@@ -82,14 +69,12 @@ def sharpened(evaluate: Callable[[list[Samples]], R], problem: Problem, sets: li
             break
         away = summed((torch.cat(c) - torch.cat(c).mean()).abs() for c in rare)
         x, weight = (torch.cat([getattr(s, name) for s in sets]) for name in ("x", "weight"))
-        narrow = [
-            d for d in (concentrated(x, away, 1.0 / weight), evaluation_distribution(problem)) if not d.is_uniform
-        ]
+        fitted = concentrated(x, away, 1.0 / weight)
+        narrow = [d for d in (fitted, evaluation_distribution(problem)) if not d.is_uniform]
         if not narrow:
             break
         distribution = Mixture.join([d.scaled((1.0 - UNIFORM_STATES) / len(narrow)) for d in narrow])
-        divergences = sets[0].div_a is not None
-        fresh = derive_seed(seed, Branch.TAILS, k)
+        divergences, fresh = sets[0].div_a is not None, derive_seed(seed, Branch.TAILS, k)
         sets = replicated_samples(problem, len(sets[0]), len(sets), fresh, divergences, distribution)
         found = evaluate(sets)
     return found

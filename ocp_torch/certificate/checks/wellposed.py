@@ -1,7 +1,5 @@
 """Is the problem what every bound takes it for? Periodic, with `f >= 0` and a probability density `mu0`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -25,9 +23,10 @@ ROUNDING, SEAM_STEP, SEAM_JUMP = 1e-6, 1e-9, 1e-5
 MASS_TOLERANCE, MASS_LEVEL = 1e-4, 0.9999
 # What the states' masses must be worth, as a part of as many equal ones: below, a few states carry mu0 and no mass is known.
 LEAST_WORTH = 0.02
-
 # How many of the lowest states a function is followed downhill from, in search of a negative value, and for how many steps.
 DESCENTS, DESCENT_STEPS = 16, 40
+# The columns of samples, and the functions that give them.
+NAMES = {"f": "state_cost", "a": "drift", "B": "control_matrix", "mu0": "initial_density"}
 
 
 @dataclass(frozen=True)
@@ -49,25 +48,27 @@ def check_problem(problem: Problem, sets: list[Samples]) -> WellPosed:
 
     Raises `InputError` where a function is not finite.
     """
-    for name in ("f", "a", "B", "mu0"):
+    for name in NAMES:
         for samples in sets:
             bad = ~torch.isfinite(getattr(samples, name)).reshape(len(samples), -1).all(dim=-1)
             if bool(bad.any()):
                 at = place(samples.x[bad][0])
-                raise ProblemError(f"{_NAMES[name]} is not finite at {at}; it must be finite on the whole torus.")
+                raise ProblemError(f"{NAMES[name]} is not finite at {at}; it must be finite on the whole torus.")
     warnings: list[str] = []
-    sizes = {name: max(float(getattr(samples, name).abs().max()) for samples in sets) for name in _NAMES}
-    shifted, seams = _periods(problem, sizes), _seams(problem, sizes)
+    sizes = {name: max(float(getattr(samples, name).abs().max()) for samples in sets) for name in NAMES}
+    x = scrambled_sobol(PROBES, problem.dim, 2, torch.float64)
+    whole_numbers = torch.randint(-2, 4, x.shape, generator=fixed_generator()).to(x)
+    shifted = _differences(problem, x, x + whole_numbers, ROUNDING, sizes)
+    seams = _seams(problem, sizes)
     for name, size in shifted.items():
         warnings.append(
-            f"no bound is used: {_NAMES[name]} is not periodic, it changes by {size:.3g} when whole numbers are added to x."
+            f"no bound is used: {NAMES[name]} is not periodic, it changes by {size:.3g} when whole numbers are added to x."
         )
-    for name, size in seams.items():
-        if name not in shifted:
-            cost = ": bounds that take its divergence are not used" if name in ("a", "B") else ", as a function may"
-            warnings.append(f"{_NAMES[name]} jumps by {size:.3g} where a coordinate passes from 1 to 0{cost}.")
+    for name in (n for n in seams if n not in shifted):
+        cost = ": bounds that take its divergence are not used" if name in ("a", "B") else ", as a function may"
+        warnings.append(f"{NAMES[name]} jumps by {seams[name]:.3g} where a coordinate passes from 1 to 0{cost}.")
     smallest = _smallest(problem.state_cost, sets, "f")
-    nonnegative = smallest >= -ROUNDING * max(float(samples.f.abs().max()) for samples in sets)
+    nonnegative = smallest >= -ROUNDING * sizes["f"]
     if not nonnegative:
         warnings.append(f"J and G are not used: the state cost falls to {smallest:.3g}, but they need f >= 0.")
     mass = Estimate.of([integral(samples, samples.mu0) for samples in sets])
@@ -88,10 +89,7 @@ def check_problem(problem: Problem, sets: list[Samples]) -> WellPosed:
             f"integral to be known (all states are worth as much as {100.0 * carried:.2g} % of them)."
         )
     sound = not shifted and positive and whole and carried >= LEAST_WORTH
-    return WellPosed(sound, nonnegative, not {"a", "B"} & set(seams), smallest, mass.value, warnings)
-
-
-_NAMES = {"f": "state_cost", "a": "drift", "B": "control_matrix", "mu0": "initial_density"}
+    return WellPosed(sound, nonnegative, not {"a", "B"} & seams.keys(), smallest, mass.value, warnings)
 
 
 def _differences(problem: Problem, x: Tensor, y: Tensor, tolerance: float, sizes: dict[str, float]) -> dict[str, float]:
@@ -99,18 +97,12 @@ def _differences(problem: Problem, x: Tensor, y: Tensor, tolerance: float, sizes
     value anywhere: at the seam a function that is odd is nearly 0."""
     here, there = (Samples.of(problem, z, divergences=False) for z in (x, y))
     found = {}
-    for name in _NAMES:
+    for name in NAMES:
         left, right = getattr(here, name), getattr(there, name)
         size = float((left - right).abs().max())
         if not size <= tolerance * max(sizes[name], float(left.abs().max()), float(right.abs().max())):
             found[name] = size
     return found
-
-
-def _periods(problem: Problem, sizes: dict[str, float]) -> dict[str, float]:
-    x = scrambled_sobol(PROBES, problem.dim, 2, torch.float64)
-    whole = torch.randint(-2, 4, x.shape, generator=fixed_generator()).to(x)
-    return _differences(problem, x, x + whole, ROUNDING, sizes)
 
 
 def _seams(problem: Problem, sizes: dict[str, float]) -> dict[str, float]:
@@ -129,5 +121,5 @@ def _smallest(function, sets: list[Samples], name: str) -> float:
     """The smallest value of ``function``: on ``sets``, and downhill from the lowest of those states."""
     values, states = torch.cat([getattr(s, name) for s in sets]), torch.cat([s.x for s in sets])
     lowest = states[values.topk(min(DESCENTS, len(values)), largest=False).indices]
-    found = supremum(lambda x: -function(x), lowest, ascents=DESCENTS, steps=DESCENT_STEPS, differentiable=False)
+    found = supremum(lambda x: -function(x), lowest, DESCENTS, DESCENT_STEPS, differentiable=False)
     return min(-found.value, float(values.min()))

@@ -1,7 +1,5 @@
 """A controller somebody brings, as a policy: checked, wrapped to the torus, with derivatives by differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -9,17 +7,15 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError
+from ocp_torch.maths.differences import STEPS, Differenced
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.problems.problem import Problem
 
 # States a controller is tried on before anything is computed with it.
 PROBES = 7
-# Half the distance of the two states of a difference quotient, by what the controller computes in.
-STEPS = {torch.float64: 1e-5, torch.float32: 2e-3}
-# Two calls may differ by so much, relative to the control, and still be a function of the state.
-SAME = 1e-4
-# A control may be longer than the limit by so much, relative to it: it was clipped in single precision. It is cut back.
-BEYOND = 1e-5
+# Two calls may differ by so much, relative to the control, and still be a function of the state; and a control may be longer
+# than the limit by so much, relative to it, as it was clipped in single precision: it is cut back.
+SAME, BEYOND = 1e-4, 1e-5
 
 
 class BlackBox:
@@ -33,26 +29,21 @@ class BlackBox:
     def __init__(self, function: Callable, problem: Problem) -> None:
         if not callable(function):
             raise InputError(f"controller is {function!r}, but must be a function of states (N, {problem.dim}).")
-        self.function, self.dim, self.control_dim = function, problem.dim, problem.control_dim
+        self.function, self.control_dim = function, problem.control_dim
         self.limit, self.cost = problem.control_limit, problem.control_cost
         self._convert, self.precision = self._understood(scrambled_sobol(PROBES, problem.dim, 0, torch.float64))
+        self.step = STEPS[self.precision]
 
     def __call__(self, x: Tensor) -> Tensor:
-        return _Evaluate.apply(x, self)
-
-    @property
-    def step(self) -> float:
-        return STEPS[self.precision]
+        return Differenced.apply(x, self.evaluate, self.step, True)
 
     def evaluate(self, x: Tensor) -> Tensor:
         """The controls at ``x`` in the precision of ``x``; raises `InputError` as above."""
         wrapped = x.detach().double().remainder(1.0)
         try:
             out = self._ask(self._convert, wrapped)
-        except InputError:
-            raise
         except Exception as error:  # whatever a stranger's code may raise
-            raise InputError(f"the controller raised {type(error).__name__}: {_first_line(error)}.") from None
+            raise _refusal(error) from None
         bad = ~torch.isfinite(out).all(dim=-1)
         if bool(bad.any()):
             raise InputError(f"the controller is not finite at x = {wrapped[bad][0].tolist()}.")
@@ -68,11 +59,10 @@ class BlackBox:
         out = torch.as_tensor(out if isinstance(out, Tensor) else np.asarray(out)).detach().cpu()
         if out.shape == (len(x),) and self.control_dim == 1:
             out = out.unsqueeze(-1)
-        if out.shape != (len(x), self.control_dim):
-            raise InputError(
-                f"the controller gave shape {tuple(out.shape)} for states {tuple(x.shape)}, but must give "
-                f"{(len(x), self.control_dim)}."
-            )
+        wanted = (len(x), self.control_dim)
+        if out.shape != wanted:
+            given = f"shape {tuple(out.shape)} for states {tuple(x.shape)}"
+            raise InputError(f"the controller gave {given}, but must give {wanted}.")
         if out.is_complex():
             raise InputError("the controller gave complex numbers, but a control is real.")
         return out if out.is_floating_point() else out.double()
@@ -83,8 +73,7 @@ class BlackBox:
         complaints = []
         for convert in forms:
             try:
-                out = self._ask(convert, x)
-                again, alone = self._ask(convert, x), self._ask(convert, x[2:3])
+                out, again, alone = (self._ask(convert, states) for states in (x, x, x[2:3]))
             except Exception as error:  # whatever a stranger's code may raise
                 complaints.append(error)
                 continue
@@ -98,10 +87,19 @@ class BlackBox:
             coarse = out.dtype in (torch.float32, torch.float16, torch.bfloat16) or convert is forms[1]
             return convert, torch.float32 if coarse else torch.float64
         own = [e for e in complaints if not isinstance(e, _WantsArrays)]
-        shown = next((e for e in own if isinstance(e, InputError)), own[0])
-        if isinstance(shown, InputError):
-            raise shown
-        raise InputError(f"the controller raised {type(shown).__name__}: {_first_line(shown)}.") from None
+        raise _refusal(next((e for e in own if isinstance(e, InputError)), own[0])) from None
+
+
+class _WantsArrays(Exception):
+    """Tensors went in and an array came out."""
+
+
+def _refusal(error: Exception) -> InputError:
+    """What a user is told where the controller raised ``error``."""
+    if isinstance(error, InputError):
+        return error
+    first_line = next(iter(str(error).splitlines()), "").rstrip(".") or "no message"
+    return InputError(f"the controller raised {type(error).__name__}: {first_line}.")
 
 
 def require_limit(u: Tensor, x: Tensor, limit: float | None) -> None:
@@ -115,50 +113,3 @@ def require_limit(u: Tensor, x: Tensor, limit: float | None) -> None:
             f"the controller gives a control of size {float(size[worst]):.6g} at x = {x[worst].tolist()}, "
             f"but problem.control_limit is {limit:g}; clip it."
         )
-
-
-class _WantsArrays(Exception):
-    """Tensors went in and an array came out."""
-
-
-class _Evaluate(torch.autograd.Function):
-    """Values by calling, tangents and gradients by central differences, batches of batches by flattening."""
-
-    @staticmethod
-    def forward(x: Tensor, box: BlackBox) -> Tensor:
-        return box.evaluate(x)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output) -> None:
-        x, ctx.box = inputs
-        ctx.save_for_backward(x)
-        ctx.save_for_forward(x)
-
-    @staticmethod
-    def jvp(ctx, tangent: Tensor, _) -> Tensor:
-        (x,) = ctx.saved_tensors
-        return _difference(ctx.box, x, tangent)
-
-    @staticmethod
-    def backward(ctx, outward: Tensor):
-        (x,) = ctx.saved_tensors
-        basis = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
-        slopes = [(outward * _difference(ctx.box, x, e.expand_as(x))).sum(dim=-1) for e in basis]
-        return torch.stack(slopes, dim=-1), None
-
-    @staticmethod
-    def vmap(info, in_dims, x: Tensor, box: BlackBox):
-        if in_dims[0] is None:
-            return _Evaluate.apply(x, box), None
-        x = x.movedim(in_dims[0], 0)
-        return _Evaluate.apply(x.flatten(0, 1), box).unflatten(0, x.shape[:2]), 0
-
-
-def _difference(box: BlackBox, x: Tensor, direction: Tensor) -> Tensor:
-    x, direction = x.double(), direction.double()
-    ahead, behind = (_Evaluate.apply(x + s * box.step * direction, box) for s in (1.0, -1.0))
-    return ((ahead - behind) / (2.0 * box.step)).to(direction)
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).splitlines()), "").rstrip(".") or "no message"

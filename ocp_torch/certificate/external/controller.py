@@ -5,8 +5,6 @@ is the control variate of the simulation and, with the suprema of its Bellman sl
 `V`, trained for the optimum, gives the lower bound on `OPT` and a controller to compare with.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,17 +12,15 @@ from functools import cached_property
 import torch
 from torch import nn
 
-from ocp_torch.certificate.checks.hidden import Hidden
 from ocp_torch.certificate.checks.observed import Observed, observe
 from ocp_torch.certificate.context import Context
-from ocp_torch.certificate.estimate import Estimate, integral
+from ocp_torch.certificate.estimate import integral
 from ocp_torch.certificate.external.black_box import BlackBox
-from ocp_torch.certificate.simulated.candidates import few_trajectories
-from ocp_torch.certificate.simulated.performance import Simulated, simulate_performance
+from ocp_torch.certificate.simulated.performance import Candidate
 from ocp_torch.certificate.trained import in_float64
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
-from ocp_torch.control.policies import Policy, ValuePolicy, zero_policy
+from ocp_torch.control.policies import Policy, ValuePolicy
 from ocp_torch.fields.fields import Fields
 from ocp_torch.maths.jets import Field
 
@@ -42,7 +38,7 @@ class ControllerContext(Context):
     network: Callable[..., nn.Module]
 
     external = True
-    kind = subject = GIVEN
+    kind = GIVEN
     divergent = "J and the Lagrangian bound"
 
     @property
@@ -75,58 +71,24 @@ class ControllerContext(Context):
         return self.bounds_of(self.policy, self._fit.value, self._fit.log_occupation, self._initial)
 
     @property
-    def hidden(self) -> Hidden | None:
-        return self.fitted.hidden if self.fitted is not None else None
-
-    @property
-    def proved_C_V(self) -> float | None:
-        return self.fitted.C_V if self.fitted is not None else None
-
-    @cached_property
-    def _simulated(self) -> tuple[dict[str, Simulated], Estimate | None]:
-        number = self.settings.trajectories
-        if not number:
-            return {}, None
+    def candidates(self) -> dict[str, Candidate]:
         own = None if self._fit is None else self._fit.value
-        found: dict[str, tuple[Policy, Field | None, list[float] | None]] = {GIVEN: (self.policy, own, self._initial)}
-        if self.sampled_value is not None:
-            V = self.sampled_value
-            found["value"] = (ValuePolicy(self.problem, V.value), V.value, V.initial)
-        self.progress("simulation")
-        zero = self._simulate(zero_policy(self.problem), few_trajectories(self.settings))
-        return {n: self._simulate(policy, number, V, mean) for n, (policy, V, mean) in found.items()}, zero.perf
-
-    def _simulate(
-        self, policy: Policy, number: int, value: Field | None = None, initial: list[float] | None = None
-    ) -> Simulated:
-        settings, horizon = self.settings, (self.settings.horizon, self.settings.tolerance)
-        return simulate_performance(
-            self.problem, policy, number, settings.replicates, self.seed, value, initial, *horizon
-        )
-
-    @property
-    def perf(self) -> dict[str, Estimate | None]:
-        return {name: simulated.perf for name, simulated in self._simulated[0].items()}
-
-    @property
-    def zero(self) -> Estimate | None:
-        return self._simulated[1]
+        found = {GIVEN: Candidate(self.policy, own, self._initial)}
+        if (V := self.sampled_value) is not None:
+            found["value"] = Candidate(ValuePolicy(self.problem, V.value), V.value, V.initial)
+        return found
 
     @cached_property
     def observed(self) -> Observed:
-        found, _ = self._simulated
+        found, _ = self.simulated
         self.progress("assumptions")
-        met = observe(self.problem, self.policy, found.get(GIVEN), self.few, self.posed, 0)
+        met = observe(self.problem, self.policy, found.get(GIVEN), self.few, 0)
         if self.value is None or "value" not in found:
             return met
         # M is about the optimal controller, which the one from V is nearer to than anybody's.
         best, states = ValuePolicy(self.problem, self.value), self.settings.occupation_states
-        near = observe(self.problem, best, found["value"], self.few, self.posed, states)
+        near = observe(self.problem, best, found["value"], self.few, states)
         return replace(met, sup_occupation=near.sup_occupation, a_priori_occupation=near.a_priori_occupation)
-
-    @property
-    def notes(self) -> list[str]:
-        return []
 
     @property
     def remarks(self) -> list[str]:

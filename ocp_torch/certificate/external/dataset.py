@@ -5,22 +5,19 @@ samples estimate them without bias, with errors from their scatter. What a supre
 shifted and the Lagrangian bound are left out, and `M` and `C_V` are estimates, and said to be.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.checks.hidden import Hidden
-from ocp_torch.certificate.checks.observed import Observed
-from ocp_torch.certificate.checks.regularity import largest_jump
+from ocp_torch.certificate.checks.observed import Observed, largest_jump
 from ocp_torch.certificate.checks.wellposed import WellPosed
-from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.trained import FieldsContext
 from ocp_torch.certificate.upper.recorded import RecordedFit, fit_recorded
-from ocp_torch.control.policies import NETWORK, Policy
+from ocp_torch.control.policies import NETWORK
 from ocp_torch.problems.needs import SEARCHED
 from ocp_torch.problems.recorded.dataset import Dataset
 from ocp_torch.problems.samples import Samples
@@ -30,18 +27,15 @@ from ocp_torch.problems.samples import Samples
 GROUPS, FEWEST = 64, 8
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class RecordedContext(FieldsContext):
     """Fields trained on the recorded samples of ``problem``, held against those that were held out."""
 
     problem: Dataset
 
     recorded = True
-    exact = sampled_value = fitted = zero = None
-
-    @property
-    def perf(self) -> dict[str, Estimate | None]:
-        return {"value": None, "density": None}
+    sampled_value = fitted = None
+    candidates: ClassVar[dict] = {}
 
     @cached_property
     def sets(self) -> list[Samples]:
@@ -55,15 +49,6 @@ class RecordedContext(FieldsContext):
         if trained.fields.value is not None and self.problem.knows_control_matrix:
             return "value"
         return "density" if trained.fields.control_density is not None and trained.occupation == NETWORK else None
-
-    @property
-    def subject(self) -> str | None:
-        return self.kind
-
-    @cached_property
-    def policy(self) -> Policy | None:
-        """The controller handed out."""
-        return None if self.kind is None else self.policies_of(self.fields)[self.kind]
 
     @cached_property
     def _fit(self) -> tuple[RecordedFit | None, list[str]]:
@@ -102,18 +87,17 @@ class RecordedContext(FieldsContext):
     @cached_property
     def observed(self) -> Observed:
         occupation = self.fit.sup_occupation if self.fit else None
-        if self.policy is None:
-            return Observed(sup_occupation=occupation, problem=self.posed)
+        if self.kind is None:
+            return Observed(occupation)
+        policy = self.policies[self.kind]
         with torch.no_grad():
-            control = max(float(self.policy(s.x).norm(dim=-1).max()) for s in self.sets)
-        jump = largest_jump(self.policy, self.problem.dim)
-        return Observed(sup_occupation=occupation, sup_control=control, jump=jump, problem=self.posed)
+            control = max(float(policy(s.x).norm(dim=-1).max()) for s in self.sets)
+        return Observed(occupation, sup_control=control, jump=largest_jump(policy, self.problem.dim))
 
     @cached_property
     def assumptions(self) -> Assumptions:
-        _, has_J = self.uses
-        basis = self.checked.basis | {"C_V": SEARCHED}
-        return replace(self.checked, C_V=self.fit.C_V if self.fit and has_J else None, basis=basis)
+        C_V = self.fit.C_V if self.fit and self.hidden is None else None
+        return replace(self.checked, C_V=C_V, basis=self.checked.basis | {"C_V": SEARCHED})
 
     @property
     def notes(self) -> list[str]:

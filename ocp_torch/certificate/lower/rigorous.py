@@ -1,6 +1,6 @@
 """The shifted bound of a multiple of `V`, proved over cells that cover the torus (`ocp_torch.certificate.proof`)."""
 
-from ocp_torch.certificate.bound import LOWER, Bound, once
+from ocp_torch.certificate.bound import LOWER, Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate
@@ -28,9 +28,14 @@ class Rigorous(Bound):
         return proved(context)[2]
 
 
-@once
 def proved(context: Context) -> tuple[Estimate | None, list[str], list[str]]:
     """The proved counterpart of `SampledValue.own`, with a note where there is none, and what was proved in words."""
+    if "proved" not in context.results:
+        context.results["proved"] = _proved(context)
+    return context.results["proved"]
+
+
+def _proved(context: Context) -> tuple[Estimate | None, list[str], list[str]]:
     V = context.sampled_value
     if V is None:
         return None, [], []

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from ocp_torch.certificate.bound import LOWER, Bound, sentence_on
 from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
-from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.certificate.simulated.control_variate import integrals
+from ocp_torch.certificate.estimate import Estimate, integrals
 from ocp_torch.maths.jets import Field, Jet, chunked_jet, jet
 from ocp_torch.maths.supremum import Extremum, minimiser, supremum
 from ocp_torch.problems.control_cost import PowerCost

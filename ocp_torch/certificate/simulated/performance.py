@@ -1,35 +1,25 @@
 r"""`Perf(u) = E_{x0 ~ mu0} rho int e^{-rho t} (f + R(u)) dt` by simulation, with `V` as control variate where there is one.
 
-For any smooth `V`, `V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt` exactly along the closed loop, with the Bellman slack
-`Q_u = V - f - R(u) - grad V . (a + B u) / rho`. So `Perf(u) = E[V mu0] - E int rho e^{-rho t} Q_u`, and what is left to
-simulate, with all its errors, is as small as `Q_u`.
-
-Where a controller slides along a kink of `V` that rate is not the one at which `V` changes (see `Sliding`).
-
 The infinite horizon is truncated, with the tail bounded; or each trajectory stops at a time `T ~ Exp(rho)` of its own,
 and `E[rate(x_T)]` is the discounted integral, without a tail.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ocp_torch.certificate.checks.tails import widened
-from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
-from ocp_torch.certificate.simulated.sliding import Sliding
-from ocp_torch.control.policies import Policy, ValuePolicy
-from ocp_torch.maths import jets
+from ocp_torch.certificate.simulated.trajectories import Sliding, closed_loop_dynamics
+from ocp_torch.control.policies import Policy, zero_policy
 from ocp_torch.maths.jets import Field
-from ocp_torch.maths.runge_kutta import Dynamics, discounted_integral, rate_at, refined
+from ocp_torch.maths.runge_kutta import discounted_integral, rate_at, refined
 from ocp_torch.maths.seeds import Branch, derive_seed
-from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
-from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.starts import initial_points
 
 # A kink of V is met at the start of a trajectory or never, and what is late counts little: early steps are shorter.
@@ -39,15 +29,17 @@ GRADING = 2.0
 FEWEST_STEPS, DISCOUNTED, MOVED = 8, 0.4, 0.2
 # Simulation sets come after those of the bounds in the stream of evaluation points.
 SIMULATION_REPLICATE = 1000
-# What is left of the discount when simulation stops, times the rate's supremum, relative to the answer.
-TAIL = 2e-5
-# The answer is taken to be at least this part of the mean state cost at the starts.
-LEAST = 0.1
+# What is left of the discount when simulation stops, times the rate's supremum, relative to the answer; which is taken to be
+# at least the second part of the mean state cost at the starts.
+TAIL, LEAST = 2e-5, 0.1
 # States to which the starts' mean cost is compared, how many standard errors apart the two must be, and by how many times
 # that the interval is widened: trajectories may stay where no start was.
 COMPARED, UNLIKELY, UNSEEN_ROOM = 2**15, 2.5, 2.0
 # Head-room on the rate's supremum, met at starts and ends, for the states after the end.
 RATE_ROOM = 2.0
+# Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
+# a controller that another one clearly beats; but so few in all as the second number take hardly longer than a part of them.
+BASELINE_PART, CHEAP = 4, 256
 
 
 @dataclass(frozen=True)
@@ -57,27 +49,6 @@ class Simulated:
     perf: Estimate
     largest_value: float | None
     end_states: Tensor
-
-
-def _dynamics(problem: Problem, policy: Policy, value: Field | None) -> Dynamics:
-    """The closed loop and what it costs; with ``value`` its slack `-Q_u`, and as one more coordinate `z`, the sum of
-    `grad V . g` from `V` at the start on, with `z - V` as a second rate."""
-    cost = problem.control_cost
-
-    def dynamics(state: Tensor) -> tuple[Tensor, Tensor]:
-        if value is None:
-            u = policy(state)
-            return problem.velocity(state, u), problem.state_cost(state) + cost.cost(u)
-        x, summed = state[:, :-1], state[:, -1]
-        samples = Samples.of(problem, x, divergences=False)
-        generator, V = Generator.of(problem, samples), jets.jet(value, x)
-        u = policy.control(samples.B, V) if isinstance(policy, ValuePolicy) and policy.value is value else policy(x)
-        velocity = samples.a + torch.einsum("ndm,nm->nd", samples.B, u)
-        slack = generator.bellman_slack(V, u)
-        change = (V.gradient * velocity).sum(dim=-1, keepdim=True)
-        return torch.cat([velocity, change], dim=-1), torch.stack([-slack, summed - V.value], dim=-1)
-
-    return dynamics
 
 
 def starting_points(
@@ -124,7 +95,7 @@ def simulate_performance(
     random = horizon == RANDOM
     points, mass = starting_points(problem, trajectories, replicates, seed, extra=int(random))
     x0 = points[:, :dim]
-    dynamics = _dynamics(problem, policy, value)
+    dynamics = closed_loop_dynamics(problem, policy, value)
     with torch.no_grad():
         base = value(x0) if value is not None else torch.zeros_like(x0[:, 0])
         state = x0 if value is None else torch.cat([x0, base.unsqueeze(-1)], dim=-1)
@@ -176,3 +147,31 @@ def stratum_error(results: Tensor, replicates: int) -> float:
     7 %.
     """
     return float(results.std()) / (len(results) // replicates * math.sqrt(replicates))
+
+
+class Candidate(NamedTuple):
+    """A controller to simulate, the control variate `V` of its simulation, and `E[V mu0]` per set."""
+
+    policy: Policy
+    value: Field | None
+    initial: list[float] | None
+
+
+def simulate_candidates(
+    problem: Problem, candidates: dict[str, Candidate], settings: CertificateSettings, seed: int, best_only: bool
+) -> tuple[dict[str, Simulated], Estimate]:
+    """Performance of each of ``candidates``, and of doing nothing. With ``best_only`` one that is clearly worse than another
+    on a quarter of the trajectories gets no more of them, where that saves time."""
+
+    def simulate(candidate: Candidate, trajectories: int) -> Simulated:
+        (policy, value, initial), how = candidate, (settings.horizon, settings.tolerance)
+        return simulate_performance(problem, policy, trajectories, settings.replicates, seed, value, initial, *how)
+
+    few = max(2, settings.trajectories // BASELINE_PART)
+    pays = best_only and len(candidates) > 1 and settings.trajectories * settings.replicates > CHEAP
+    found = {name: simulate(candidate, few) for name, candidate in candidates.items()} if pays else {}
+    best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
+    for name, candidate in candidates.items():
+        if name not in found or not found[name].perf.interval(CONFIDENCE)[0] > best:
+            found[name] = simulate(candidate, settings.trajectories)
+    return found, simulate(Candidate(zero_policy(problem), None, None), few).perf

@@ -14,7 +14,7 @@ from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
 from ocp_torch.maths.jets import CHUNK, Field, jet
 from ocp_torch.maths.sampling import SobolSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
-from ocp_torch.objectives.phase import Phase
+from ocp_torch.objectives.objective import Phase
 from ocp_torch.objectives.policy_evaluation import PolicyEvaluation
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import Constants
@@ -22,7 +22,7 @@ from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import advance, short_fit
-from ocp_torch.steppers.optimizers import LARGEST_RATE
+from ocp_torch.steppers.fitting import LARGEST_RATE
 
 # The closed loop's data are computed once on so many states at most: their divergences cost more than a step.
 POOL = 2**16

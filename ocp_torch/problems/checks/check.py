@@ -4,21 +4,30 @@ What is refused is certainly wrong. Rough and discontinuous functions are legal,
 are the same to the bit, in single precision too, and away from where functions like to jump.
 """
 
-from __future__ import annotations
+import math
 
 import torch
+from torch import Tensor
 
-from ocp_torch.problems.checks.construction import require_made, require_units
-from ocp_torch.problems.checks.divergences import require_divergences
+from ocp_torch.errors import ProblemError, require_integer, require_number
+from ocp_torch.problems.blame import named
 from ocp_torch.problems.checks.functions import FORMS, Functions
 from ocp_torch.problems.checks.mass import require_mass
-from ocp_torch.problems.checks.period import require_period
-from ocp_torch.problems.checks.purity import require_differentiable, require_purity, require_still
-from ocp_torch.problems.checks.values import require_finite, require_signs
-from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.checks.sameness import require_differentiable, require_period, require_purity, require_still
+from ocp_torch.problems.checks.values import require_divergences, require_finite, require_signs
+from ocp_torch.problems.control_limit import control_cost
+from ocp_torch.problems.problem import MOST_COORDINATES, Problem
+from ocp_torch.problems.simulator.simulator import Simulator
 
 # Sizes of the batches that shapes are checked with: none a likely d or m, and one a single state.
 SIZES = (7, 1, 37, 2)
+SET_BY_INIT = ("dim", "control_dim", "discount", "exponent", "control_cost")
+DECLARED = ("state_cost_bound", "occupation_bound", "control_bound", "value_bound", "exact_optimum")
+# Turns of a state round the torus within 1 / discount. Paths are simulated in steps of a fraction of a turn: more than so
+# many would take hours.
+MOST_TURNS = 1e4
+# States at which typical speeds are taken, and the number of their fixed design.
+SPEED_STATES, SPEED_DESIGN = 64, 13
 
 
 def check_once(problem: Problem) -> None:
@@ -29,9 +38,8 @@ def check_once(problem: Problem) -> None:
     require_made(problem)
     if not problem.has_simulator:
         return
-    own = type(problem).__module__.startswith("ocp_torch.")
-    simulator = hasattr(problem, "answers")
-    if simulator or not own:
+    simulator = isinstance(problem, Simulator)
+    if simulator or not type(problem).__module__.startswith("ocp_torch."):
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             _check(Functions(problem, simulator))
     require_units(problem)
@@ -49,3 +57,53 @@ def _check(functions: Functions) -> None:
     for require in (require_finite, require_period, require_signs, require_divergences, require_mass):
         require(functions)
     require_still(functions, first)
+
+
+def require_made(problem: Problem) -> None:
+    """What `Problem.__init__` sets is there, and still what it was."""
+    missing = [name for name in SET_BY_INIT if not _has(problem, name)]
+    if missing:
+        raise ProblemError(
+            f"{named(problem)} has no {missing[0]}: its __init__ must call super().__init__(dim=..), which sets it."
+        )
+    require_integer("problem.dim", problem.dim, 1, maximum=MOST_COORDINATES)
+    require_integer("problem.control_dim", problem.control_dim, 1, maximum=MOST_COORDINATES)
+    require_number("problem.discount", problem.discount, above=0.0)
+    require_number("problem.exponent", problem.exponent, above=1.0, at_most=2.0)
+    expected = control_cost(problem.exponent, problem.control_limit)
+    if type(problem.control_cost) is type(expected) and vars(problem.control_cost) != vars(expected):
+        raise ProblemError(
+            f"{named(problem)} changes exponent or control_limit after super().__init__, which has made the control cost of "
+            "them; give both to super().__init__."
+        )
+    for name in DECLARED:
+        bound = getattr(problem, name, None)
+        infinite = name == "occupation_bound" and bound == math.inf
+        if bound is not None and not infinite:
+            number = bound.item() if isinstance(bound, Tensor) and bound.ndim == 0 else bound
+            require_number(f"{name} of {named(problem)}", number)
+
+
+def require_units(problem: Problem) -> None:
+    """Units of cost and time in which a state can be followed for the time that counts."""
+    f, a, B = problem.probe(SPEED_STATES, SPEED_DESIGN, "f", "a", "B")
+    # A control that costs as much as the state cost varies.
+    u = (problem.exponent * float(f.std())) ** (1.0 / problem.exponent)
+    u = u if problem.control_limit is None else min(u, problem.control_limit)
+    drift, push = float(a.norm(dim=-1).mean()), u * float(B.flatten(1).norm(dim=-1).mean())
+    turns = (drift + push) / problem.discount
+    if turns > MOST_TURNS:
+        time = 1.0 / problem.discount
+        raise ProblemError(
+            f"the units of {named(problem)} are too far apart: within 1 / discount = {time:.3g} a state would move "
+            f"{turns:.2g} times round the torus (drift {drift:.2g} and control {push:.2g} per unit of time), more than the "
+            f"{MOST_TURNS:g} that can be followed; discount, drift and control_matrix must be of one unit of time, and "
+            "state_cost of the unit of |u|^q / q: f times s goes with control_matrix times s^(-1/q)."
+        )
+
+
+def _has(problem: Problem, name: str) -> bool:
+    try:
+        return getattr(problem, name, None) is not None
+    except Exception:  # a property of a user's own that leans on what is missing
+        return False

@@ -1,7 +1,5 @@
 """The functions of a problem, asked with care: what each gives has the right shape, precision and device."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch
@@ -60,8 +58,7 @@ class Functions:
 
         Raises `ProblemError` where it raises, changes ``x``, or gives another type, shape, precision or device.
         """
-        given = x.clone()
-        answer = self.called(getattr(self.problem, name), given, name)
+        answer = self.called(getattr(self.problem, name), given := x.clone(), name)
         if not torch.equal(given, x):
             raise ProblemError(
                 f"{name} of {self.name} changes its argument x in place; it must leave it as it is (x = x.clone() first)."

@@ -1,7 +1,5 @@
 """The mass of a density that may be very narrow: sampled evenly first, then where its mass was met."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +15,8 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.simulator import Simulator
 
 Density = Callable[[Tensor], Tensor]
+# Where densities peak ``(K, d)``, the half-widths of the peaks along each coordinate ``(K, d)``, and their heights ``(K,)``.
+Peaks = tuple[Tensor, Tensor, Tensor]
 
 # Independent estimates, and Student's t quantile of their mean at the two-sided level 0.9999 (15 degrees of freedom).
 REPLICATES, QUANTILE = 16, 5.2391
@@ -81,32 +81,29 @@ def sampled_mass(density: Density, dim: int, count: int) -> Mass:
     sets = [scrambled_sobol(count, dim, derive_seed(0, Branch.MASS, r), torch.float64) for r in range(REPLICATES)]
     x = torch.cat(sets)
     share = density(x)  # of the mass, times the number of states
-    found, states = _mass(share, count), len(x)
-    peaks = torch.empty(0, dim, dtype=torch.float64)
-    widths, heights = peaks, torch.empty(0, dtype=torch.float64)
+    found = _estimate(share, len(x))
+    none = torch.empty(0, dim, dtype=torch.float64)
+    peaks: Peaks = none, none, none[:, 0]
     for look in range(LOOKS):
         if found.right:
             break
-        top, top_widths, top_heights, used = _peaks(density, x, share)
-        peaks, widths, heights = (torch.cat(p) for p in ((peaks, top), (widths, top_widths), (heights, top_heights)))
-        peaks, widths, heights = _distinct(peaks, widths, heights)
+        climbed, asked = _climbed(density, x, share)
+        peaks = _distinct(*(torch.cat(parts) for parts in zip(peaks, climbed, strict=True)))
         generator = torch.Generator().manual_seed(derive_seed(0, Branch.MASS, REPLICATES, look))
-        x = _drawn(peaks, widths, REPLICATES * count, generator)
-        share = density(x) / _density(x, peaks, widths)
-        states += used + len(x)
-        found = Mass(**{**vars(_mass(share, count)), "states": states})
+        x = _drawn(peaks, REPLICATES * count, generator)
+        share = density(x) / _density(x, peaks)
+        found = _estimate(share, found.states + asked + len(x))
     return found
 
 
-def _mass(share: Tensor, count: int) -> Mass:
-    means = share.reshape(REPLICATES, count).mean(dim=1)
+def _estimate(share: Tensor, states: int) -> Mass:
+    means = share.reshape(REPLICATES, -1).mean(dim=1)
     se = float(means.std()) / math.sqrt(REPLICATES)
-    return Mass(float(means.mean()), QUANTILE * se, len(share))
+    return Mass(float(means.mean()), QUANTILE * se, states)
 
 
-def _peaks(density: Density, x: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Peaks climbed to from the states with the largest ``share``, their half-widths along each coordinate, their heights,
-    and how many states that took."""
+def _climbed(density: Density, x: Tensor, share: Tensor) -> tuple[Peaks, int]:
+    """Peaks climbed to from the states with the largest ``share``, and how many states that took."""
     at = x[share.topk(PEAKS).indices].clone()
     height, step = density(at), torch.full((PEAKS, 1), STEP, dtype=torch.float64)
     generator = fixed_generator()
@@ -124,36 +121,37 @@ def _peaks(density: Density, x: Tensor, share: Tensor) -> tuple[Tensor, Tensor, 
         half = density(moved.flatten(0, 1)).reshape(2, NARROWEST, PEAKS) < 0.5 * height
         nearest = torch.where(half, distances.view(1, -1, 1), 1.0).amin(dim=1)  # (2, PEAKS), on either side
         widths[:, i] = nearest.amax(dim=0)
-    return at, widths, height, PEAKS * (1 + CLIMB + 2 * NARROWEST * at.shape[1])
+    return (at, widths, height), PEAKS * (1 + CLIMB + 2 * NARROWEST * at.shape[1])
 
 
-def _distinct(peaks: Tensor, widths: Tensor, heights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _distinct(at: Tensor, widths: Tensor, heights: Tensor) -> Peaks:
     """The highest of them, one of each that lie within a width of one another."""
     kept: list[int] = []
     for k in heights.argsort(descending=True).tolist():
-        away = lambda j, k=k: ((peaks[j] - peaks[k] + 0.5).remainder(1.0) - 0.5).abs() > widths[j]
-        if all(bool(away(j).any()) for j in kept):
+        away = ((at[kept] - at[k] + 0.5).remainder(1.0) - 0.5).abs() > widths[kept]
+        if bool(away.any(dim=1).all()):
             kept.append(k)
     kept = kept[:PEAKS]
-    return peaks[kept], widths[kept], heights[kept]
+    return at[kept], widths[kept], heights[kept]
 
 
-def _drawn(peaks: Tensor, widths: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def _drawn(peaks: Peaks, count: int, generator: torch.Generator) -> Tensor:
     """States of the mixture `_density`: even ones, and around each peak wrapped Cauchy ones, coordinate by coordinate."""
+    centres, widths, _ = peaks
     draw = lambda *shape: torch.rand(*shape, dtype=torch.float64, generator=generator)
-    which = torch.randint(len(peaks), (count,), generator=generator)
-    even = draw(count, peaks.shape[1])
-    offset = widths[which] * torch.tan(math.pi * (draw(count, peaks.shape[1]) - 0.5))
-    near = torch.where(widths[which] >= BROAD, even, (peaks[which] + offset).remainder(1.0))
+    which = torch.randint(len(centres), (count,), generator=generator)
+    even = draw(count, centres.shape[1])
+    offset = widths[which] * torch.tan(math.pi * (draw(count, centres.shape[1]) - 0.5))
+    near = torch.where(widths[which] >= BROAD, even, (centres[which] + offset).remainder(1.0))
     return torch.where(draw(count, 1) < EVEN, even, near)
 
 
-def _density(x: Tensor, peaks: Tensor, widths: Tensor) -> Tensor:
+def _density(x: Tensor, peaks: Peaks) -> Tensor:
     """Of the mixture, ``(N,)``: sinh g / (cosh g - cos 2 pi t) with g = 2 pi width is the wrapped Cauchy density."""
     total = torch.zeros_like(x[:, 0])
-    for peak, width in zip(peaks, widths, strict=True):
+    for centre, width, _ in zip(*peaks, strict=True):
         g = 2.0 * math.pi * width
         # cosh g - cos 2 pi t as a sum of squares, which does not cancel where both are small.
-        gap = 2.0 * ((0.5 * g).sinh().square() + (math.pi * (x - peak)).sin().square())
+        gap = 2.0 * ((0.5 * g).sinh().square() + (math.pi * (x - centre)).sin().square())
         total += torch.where(width >= BROAD, 1.0, g.sinh() / gap).prod(dim=-1)
-    return EVEN + (1.0 - EVEN) * total / len(peaks)
+    return EVEN + (1.0 - EVEN) * total / len(peaks[0])

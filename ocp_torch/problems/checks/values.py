@@ -1,6 +1,4 @@
-"""Values: finite everywhere, `f >= 0` and `mu0 >= 0`, and `f` within the bound that the problem declares."""
-
-from __future__ import annotations
+"""Values: finite everywhere, `f >= 0` and `mu0 >= 0`, `f` within its declared bound, and divergences that are some."""
 
 import torch
 from torch import Tensor
@@ -19,12 +17,19 @@ FACES = 32
 # The lowest states from which a search goes on downhill, and its steps.
 DESCENTS, STEPS = 16, 40
 # Designs of the states (see `functions.FIRST_DESIGN`).
-SPREAD, FACE, SIGN = 3, 4, 6
+SPREAD, FACE, SIGN, DIVERGENCE = 3, 4, 6, 7
+# What a divergence is one of, and the states at which it is compared with differences of it.
+SOURCES, COMPARED = {"drift_divergence": "drift", "control_divergence": "control_matrix"}, 24
+# Steps of the differences. They are believed where both agree within this part of the largest divergence, and a claim that is
+# off by more than that part there is wrong; kinks and jumps at a minority of states are forgiven.
+DIFFERENCES, AGREE, WRONG = (1e-3, 2.5e-4), 0.01, 0.1
+# Beyond so many numbers the differences cost too much.
+MOST_NUMBERS = 2**24
 
 
 def require_finite(functions: Functions) -> None:
     """At evenly spread states and, the data, at those where a division goes wrong first: on the faces and the middles."""
-    for dtype in (torch.float64, torch.float32):
+    for dtype, how in ((torch.float64, ""), (torch.float32, " in single precision")):
         spread = functions.states(functions.count, SPREAD).to(dtype).remainder(1.0)
         special = _special(functions).to(dtype)
         for name in FORMS:
@@ -35,7 +40,6 @@ def require_finite(functions: Functions) -> None:
                 bad = ~torch.isfinite(values).reshape(len(x), -1).all(dim=-1)
                 if bool(bad.any()):
                     at = int(bad.nonzero()[0])
-                    how = " in single precision" if dtype is torch.float32 else ""
                     raise ProblemError(
                         f"{name} of {functions.name} gives {values[at].tolist()}{how} at {place(x[at])}, but must be finite "
                         "on the whole torus."
@@ -77,3 +81,41 @@ def _require_sign(functions: Functions, name: str, x: Tensor, hint: str) -> tupl
             f"{name} of {functions.name} is {least:.6g} at {place(found.x)}, but must be at least 0{hint}"
         )
     return largest, x[int(values.argmax())]
+
+
+def require_divergences(functions: Functions) -> None:
+    """Raise where most of the divergences that central differences of two steps settle are claimed to be something else."""
+    d, m = functions.problem.dim, functions.problem.control_dim
+    if functions.simulator or COMPARED * d * d * m > MOST_NUMBERS:
+        return
+    x = functions.exact_states(COMPARED, DIVERGENCE)
+    for name, source in SOURCES.items():
+        claimed = functions.given(name, x)
+        if claimed is None:
+            continue
+        claimed = claimed.reshape(len(x), -1)
+        coarse, fine = (_differences(functions, source, x, step) for step in DIFFERENCES)
+        size = float(torch.maximum(fine.abs(), claimed.abs()).max())
+        settled = ((coarse - fine).abs() <= AGREE * size).all(dim=-1)
+        off = (claimed - fine).abs().amax(dim=-1)
+        wrong = settled & (off > WRONG * size)
+        if 2 * int(settled.sum()) > len(x) and 2 * int(wrong.sum()) > int(settled.sum()):
+            at = int((off * wrong).argmax())
+            raise ProblemError(
+                f"{name} of {functions.name} is {_listed(claimed[at])} at {place(x[at])}, but by differences of {source} it "
+                f"is {_listed(fine[at])}; give the divergence of {source}, or None where it is not known (as where "
+                f"{source} detaches x or leaves PyTorch, which loses its derivative)."
+            )
+
+
+def _differences(functions: Functions, source: str, x: Tensor, step: float) -> Tensor:
+    """The divergence of each column, ``(N, columns)``, by central differences."""
+    total = torch.zeros((), dtype=x.dtype)
+    for i, move in enumerate(step * torch.eye(x.shape[1], dtype=x.dtype)):
+        change = (functions.ask(source, x + move) - functions.ask(source, x - move)) / (2.0 * step)
+        total = total + change.reshape(*x.shape, -1)[:, i]
+    return total
+
+
+def _listed(values: Tensor) -> str:
+    return f"{float(values[0]):.4g}" if len(values) == 1 else str([round(float(v), 6) for v in values[:8]])

@@ -1,7 +1,5 @@
 r"""The paper's example (section 4.4): `dx/dt = u` on the circle, `f(x) = x(x-1) + 1/4`, `q = 2`, uniform start."""
 
-from __future__ import annotations
-
 from ocp_torch.problems.exact.torus import Torus
 
 

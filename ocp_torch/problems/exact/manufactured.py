@@ -6,7 +6,7 @@ Choose periodic `V0`, `B`, `q`, and densities `mu0`, `mu* > 0`. Then `u* = grad 
 `f = V0 - grad V0 . g* / rho - |u*|^q / q + c` makes the Hamilton-Jacobi-Bellman equation hold with `V* = V0 + c`.
 """
 
-from __future__ import annotations
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -15,8 +15,7 @@ from ocp_torch.errors import InputError, require_flag, require_integer, require_
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.control_cost import norm_power
-from ocp_torch.problems.exact.trigonometric import TrigonometricPolynomial, random_polynomial
-from ocp_torch.problems.exact.wavy_matrix import WavyMatrix
+from ocp_torch.problems.exact.trigonometric import TrigonometricPolynomial, WavyMatrix, random_polynomial
 from ocp_torch.problems.problem import Problem
 
 # States searched for the extrema of u* and f, and the ascents from the best of them with their steps: the truth claimed is as
@@ -54,9 +53,7 @@ class Manufactured(Problem):
         seed: int = 0,
         control_limit: float | None = None,
     ) -> None:
-        super().__init__(
-            dim=dim, control_dim=control_dim, discount=discount, exponent=exponent, control_limit=control_limit
-        )
+        super().__init__(dim, control_dim, discount, exponent, control_limit)
         if self.control_dim > self.dim:
             raise InputError(f"problem.control_dim is {control_dim}, but must be at most problem.dim = {dim}.")
         self.drift_size = require_number("problem.drift", drift, at_least=0.0)
@@ -68,10 +65,6 @@ class Manufactured(Problem):
         self.seed = require_integer("problem.seed", seed, 0)
         self._prescribe(torch.Generator().manual_seed(self.seed))
         self._derive()
-
-    @property
-    def parameters(self) -> dict:
-        return {**super().parameters, "drift": self.drift_size}
 
     @property
     def driftless(self) -> bool:
@@ -88,10 +81,9 @@ class Manufactured(Problem):
         draw = lambda peak=None: random_polynomial(d, self.interaction, terms, generator, peak)
         peak = torch.rand(d, generator=generator, dtype=torch.float64)
         self.V0 = draw()
-        self.mu = draw(peak).scaled(self.contrast)
-        self.mu.constant = 1.0
-        self.mu0 = draw(torch.rand(d, generator=generator, dtype=torch.float64)).scaled(self.initial_contrast)
-        self.mu0.constant = 1.0
+        self.mu = replace(draw(peak).scaled(self.contrast), constant=1.0)
+        peak = torch.rand(d, generator=generator, dtype=torch.float64)
+        self.mu0 = replace(draw(peak).scaled(self.initial_contrast), constant=1.0)
         self.phi = self.mu0.minus(self.mu).inverse_laplacian()
         self.stream = [self._stream_component(i, generator) for i in range(d)]
         self.B = WavyMatrix(d, self.control_dim, self.state_dependent_control, generator)
@@ -105,15 +97,13 @@ class Manufactured(Problem):
             return TrigonometricPolynomial(none.reshape(0, 1), none, none, sign * size)
         part = random_polynomial(self.dim - 1, self.interaction, self.dim, generator).scaled(0.5 * size)
         left, right = part.waves[:, :i], part.waves[:, i:]
-        part.waves = torch.cat([left, torch.zeros(len(left), 1, dtype=torch.float64), right], dim=1)
-        part.constant = 0.5 * sign * size
-        return part
+        waves = torch.cat([left, torch.zeros_like(part.waves[:, :1]), right], dim=1)
+        return replace(part, waves=waves, constant=0.5 * sign * size)
 
     def _derive(self) -> None:
         """Scale `V0` so that `sup |u*| = control_size`, then find the smallest `c` with `f >= 0`, and the bounds."""
         points = scrambled_sobol(SEARCH_POINTS, self.dim, 0, torch.float64)
-        push = lambda x: self._pull_back(x).norm(dim=-1)
-        steepest = supremum(push, points, ASCENTS, ASCENT_STEPS).value
+        steepest = supremum(lambda x: self._pull_back(x).norm(dim=-1), points, ASCENTS, ASCENT_STEPS).value
         if steepest <= 0.0:
             raise InputError(
                 f"problem.seed = {self.seed} gives a value function the control cannot change; take another."
@@ -164,11 +154,10 @@ class Manufactured(Problem):
         direction = torch.nn.functional.normalize(p, dim=-1, eps=1e-30)
         scale = norm_power(p, power) if power > 0.0 else torch.ones_like(p[:, 0])
         radial = torch.full_like(scale, power)
-        limit = self.control_limit
-        if limit is not None and self.limited:
+        if self.control_limit is not None and self.limited:
             size = p.norm(dim=-1)
-            at_limit = size > limit ** (self.exponent - 1.0)
-            scale = torch.where(at_limit, limit / size.clamp_min(1e-30), scale)
+            at_limit = size > self.control_limit ** (self.exponent - 1.0)
+            scale = torch.where(at_limit, self.control_limit / size.clamp_min(1e-30), scale)
             radial = torch.where(at_limit, -1.0, radial)
         along = torch.einsum("nk,nkj->nj", direction, jacobian).unsqueeze(1)
         bent = jacobian + radial[:, None, None] * direction.unsqueeze(-1) * along

@@ -1,7 +1,5 @@
 r"""A kinked problem with exact truth in any dimension: independent circles, seen through a shear of the torus."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,22 +1,36 @@
 """A problem known only through recorded samples: no simulator, no formula, nothing to evaluate anywhere else."""
 
-from __future__ import annotations
-
 import copy
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import MARGIN, Problem
-from ocp_torch.problems.recorded import recording
-from ocp_torch.problems.recorded.recording import Recording
-from ocp_torch.problems.recorded.split import HELD_OUT, TRAINING, VALIDATION, split, with_divergences
+from ocp_torch.problems.recorded.recording import Recording, read
 from ocp_torch.problems.samples import Samples
 
 # Matrices that differ by less, relative to 1 + their size, are the same.
 CONSTANT = 1e-9
+# The part of what is not held out that evaluations during training are made on.
+VALIDATION_PART = 0.1
+# Fewest samples of a part that anything is estimated from.
+FEWEST = 32
+
+
+def _unknown(what: str) -> Callable[..., Tensor]:
+    """The method that refuses to give ``what``."""
+
+    def refuse(self: Problem, x: Tensor) -> Tensor:
+        raise InputError(
+            f"the {what} of a data set is known at its recorded states only; nothing can be simulated with it."
+        )
+
+    return refuse
 
 
 class Dataset(Problem):
@@ -30,6 +44,9 @@ class Dataset(Problem):
     """
 
     has_simulator = False
+    incidental = ("path",)
+    state_cost, initial_density = _unknown("state cost"), _unknown("initial density")
+    drift = drift_divergence = _unknown("drift")
 
     def __init__(
         self,
@@ -49,10 +66,8 @@ class Dataset(Problem):
         self.path = str(Path(path).absolute())
         self.wrap, self.seed = require_flag("problem.wrap", wrap), require_integer("problem.seed", seed, 0)
         self.held_out_part = require_number("problem.held_out", held_out, at_least=0.01, at_most=0.99)
-        self._recording: recording.Recording | None = None
-        self._parts: dict[str, Samples] = {}
-        if dim is None:
-            self._recording = recording.read(self.path, self.wrap)
+        self._recording = read(self.path, self.wrap) if dim is None else None
+        if self._recording is not None:
             samples, numbers = self._recording.samples, self._recording.numbers
             dim, control_dim = samples.B.shape[1:]
             discount = numbers.get("discount") if discount is None else discount
@@ -65,63 +80,67 @@ class Dataset(Problem):
             raise InputError("problem.discount is missing: the file does not hold it; give problem.discount=...")
         super().__init__(dim, control_dim, discount, exponent, control_limit)  # type: ignore[arg-type] # refused there
         self._B = None if constant_matrix is None else torch.tensor(constant_matrix, dtype=torch.float64)
+        self.constant_matrix = None if self._B is None else self._B.tolist()
         self.knows_control_matrix = self._B is not None
         if self._B is not None and self._B.shape != (self.dim, self.control_dim):
             raise InputError(f"problem.constant_matrix has shape {tuple(self._B.shape)}, but must be (d, m).")
         if self._recording is not None:
-            self._take_in(self._recording)
-
-    incidental = ("path",)
+            self._split(self._recording.samples)
 
     @property
     def parameters(self) -> dict:
-        return {
-            **{name: getattr(self, name) for name in ("path", "discount", "exponent", "control_limit", "seed", "wrap")},
-            "held_out": self.held_out_part,
-            "dim": self.dim,
-            "control_dim": self.control_dim,
-            "constant_matrix": None if self._B is None else self._B.tolist(),
-        }
+        return {**super().parameters, "held_out": self.held_out_part}
 
     @property
     def recording(self) -> Recording:
         """What the file holds, read when it is first asked for."""
         if self._recording is None:
-            found = recording.read(self.path, self.wrap)
-            if found.samples.B.shape[1:] != (self.dim, self.control_dim):
-                raise InputError(
-                    f"{self.path} is of d, m = {tuple(found.samples.B.shape[1:])}, not {(self.dim, self.control_dim)}."
-                )
-            self._take_in(found)
-            return found
+            found = read(self.path, self.wrap)
+            if (sizes := tuple(found.samples.B.shape[1:])) != (self.dim, self.control_dim):
+                raise InputError(f"{self.path} is of d, m = {sizes}, not {(self.dim, self.control_dim)}.")
+            self._split(found.samples)
+            self._recording = found
         return self._recording
 
-    def _take_in(self, found: Recording) -> None:
-        self._recording = found
+    def _split(self, samples: Samples) -> None:
+        """The three parts; the divergences that are 0, of no drift and of a constant `B`, are known."""
         # The largest cost among the samples, with head-room: an estimate, and the certificate calls it one.
-        self.state_cost_bound = MARGIN * float(found.samples.f.max())
-        samples = with_divergences(found.samples, constant_matrix=self._B is not None)
-        self._parts = split(samples, self.held_out_part, self.seed)
-
-    def _part(self, name: str) -> Samples:
-        _ = self.recording
-        return self._parts[name]
+        self.state_cost_bound = MARGIN * float(samples.f.max())
+        zero = torch.zeros_like(samples.f)
+        if samples.div_a is None and not samples.a.any():
+            samples = replace(samples, div_a=zero)
+        if samples.div_B is None and self._B is not None:
+            samples = replace(samples, div_B=zero.unsqueeze(-1).expand(-1, self.control_dim))
+        count = len(samples)
+        held = round(self.held_out_part * count)
+        chosen_by = max(FEWEST, round(VALIDATION_PART * (count - held)))
+        if held < FEWEST or count - held - chosen_by < FEWEST:
+            raise InputError(
+                f"problem.held_out = {self.held_out_part:g} of {count} samples leaves too few on one side; each part needs "
+                f"at least {FEWEST}."
+            )
+        generator = torch.Generator().manual_seed(derive_seed(self.seed, Branch.DATASET_SPLIT))
+        rows = torch.randperm(count, generator=generator).split([held, chosen_by, count - held - chosen_by])
+        self._held_out, self._validation, self._training = (samples.take(part) for part in rows)
 
     @property
     def training(self) -> Samples:
         """What may be learned from."""
-        return self._part(TRAINING)
+        _ = self.recording
+        return self._training
 
     @property
     def held_out(self) -> Samples:
         """What nothing was learned from or chosen by."""
-        return self._part(HELD_OUT)
+        _ = self.recording
+        return self._held_out
 
     @property
-    def validation_view(self) -> Dataset:
+    def validation_view(self) -> "Dataset":
         """The same problem with other held-out samples, for evaluations by which choices are made."""
+        _ = self.recording
         other = copy.copy(self)
-        other._recording, other._parts = self.recording, {**self._parts, HELD_OUT: self._part(VALIDATION)}
+        other._held_out = self._validation
         return other
 
     def samples(self, places: Tensor, divergences: bool = True) -> Samples:
@@ -158,21 +177,3 @@ class Dataset(Problem):
     def control_divergence(self, x: Tensor) -> Tensor:
         self.control_matrix(x[:1])
         return x.new_zeros(len(x), self.control_dim)
-
-    def state_cost(self, x: Tensor) -> Tensor:
-        raise _unknown("state cost")
-
-    def drift(self, x: Tensor) -> Tensor:
-        raise _unknown("drift")
-
-    def drift_divergence(self, x: Tensor) -> Tensor:
-        raise _unknown("drift")
-
-    def initial_density(self, x: Tensor) -> Tensor:
-        raise _unknown("initial density")
-
-
-def _unknown(what: str) -> InputError:
-    return InputError(
-        f"the {what} of a data set is known at its recorded states only; nothing can be simulated with it."
-    )

@@ -1,7 +1,5 @@
 """Whether recorded arrays can be what they are called: signs, the range of states, the distribution they were drawn from."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -39,37 +37,27 @@ def samples_of(path: Path, arrays: dict[str, np.ndarray], wrap: bool) -> Samples
         array = arrays.get(name)
         if array is not None and ((array <= 0.0) if name == "density" else (array < 0.0)).any():
             raise InputError(f"{path}: {name} falls to {array.min():g}, but must be {what}.")
-    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    columns = {name: torch.from_numpy(array) for name, array in arrays.items()}
     one = torch.ones(len(f), dtype=torch.float64)
-    weight = 1.0 / tensors["density"] if "density" in tensors else one
-    samples = Samples(
-        x=torch.from_numpy(x).remainder(1.0),
-        f=tensors["f"].clamp_min(0.0),
-        a=tensors["a"],
-        B=tensors["B"],
-        mu0=tensors.get("mu0", one),
-        weight=weight,
-        div_a=tensors.get("div_a"),
-        div_B=tensors.get("div_B"),
-    )
-    _require_distribution(path, samples, "density" in tensors)
+    density = columns.pop("density", None)
+    columns |= {"x": columns["x"].remainder(1.0), "f": columns["f"].clamp_min(0.0)}
+    samples = Samples(**{"mu0": one, "weight": one if density is None else 1.0 / density} | columns)
+    _require_distribution(path, samples, density is not None)
     return samples
 
 
 def _require_distribution(path: Path, samples: Samples, given: bool) -> None:
     """The weighted means of what integrates to a known number: 1, `mu0`, and waves along each coordinate."""
-    count = len(samples)
-    weigh = "mean of 1 / density" if given else "mean of 1"
 
     def off(values: Tensor, truth: float) -> float:
         """Standard errors between the weighted mean and ``truth``, less `FORGIVEN`."""
         terms = samples.weight * values
-        return max(0.0, abs(float(terms.mean()) - truth) - FORGIVEN) / max(float(terms.std()) / count**0.5, 1e-12)
+        error = float(terms.std()) / len(terms) ** 0.5
+        return max(0.0, abs(float(terms.mean()) - truth) - FORGIVEN) / max(error, 1e-12)
 
-    if off(torch.ones(count, dtype=torch.float64), 1.0) > SURE:
-        raise InputError(
-            f"{path}: the {weigh} is {float(samples.weight.mean()):.4g}, but must be 1: density is not that of x."
-        )
+    if off(torch.ones_like(samples.weight), 1.0) > SURE:
+        mean = float(samples.weight.mean())
+        raise InputError(f"{path}: the mean of 1 / density is {mean:.4g}, but must be 1: density is not that of x.")
     if off(samples.mu0, 1.0) > SURE:
         mean = float(samples.mean(samples.mu0))
         raise InputError(f"{path}: mu0 has mean {mean:.4g} over the torus, but a density must have mean 1.")
@@ -77,11 +65,9 @@ def _require_distribution(path: Path, samples: Samples, given: bool) -> None:
         for k in FREQUENCIES:
             angle = 2.0 * torch.pi * k * samples.x[:, i]
             if max(off(angle.cos(), 0.0), off(angle.sin(), 0.0)) > SURE:
-                source = "the density it comes with" if given else "the uniform law"
-                raise InputError(
-                    f"{path}: coordinate {i} of x does not follow {source}; "
-                    + ("give the density of the law it was drawn from." if not given else "density must be that of x.")
-                )
+                uniform = "the uniform law; give the density of the law it was drawn from"
+                law = "the density it comes with; density must be that of x" if given else uniform
+                raise InputError(f"{path}: coordinate {i} of x does not follow {law}.")
 
 
 def dependence_notes(path: Path, samples: Samples) -> tuple[str, ...]:
@@ -91,9 +77,7 @@ def dependence_notes(path: Path, samples: Samples) -> tuple[str, ...]:
     if spread <= 0.0:
         return ()
     correlation = float((centred[1:] * centred[:-1]).sum()) / spread
-    if correlation * len(centred) ** 0.5 <= SURE:
-        return ()
-    return (
-        f"consecutive samples of {path.name} are alike (correlation {correlation:.2g}): they are no independent draws, and "
-        "errors and intervals are too small.",
+    alike = (
+        f"consecutive samples of {path.name} are alike (correlation {correlation:.2g}): they are no independent draws, "
     )
+    return (f"{alike}and errors and intervals are too small.",) if correlation * len(centred) ** 0.5 > SURE else ()

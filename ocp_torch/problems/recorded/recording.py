@@ -5,12 +5,9 @@ Arrays: ``x (N, d)`` in `[0, 1)`, ``f (N,)``, ``a (N, d)``, ``B (N, d, m)``; opt
 the numbers ``discount``, ``exponent`` and ``control_limit``. Samples must be independent draws.
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -58,15 +55,29 @@ def read(path: str | Path, wrap: bool = False) -> Recording:
     if kind(path) is None:
         raise InputError(f"problem.path is {str(path)!r}, which does not exist.")
     arrays = read_npz(path, KNOWN, MOST_BYTES) if path.suffix == ".npz" else _read_safetensors(path)
-    _require_names(path, arrays)
-    numbers = {name: _number(path, name, arrays.pop(name)) for name in NUMBERS if name in arrays}
+    missing = [name for name in REQUIRED if name not in arrays]
+    if missing:
+        raise InputError(f"{path} lacks {', '.join(missing)}; a recording holds x, f, a and B.")
+    for name in arrays:
+        if name not in KNOWN:
+            raise InputError(f"{path} holds {name!r}, which is no array of a recording{nearest(name, KNOWN)}.")
+    numbers = {}
+    for name in (name for name in NUMBERS if name in arrays):
+        number = arrays.pop(name)
+        if number.size != 1 or not np.isfinite(number).all():
+            raise InputError(f"{path}: {name} has shape {number.shape}, but must be one finite number.")
+        numbers[name] = float(number.reshape(()))
     _require_shapes(path, arrays)
     for name, array in arrays.items():
         bad = ~np.isfinite(array).reshape(len(array), -1).all(axis=1)
         if bad.any():
             raise InputError(f"{path}: {name} is not finite at {int(bad.sum())} samples, first at row {bad.argmax()}.")
     samples = samples_of(path, arrays, wrap)
-    return Recording(samples, numbers, _digest(arrays), dependence_notes(path, samples))
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(arrays[name]).data)
+    return Recording(samples, numbers, digest.hexdigest(), dependence_notes(path, samples))
 
 
 def write(path: str | Path, samples: Samples, numbers: dict[str, float | None], density: Tensor | None = None) -> None:
@@ -76,17 +87,15 @@ def write(path: str | Path, samples: Samples, numbers: dict[str, float | None], 
         raise InputError(f"out is {str(path)!r}, but must be a file ending in {' or '.join(SUFFIXES)}.")
     columns = {name: getattr(samples, name) for name in ("x", "f", "a", "B", "div_a", "div_B", "mu0")}
     columns["density"] = density
-    arrays: dict[str, Any] = {
-        k: np.ascontiguousarray(v.detach().cpu().numpy()) for k, v in columns.items() if v is not None
-    }
-    arrays |= {k: np.float64(v) for k, v in numbers.items() if v is not None}
+    arrays = {k: np.ascontiguousarray(v.detach().cpu().numpy()) for k, v in columns.items() if v is not None}
+    arrays |= {k: np.asarray(v, dtype=np.float64) for k, v in numbers.items() if v is not None}
 
     def fill(temporary: Path) -> None:
         if path.suffix == ".safetensors":
-            save_file({k: np.asarray(v) for k, v in arrays.items()}, str(temporary))
+            save_file(arrays, str(temporary))
             return
         with temporary.open("wb") as file:
-            np.savez_compressed(file, **arrays)
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
     write_atomically(path, fill)
 
@@ -95,28 +104,12 @@ def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
     tensors, _ = read_safetensors(path, MOST_BYTES)
     for name, tensor in tensors.items():
         if tensor.dtype == torch.bool or tensor.is_complex():
-            raise InputError(
-                f"{path}: {name} has type {str(tensor.dtype).removeprefix('torch.')}, but must hold real numbers."
-            )
+            kind_of = str(tensor.dtype).removeprefix("torch.")
+            raise InputError(f"{path}: {name} has type {kind_of}, but must hold real numbers.")
     total = 8 * sum(tensor.numel() for tensor in tensors.values())
     if total > MOST_BYTES:
         raise InputError(f"{path} unpacks to {total:,} bytes, but at most {MOST_BYTES:,} are read.")
     return {name: tensor.double().numpy() for name, tensor in tensors.items()}
-
-
-def _require_names(path: Path, arrays: dict) -> None:
-    missing = [name for name in REQUIRED if name not in arrays]
-    if missing:
-        raise InputError(f"{path} lacks {', '.join(missing)}; a recording holds x, f, a and B.")
-    for name in arrays:
-        if name not in KNOWN:
-            raise InputError(f"{path} holds {name!r}, which is no array of a recording{nearest(name, KNOWN)}.")
-
-
-def _number(path: Path, name: str, array: np.ndarray) -> float:
-    if array.size != 1 or not np.isfinite(array).all():
-        raise InputError(f"{path}: {name} has shape {array.shape}, but must be one finite number.")
-    return float(array.reshape(()))
 
 
 def _require_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -131,11 +124,3 @@ def _require_shapes(path: Path, arrays: dict[str, np.ndarray]) -> None:
             raise InputError(f"{path}: {name} has shape {arrays[name].shape}, but must have ({letters}) = {expected}.")
     if len(x) < FEWEST:
         raise InputError(f"{path} holds {len(x)} samples, but at least {FEWEST} are needed.")
-
-
-def _digest(arrays: dict[str, np.ndarray]) -> str:
-    digest = hashlib.sha256()
-    for name in sorted(arrays):
-        digest.update(name.encode())
-        digest.update(np.ascontiguousarray(arrays[name]).data)
-    return digest.hexdigest()

@@ -1,7 +1,5 @@
 """A stranger's NumPy function, asked with care: what it gives is checked, and what goes wrong is named with the state."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -10,31 +8,24 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError, ProblemError, require_integer
 from ocp_torch.maths.sampling import scrambled_sobol
-from ocp_torch.problems.simulator.target import asked, resolved
-from ocp_torch.problems.simulator.workers import Workers
+from ocp_torch.problems.simulator.target import Workers, asked, resolved
 
-__all__ = ["Oracle", "asked", "resolved"]
-
-# Two calls may differ by so much, relative to the size of the answer, and still be a function of the state.
-SAME = 1e-6
-# Single precision is forgiven that much more.
-SAME_IN_FLOAT32 = 1e3
+# Two calls may differ by so much, relative to the size of the answer, and still be a function of the state; in single
+# precision by the second number.
+SAME, SAME_IN_FLOAT32 = 1e-6, 1e-3
 # At the seam, where a coordinate passes from 1 to 0, states this far on both sides are compared: so many for each coordinate,
 # and at most so many coordinates.
 SEAM_STEP, SEAM_PROBES, MOST_SEAMS = 1e-7, 4, 32
 # What changes across the seam by more than that part of the answer's size jumps there. The size is the largest answer at so
 # many states of the whole torus: at the seam itself an odd function is nearly 0.
 SEAM_JUMP, SIZED = 1e-3, 32
-NAMES = ("f", "a", "B", "mu0")
 
 
 class Oracle:
-    """``target``, by name or the function itself, as a function of states ``(N, dim)`` that gives `f`, `a`, `B` and maybe
-    `mu0`: made only if it keeps to that at a few states and across the seam, and asked with ``workers`` processes.
+    """The ``target`` of a `Simulator`, by name or the function itself, asked with ``workers`` processes: made only if it
+    keeps to what is said there at a few states and across the seam, and held to it whenever it is asked.
 
     ``driftless``: `None` stands for `a`; ``gives_mu0``: there is a fourth part; ``in_float32``: `f` is in single precision.
-    Raises `InputError`, when made and when asked, with the state, where the function fails, gives another shape or a number
-    that is not finite; when made, also where it is no function of the state alone or jumps from 1 to 0.
     """
 
     def __init__(self, target: str | Callable, dim: int, control_dim: int, workers: int = 1) -> None:
@@ -73,20 +64,17 @@ class Oracle:
         for name, values in found.items():
             bad = ~torch.isfinite(values).reshape(len(x), -1).all(dim=-1)
             if bool(bad.any()):
-                at_row = int(bad.nonzero()[0])
-                raise ProblemError(f"the oracle's {name} is not finite at x = {x[at_row].tolist()}.")
+                raise ProblemError(f"the oracle's {name} is not finite at x = {x[int(bad.nonzero()[0])].tolist()}.")
         return found
 
     def _failure(self, x: np.ndarray, error: Exception) -> str:
         """What it raised, and the state it raises it at, found by halving the batch."""
         while len(x) > 1:
-            half = x[: len(x) // 2]
+            half, x = x[: len(x) // 2], x[len(x) // 2 :]
             try:
                 asked(self._function, half, self.one_by_one)
             except Exception as other:  # whatever a stranger's code may raise
                 x, error = half, other
-                continue
-            x = x[len(x) // 2 :]
         reason = next(iter(str(error).splitlines()), "").rstrip(".") or "no message"
         return f"the oracle raised {type(error).__name__} at x = {x[0].tolist()}: {reason}."
 
@@ -97,27 +85,23 @@ class Oracle:
             raise InputError(
                 f"the oracle gave a {type(answer).__name__}, but must give f, a, B (and, if it likes, mu0)."
             )
-        parts = dict(zip(NAMES, answer, strict=False))
         forms = {"f": (count,), "a": (count, d), "B": (count, d, m), "mu0": (count,)}
         found = {}
-        for name, part in parts.items():
-            if name == "a" and part is None:
-                part = np.zeros((count, d))
+        for (name, form), part in zip(forms.items(), answer, strict=False):
             try:
-                given = np.asarray(part)
-                array = given.astype(np.float64) if given.dtype.kind in "fiu" else None
+                given = np.zeros(form) if name == "a" and part is None else np.asarray(part)
             except (TypeError, ValueError):
-                array = None
-            if array is None:
+                given = np.asarray(None)
+            if given.dtype.kind not in "fiu":
                 raise InputError(f"the oracle's {name} is no array of real numbers at x = {x[0].tolist()}.")
-            if name == "B" and m == 1 and array.shape == (count, d):
-                array = array[:, :, None]
-            if array.shape != forms[name]:
+            if name == "B" and m == 1 and given.shape == (count, d):
+                given = given[:, :, None]
+            if given.shape != form:
                 raise InputError(
-                    f"the oracle's {name} has shape {array.shape} for states of shape {x.shape} (x = {x[0].tolist()} the "
-                    f"first), but must have {forms[name]}."
+                    f"the oracle's {name} has shape {given.shape} for states of shape {x.shape} (x = {x[0].tolist()} the "
+                    f"first), but must have {form}."
                 )
-            found[name] = torch.from_numpy(np.ascontiguousarray(array))
+            found[name] = torch.from_numpy(given.astype(np.float64, order="C"))
         return found
 
     def _understand(self) -> None:
@@ -129,9 +113,8 @@ class Oracle:
         self.driftless, self.gives_mu0 = raw[1] is None, len(raw) == 4
         self.in_float32 = np.asarray(raw[0]).dtype == np.float32
         again, alone = self.checked(x), self.checked(x[2:3])
-        same = SAME * (SAME_IN_FLOAT32 if self.in_float32 else 1.0)
         for name, values in found.items():
-            size = same * (float(values.abs().max().nan_to_num()) + 1e-6)
+            size = (SAME_IN_FLOAT32 if self.in_float32 else SAME) * (float(values.abs().max()) + 1e-6)
             if float((again[name] - values).abs().max()) > size:
                 raise InputError(
                     f"the oracle's {name} differs between two calls at x = {x[0].tolist()}; it must be a function of x."
@@ -166,9 +149,10 @@ class Oracle:
             here, there = self.checked(after), self.checked(before)
             for name in here:
                 change = (here[name] - there[name]).reshape(SEAM_PROBES, -1).abs().amax(dim=-1)
-                size = max(float(values[name].abs().max()) for values in (here, there, everywhere))
                 worst = int(change.argmax())
-                if float(change[worst]) > SEAM_JUMP * size:
+                if float(change[worst]) > SEAM_JUMP * max(
+                    float(v[name].abs().max()) for v in (here, there, everywhere)
+                ):
                     raise InputError(
                         f"the oracle's {name} jumps by {float(change[worst]):.3g} where coordinate {i} passes from 1 to 0, "
                         f"at x = {after[worst].tolist()}, but it must have period 1 in each coordinate."

@@ -1,19 +1,15 @@
 """A problem given by one plain function, somebody's simulator: a black box that is asked, and never differentiated."""
 
-from __future__ import annotations
-
 from collections import abc
 
 import torch
 from torch import Tensor
 
 from ocp_torch.errors import require_flag
+from ocp_torch.maths.differences import STEPS, Differenced
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.oracle import Oracle
 
-# Half the distance of the two states of a difference quotient, by what the oracle computes in: near the cube root of its
-# rounding, which balances what rounding and what curvature cost.
-STEPS = {"float64": 1e-5, "float32": 2e-3}
 # States scanned for narrow features for each at which a bound is evaluated, where the oracle takes batches.
 SCAN_FACTOR = 8
 
@@ -48,7 +44,7 @@ class Simulator(Problem):
         self.differences = require_flag("problem.differences", differences)
         self.workers = workers
         self._oracle = Oracle(target, self.dim, self.control_dim, workers)
-        self._step = STEPS["float32" if self._oracle.in_float32 else "float64"]
+        self._step = STEPS[torch.float32 if self._oracle.in_float32 else torch.float64]
 
     @property
     def scan_factor(self) -> int:
@@ -63,17 +59,22 @@ class Simulator(Problem):
     def gives_divergences(self) -> bool:
         return self.differences
 
+    def _part(self, name: str, x: Tensor) -> Tensor:
+        """One part of the answers; without differences an ascent follows the networks alone."""
+        answer = lambda at: self._oracle.answers(_unit_cell(at))[name].to(at)
+        return Differenced.apply(x, answer, self._step, self.differences)
+
     def state_cost(self, x: Tensor) -> Tensor:
-        return _Ask.apply(x, self, "f")
+        return self._part("f", x)
 
     def drift(self, x: Tensor) -> Tensor:
-        return torch.zeros_like(x) if self._oracle.driftless else _Ask.apply(x, self, "a")
+        return torch.zeros_like(x) if self._oracle.driftless else self._part("a", x)
 
     def control_matrix(self, x: Tensor) -> Tensor:
-        return _Ask.apply(x, self, "B")
+        return self._part("B", x)
 
     def initial_density(self, x: Tensor) -> Tensor:
-        return _Ask.apply(x, self, "mu0") if self._oracle.gives_mu0 else torch.ones_like(x[:, 0])
+        return self._part("mu0", x) if self._oracle.gives_mu0 else torch.ones_like(x[:, 0])
 
     def drift_divergence(self, x: Tensor) -> Tensor | None:
         return self._divergences(x)[0] if self.differences else None
@@ -84,8 +85,8 @@ class Simulator(Problem):
     @torch.no_grad()
     def _divergences(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """`div a` and `div B` by central differences, all `2 d` shifted batches in one call."""
-        at = x.detach().cpu().double().remainder(1.0)
-        if "divergences" not in (kept := self.answers(at)):
+        at = _unit_cell(x)
+        if "divergences" not in (kept := self._oracle.answers(at)):
             moves = self._step * torch.eye(self.dim, dtype=torch.float64)
             shifted = torch.cat([at + s * e for e in moves for s in (1.0, -1.0)]).remainder(1.0)
             found = self._oracle.checked(shifted)
@@ -95,47 +96,6 @@ class Simulator(Problem):
             kept["divergences"] = torch.einsum("ini->n", a), torch.einsum("inik->nk", B)
         return tuple(part.to(x) for part in kept["divergences"])
 
-    def answers(self, at: Tensor) -> dict:
-        """All parts at float64 states of the unit cell (see `Oracle.answers`)."""
-        return self._oracle.answers(at)
 
-
-class _Ask(torch.autograd.Function):
-    """One part of the oracle's answer: values by calling, derivatives by central differences; stacks flattened."""
-
-    @staticmethod
-    def forward(x: Tensor, problem: Simulator, name: str) -> Tensor:
-        return problem.answers(x.detach().cpu().double().remainder(1.0))[name].to(x)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output) -> None:
-        x, ctx.problem, ctx.name = inputs
-        ctx.save_for_backward(x)
-        ctx.save_for_forward(x)
-
-    @staticmethod
-    def jvp(ctx, tangent: Tensor, *_) -> Tensor:
-        (x,) = ctx.saved_tensors
-        return _difference(ctx.problem, ctx.name, x, tangent)
-
-    @staticmethod
-    def backward(ctx, outward: Tensor):
-        (x,) = ctx.saved_tensors
-        if not ctx.problem.differences:
-            return torch.zeros_like(x), None, None  # an ascent then follows the networks alone
-        basis = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
-        slopes = [outward * _difference(ctx.problem, ctx.name, x, e.expand_as(x)) for e in basis]
-        return torch.stack([s.reshape(len(x), -1).sum(dim=-1) for s in slopes], dim=-1), None, None
-
-    @staticmethod
-    def vmap(info, in_dims, x: Tensor, problem: Simulator, name: str):
-        if in_dims[0] is None:
-            return _Ask.apply(x, problem, name), None
-        x = x.movedim(in_dims[0], 0)
-        return _Ask.apply(x.flatten(0, 1), problem, name).unflatten(0, x.shape[:2]), 0
-
-
-def _difference(problem: Simulator, name: str, x: Tensor, direction: Tensor) -> Tensor:
-    step, x64, along = problem._step, x.double(), direction.double()
-    ahead, behind = (_Ask.apply(x64 + s * step * along, problem, name) for s in (1.0, -1.0))
-    return ((ahead - behind) / (2.0 * step)).to(direction)
+def _unit_cell(x: Tensor) -> Tensor:
+    return x.detach().cpu().double().remainder(1.0)

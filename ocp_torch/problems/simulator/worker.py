@@ -3,8 +3,6 @@
 Nothing of the package is imported before the watch stands, so that no moment of a start outlives the parent.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import signal
@@ -13,14 +11,14 @@ import threading
 
 # What the C library calls it: `prctl(PR_SET_PDEATHSIG, ...)`.
 PR_SET_PDEATHSIG = 1
+# What a pipe raises when the parent is gone, or wants no more.
+GONE = (EOFError, BrokenPipeError, ConnectionResetError)
 
 
 def end_with_parent(lifeline: int, parent: int, mortal: bool) -> None:
-    """End this process as soon as the other end of the pipe ``lifeline`` closes, whatever it is doing.
-
-    Where the parent's main thread started this one (``mortal``) Linux itself ends it too, also while somebody's compiled
-    code lets no other thread run; ``parent`` is whose child it was, in case it died before it could be asked for.
-    """
+    """End this process as soon as the other end of the pipe ``lifeline`` closes, whatever it is doing. Where the parent's
+    main thread started this one (``mortal``) Linux itself ends it too, also while somebody's compiled code lets no other
+    thread run; ``parent`` is whose child it was, in case it died before it could be asked for."""
 
     def wait_for_the_end() -> None:
         while os.read(lifeline, 1):
@@ -35,10 +33,8 @@ def end_with_parent(lifeline: int, parent: int, mortal: bool) -> None:
 
 
 def heed_the_parent_alone() -> None:
-    """Ctrl-C and a scheduler's SIGTERM reach all processes of a run, but what to do then is the parent's to say.
-
-    Handlers, since an ignored or blocked signal would stay so in the programs that a simulator starts.
-    """
+    """Ctrl-C and a scheduler's SIGTERM reach all processes of a run, but what to do then is the parent's to say; by handlers,
+    since an ignored or blocked signal would stay so in the programs that a simulator starts."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: None)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
@@ -57,7 +53,7 @@ def serve(connection) -> None:
         try:
             function = function or resolved(target)
             connection.send((True, asked(function, x, one_by_one)))
-        except (EOFError, BrokenPipeError, ConnectionResetError):
+        except GONE:
             raise
         except Exception as error:  # whatever a stranger's code may raise, or give that cannot be sent
             try:
@@ -66,19 +62,14 @@ def serve(connection) -> None:
                 connection.send((False, RuntimeError(f"{type(error).__name__}: {error} ({unsendable})")))
 
 
-def main(requests: int, lifeline: int, parent: int, mortal: bool) -> None:
-    """See the arguments of `Workers`."""
-    end_with_parent(lifeline, parent, mortal)
+if __name__ == "__main__":
+    sys.path.pop(0)  # this file's folder, whose names are nobody's
+    requests, lifeline, parent, mortal = map(int, sys.argv[1:])
+    end_with_parent(lifeline, parent, bool(mortal))
     heed_the_parent_alone()
     from multiprocessing.connection import Connection
 
     try:
         serve(Connection(requests))
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        pass  # the parent is gone, or wants no more
-
-
-if __name__ == "__main__":
-    sys.path.pop(0)  # this file's folder, whose names are nobody's
-    pipe, lifeline, parent, mortal = map(int, sys.argv[1:])
-    main(pipe, lifeline, parent, bool(mortal))
+    except GONE:
+        pass

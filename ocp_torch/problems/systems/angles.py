@@ -1,6 +1,4 @@
-"""Angles on the torus: a coordinate is a turn, a physical angle is in radians; and a bump that obstacles cost."""
-
-from __future__ import annotations
+"""Angles on the torus: a coordinate is a turn, a physical angle is in radians."""
 
 import math
 
@@ -17,8 +15,3 @@ def to_turns(radians: Tensor) -> Tensor:
 def to_radians(turns: Tensor) -> Tensor:
     """Any coordinates as angles in [-pi, pi)."""
     return ((turns + 0.5).remainder(1.0) - 0.5) * TURN
-
-
-def bump(square: Tensor, reach: Tensor | float) -> Tensor:
-    """`max(1 - r^2 / reach^2, 0)^3` of a ``square`` distance `r^2`: 1 at the centre, 0 from ``reach`` on."""
-    return (1.0 - square / reach**2).clamp_min(0.0) ** 3

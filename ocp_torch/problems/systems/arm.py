@@ -1,29 +1,21 @@
 r"""A planar arm of `n` revolute joints under joint-velocity control: reach a target, keep the links off round obstacles."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from ocp_torch.problems.arguments import require_numbers
+from ocp_torch.errors import require_number, require_numbers
 from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.linkage import Linkage
 
-TARGET = (0.2, 0.65)
-OBSTACLES = ((0.75, -0.4, 0.08),)
-
 
 class Arm(Linkage):
-    r"""`dx/dt = speed u` and `f = target_weight |p(x) - target|^2 + obstacle_weight sum_o (1 - prod_s (1 - b_o(r_s(x))))`.
+    r"""A `Linkage` in the plane: `x_i` is the angle of joint `i` against the link before it, in turns.
 
-    `x_i` is the angle of joint `i` against the link before it, in turns; the state space is exactly the torus and there is
-    no drift. Joint `i` ends at `r_i = r_{i-1} + l_i (cos, sin)(2 pi (x_1 + ... + x_i))`, in metres from the base, and the
-    end effector is `p = r_n` (Murray, Li, Sastry: *A Mathematical Introduction to Robotic Manipulation*, chapter 3).
-    `u = 1` turns a joint by ``speed`` turns per second. `s` runs over points of all links; `b_o` is 1 at the centre of an
-    obstacle and falls to 0 at ``clearance`` metres from its rim, so that an obstacle costs about ``obstacle_weight`` where
-    any part of the arm is inside; everything is twice differentiable.
+    Joint `i` ends at `r_i = r_{i-1} + l_i (cos, sin)(2 pi (x_1 + ... + x_i))`, in metres from the base, and the tip is
+    `p = r_n` (Murray, Li, Sastry: *A Mathematical Introduction to Robotic Manipulation*, chapter 3). An obstacle costs
+    about ``obstacle_weight`` where any part of the arm is inside.
 
     ``lengths`` in metres, by default 1 / dim each; ``target`` `[x, y]`; ``obstacles`` a list of `[x, y, radius]`. The
     optimal flow contracts onto the configurations that reach the target: `mu*` is declared unbounded, and no `M` makes
@@ -34,8 +26,8 @@ class Arm(Linkage):
         self,
         dim: int = 2,
         lengths: list[float] | None = None,
-        target: Sequence[float] = TARGET,
-        obstacles: Sequence[Sequence[float]] = OBSTACLES,
+        target: Sequence[float] = (0.2, 0.65),
+        obstacles: Sequence[Sequence[float]] = ((0.75, -0.4, 0.08),),
         clearance: float = 0.2,
         target_weight: float = 1.0,
         obstacle_weight: float = 3.0,
@@ -44,8 +36,9 @@ class Arm(Linkage):
         exponent: float = 2.0,
         control_limit: float | None = None,
     ) -> None:
-        costs = (target, obstacles, clearance, target_weight, obstacle_weight)
-        super().__init__(dim, 2, *costs, speed, discount, exponent, control_limit)
+        super().__init__(dim, dim, discount, exponent, control_limit)
+        self.pursue(2, target, obstacles, clearance, target_weight, obstacle_weight)
+        self.speed = require_number("problem.speed", speed, above=0.0)
         equal = [1.0 / self.dim] * self.dim
         self.lengths = equal if lengths is None else require_numbers("problem.lengths", lengths, self.dim, above=0.0)
         self._lengths = torch.tensor(self.lengths, dtype=torch.float64)

@@ -1,19 +1,13 @@
 r"""Dubins' vehicle in a periodic plane: constant speed, only the turn rate is controlled; stay near a target."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import require_number
 from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.planar import PlanarVehicle
-
-TARGET = (2.0, 2.0)
-OBSTACLES = ((1.0, 2.6, 0.3),)
 
 
 class Dubins(PlanarVehicle):
@@ -34,8 +28,8 @@ class Dubins(PlanarVehicle):
     def __init__(
         self,
         size: float = 4.0,
-        target: Sequence[float] = TARGET,
-        obstacles: Sequence[Sequence[float]] = OBSTACLES,
+        target: Sequence[float] = (2.0, 2.0),
+        obstacles: Sequence[Sequence[float]] = ((1.0, 2.6, 0.3),),
         clearance: float = 0.3,
         target_weight: float = 1.0,
         obstacle_weight: float = 2.0,
@@ -45,21 +39,16 @@ class Dubins(PlanarVehicle):
         exponent: float = 2.0,
         control_limit: float | None = None,
     ) -> None:
-        weights = target_weight, obstacle_weight
-        super().__init__(1, size, target, obstacles, clearance, *weights, discount, exponent, control_limit)
-        self.speed = require_number("problem.speed", speed, above=0.0)
-        self.turn_rate = require_number("problem.turn_rate", turn_rate, above=0.0)
+        super().__init__(3, 1, discount, exponent, control_limit)
+        self.pursue(2, target, obstacles, clearance, target_weight, obstacle_weight)
+        self.drive(size, speed, turn_rate)
         self.occupation_bound = math.inf if TURN * self.turn_rate > self.discount else None
 
     def drift(self, x: Tensor) -> Tensor:
-        ahead = self.speed / self.size * self.heading(x)
-        return torch.cat([ahead, torch.zeros_like(ahead[:, :1])], dim=-1)
+        return self.ahead(x)
 
     def drift_divergence(self, x: Tensor) -> Tensor:
         return torch.zeros_like(x[:, 0])
 
     def control_matrix(self, x: Tensor) -> Tensor:
-        return x.new_tensor([0.0, 0.0, self.turn_rate]).unsqueeze(-1).expand(len(x), 3, 1)
-
-    def control_divergence(self, x: Tensor) -> Tensor:
-        return x.new_zeros(len(x), 1)
+        return self.turning(x).unsqueeze(-1)

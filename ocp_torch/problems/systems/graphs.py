@@ -1,7 +1,5 @@
 """Who acts on whom: adjacency matrices by name, by seed, from a list of rows or from a file."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,10 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError, nearest
+from ocp_torch.errors import InputError, nearest, require_numbers
 from ocp_torch.files.arrays import read_npy
 from ocp_torch.files.reading import read_text
-from ocp_torch.problems.arguments import require_numbers
 
 GRAPHS = ("complete", "ring", "random")
 SUFFIXES = (".npy", ".txt")
@@ -30,28 +27,23 @@ def adjacency(name: str, value: object, count: int, probability: float, seed: in
     connected), a `.npy` or `.txt` file, or a list of rows. Raises `InputError` for anything else, or one of another size.
     """
     if not isinstance(value, str):
-        return _checked(name, _rows(name, value, count), count)
+        if not isinstance(value, Sequence) or len(value) != count:
+            raise InputError(f"{name} is {value!r}, but must be a list of {count} rows.")
+        rows = [require_numbers(f"{name}[{i}]", row, count) for i, row in enumerate(value)]
+        return _checked(name, np.array(rows), count)
     if Path(value).suffix in SUFFIXES:
         return _checked(name, _read(name, Path(value), count), count)
-    if value not in GRAPHS:
-        raise InputError(
-            f"{name} is {value!r}, but must be {', '.join(GRAPHS)}, a .npy or .txt file, or a list of rows"
-            f"{nearest(value, GRAPHS)}."
-        )
-    return {"complete": _complete, "ring": _ring, "random": _random}[value](count, probability, seed)
-
-
-def _complete(count: int, probability: float, seed: int) -> Tensor:
-    return 1.0 - torch.eye(count, dtype=torch.float64)
-
-
-def _ring(count: int, probability: float, seed: int) -> Tensor:
-    A = torch.zeros(count, count, dtype=torch.float64)
-    for i in range(count):
-        j = (i + 1) % count
-        if i != j:
-            A[i, j] = A[j, i] = 1.0
-    return A
+    own = torch.eye(count, dtype=torch.float64)
+    if value == "complete":
+        return 1.0 - own
+    if value == "ring":
+        return torch.maximum(own.roll(1, dims=0), own.roll(-1, dims=0))
+    if value == "random":
+        return _random(count, probability, seed)
+    raise InputError(
+        f"{name} is {value!r}, but must be {', '.join(GRAPHS)}, a .npy or .txt file, or a list of rows"
+        f"{nearest(value, GRAPHS)}."
+    )
 
 
 def _random(count: int, probability: float, seed: int) -> Tensor:
@@ -61,14 +53,8 @@ def _random(count: int, probability: float, seed: int) -> Tensor:
     order = torch.randperm(count, generator=generator).tolist()
     for k in range(1, count):
         i, j = order[k], order[int(torch.randint(k, (), generator=generator))]
-        A[i, j] = A[j, i] = 1.0
-    return ((A + A.T) > 0).double()
-
-
-def _rows(name: str, value: object, count: int) -> np.ndarray:
-    if not isinstance(value, Sequence) or len(value) != count:
-        raise InputError(f"{name} is {value!r}, but must be a list of {count} rows.")
-    return np.array([require_numbers(f"{name}[{i}]", row, count) for i, row in enumerate(value)])
+        A[i, j] = 1.0
+    return torch.maximum(A, A.T)
 
 
 def _read(name: str, path: Path, count: int) -> np.ndarray:

@@ -1,24 +1,18 @@
 r"""Kuramoto's coupled phase oscillators on a graph, some of them pushed: synchronise, desynchronise or entrain them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError, require_choice, require_flag, require_integer, require_number
-from ocp_torch.problems.arguments import require_numbers
-from ocp_torch.problems.problem import Problem
-from ocp_torch.problems.systems.angles import TURN, to_radians, to_turns
-from ocp_torch.problems.systems.graphs import adjacency
-from ocp_torch.problems.systems.synchrony import DESYNCHRONISE, ENTRAIN, SYNCHRONISE, goal_cost, order_parameter
-
-GOALS = (SYNCHRONISE, DESYNCHRONISE, ENTRAIN)
+from ocp_torch.errors import InputError, require_flag, require_integer, require_number
+from ocp_torch.problems.systems.angles import TURN
+from ocp_torch.problems.systems.graphs import GRAPHS, adjacency
+from ocp_torch.problems.systems.oscillators import ENTRAIN, SYNCHRONISE, Oscillators
 
 
-class Kuramoto(Problem):
+class Kuramoto(Oscillators):
     r"""`dtheta_i/dt = omega_i + (coupling / n) sum_j A_ij sin(theta_j - theta_i) + strength u_i`, `x = theta / 2 pi`.
 
     Kuramoto (1975), on a graph as in Rodrigues et al. (Physics Reports 610, 2016). Phases are in radians, ``frequencies``
@@ -34,6 +28,8 @@ class Kuramoto(Problem):
     Where not all oscillators are controlled, assumption A2 of the paper fails (see `Dubins` for what then still holds).
     Raises `InputError` for wrong arguments.
     """
+
+    goals = (*Oscillators.goals, ENTRAIN)
 
     def __init__(
         self,
@@ -54,48 +50,33 @@ class Kuramoto(Problem):
         control_limit: float | None = None,
     ) -> None:
         self.oscillators = n = require_integer("problem.oscillators", oscillators, 2, maximum=512)
-        self.goal = require_choice("problem.goal", goal, GOALS)
-        invariant = self.goal != ENTRAIN
-        self.relative = invariant if relative is None else require_flag("problem.relative", relative)
-        if self.relative and not invariant:
+        self.relative = goal != ENTRAIN if relative is None else require_flag("problem.relative", relative)
+        if self.relative and goal == ENTRAIN:
             raise InputError("problem.relative is true, but problem.goal = entrain asks for phases, not differences.")
         self.controlled = _subset(controlled, n)
         super().__init__(n - self.relative, len(self.controlled), discount, exponent, control_limit)
+        self.aim(goal, weight)
         self.seed = require_integer("problem.seed", seed, 0)
         self.spread = require_number("problem.spread", spread, at_least=0.0)
         self.probability = require_number("problem.probability", probability, at_least=0.0, at_most=1.0)
-        self.coupling = require_number("problem.coupling", coupling)
-        self.strength = require_number("problem.strength", strength, above=0.0)
-        self.weight = require_number("problem.weight", weight, above=0.0)
         if frequencies is None:
             drawn = torch.randn(n, generator=torch.Generator().manual_seed(self.seed), dtype=torch.float64)
-            self.frequencies = (self.spread * (drawn - drawn.mean())).tolist()
-        else:
-            self.frequencies = require_numbers("problem.frequencies", frequencies, n)
+            frequencies = (self.spread * (drawn - drawn.mean())).tolist()
+        self.run_at(frequencies, n, coupling, strength)
         self._adjacency = adjacency("problem.graph", graph, n, self.probability, self.seed)
         # Rows, not a file's name: what is saved with a controller must not depend on another file.
-        self.graph = graph if graph in ("complete", "ring", "random") else self._adjacency.tolist()
-        self._omega = torch.tensor(self.frequencies, dtype=torch.float64)
+        self.graph = graph if graph in GRAPHS else self._adjacency.tolist()
         B = torch.zeros(n, self.control_dim, dtype=torch.float64)
         B[self.controlled, range(self.control_dim)] = self.strength / TURN
         self._B = B[:-1] - B[-1] if self.relative else B
-        self.state_cost_bound = self.weight
         self.occupation_bound = math.inf
 
     def phases(self, x: Tensor) -> Tensor:
-        """All phases in turns, ``(N, n)``; in relative coordinates the last one is 0."""
+        """In relative coordinates the last one is 0."""
         return torch.cat([x, torch.zeros_like(x[:, :1])], dim=-1) if self.relative else x
 
-    def order_parameter(self, x: Tensor) -> Tensor:
-        """`r` in [0, 1], ``(N,)``."""
-        return order_parameter(self.phases(x))
-
-    def state_cost(self, x: Tensor) -> Tensor:
-        return self.weight * goal_cost(self.goal, self.phases(x))
-
     def drift(self, x: Tensor) -> Tensor:
-        angle = TURN * self.phases(x)
-        cosine, sine, A = angle.cos(), angle.sin(), self._like(x, "A", self._adjacency)
+        (cosine, sine), A = self.circular(x), self._like(x, "A", self._adjacency)
         # sin(theta_j - theta_i), summed over j, without a matrix for each state.
         pulled = cosine * (sine @ A.T) - sine * (cosine @ A.T)
         rate = (self._like(x, "omega", self._omega) + self.coupling / self.oscillators * pulled) / TURN
@@ -103,8 +84,7 @@ class Kuramoto(Problem):
 
     def drift_divergence(self, x: Tensor) -> Tensor:
         """`-(coupling / n) sum_ij A_ij cos(theta_j - theta_i)`, also of the relative phases."""
-        angle = TURN * self.phases(x)
-        cosine, sine, A = angle.cos(), angle.sin(), self._like(x, "A", self._adjacency)
+        (cosine, sine), A = self.circular(x), self._like(x, "A", self._adjacency)
         together = (cosine * (cosine @ A.T) + sine * (sine @ A.T)).sum(dim=-1)
         return -self.coupling / self.oscillators * together
 
@@ -115,12 +95,8 @@ class Kuramoto(Problem):
         return x.new_zeros(len(x), self.control_dim)
 
     def to_torus(self, phases: Tensor) -> Tensor:
-        """Phases in radians ``(N, n)`` as states ``(N, d)``; in relative coordinates the last phase is taken off."""
-        return to_turns(phases[:, :-1] - phases[:, -1:] if self.relative else phases)
-
-    def from_torus(self, x: Tensor) -> Tensor:
-        """States as phases in [-pi, pi) radians, ``(N, n)``; the last is 0 in relative coordinates."""
-        return to_radians(self.phases(x))
+        """In relative coordinates the last phase is taken off."""
+        return super().to_torus(phases[:, :-1] - phases[:, -1:] if self.relative else phases)
 
 
 def _subset(controlled: object, count: int) -> list[int]:

@@ -1,19 +1,20 @@
 r"""Swing up a pendulum by a torque at its pivot: the model and parameters of Gymnasium's Pendulum-v1, made periodic."""
 
-from __future__ import annotations
+import math
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError, require_number
-from ocp_torch.problems.exact.local import occupation_bound_at_rest
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.angles import TURN, to_radians, to_turns
 
 SPEED_COST = 0.1
 # The environment this is a model of: it observes cos theta, sin theta and theta', and takes a torque in N m.
 GYMNASIUM = "Pendulum-v1"
+# A contraction this close to rho, relative to it, counts as one that reaches it, so that rounding decides nothing.
+ROUNDING = 1e-9
 
 
 class Pendulum(Problem):
@@ -45,7 +46,7 @@ class Pendulum(Problem):
         exponent: float = 2.0,
         control_limit: float | None = None,
     ) -> None:
-        super().__init__(dim=2, control_dim=1, discount=discount, exponent=exponent, control_limit=control_limit)
+        super().__init__(2, 1, discount, exponent, control_limit)
         self.gravity = require_number("problem.gravity", gravity, at_least=0.0)
         self.mass = require_number("problem.mass", mass, above=0.0)
         self.length = require_number("problem.length", length, above=0.0)
@@ -68,6 +69,10 @@ class Pendulum(Problem):
         Q = 2.0 * self._scale * torch.tensor([TURN**2, SPEED_COST * (2.0 * self.seam) ** 2], dtype=torch.float64).diag()
         self.occupation_bound = occupation_bound_at_rest(A, B, Q, self.discount, self.exponent)
 
+    def _velocity(self, x: Tensor) -> Tensor:
+        """`theta'` in [-seam, seam) rad/s, ``(N,)``."""
+        return ((x[:, 1] + 0.5).remainder(1.0) - 0.5) * (2.0 * self.seam)
+
     def _beyond(self, velocity: Tensor) -> Tensor:
         """How far the speed is between ``max_speed`` and the seam, in [0, 1]."""
         return ((velocity.abs() - self.max_speed) / (self.seam - self.max_speed)).clamp(0.0, 1.0)
@@ -89,26 +94,24 @@ class Pendulum(Problem):
         return velocity.abs().clamp_max(self.max_speed) ** 2 + 2.0 * width * (self.max_speed * level + width * slope)
 
     def state_cost(self, x: Tensor) -> Tensor:
-        _, velocity = self.from_torus(x).unbind(dim=-1)
         # 2 (1 - cos) as 4 sin^2 of the half angle loses no digits near upright.
         tilt = 4.0 * (0.5 * TURN * x[:, 0]).sin().square()
-        return self._scale * (tilt + SPEED_COST * self._square(velocity))
+        return self._scale * (tilt + SPEED_COST * self._square(self._velocity(x)))
 
     def drift(self, x: Tensor) -> Tensor:
-        velocity = self.from_torus(x)[:, 1]
-        fall = self._pull * (TURN * x[:, 0]).sin()
+        velocity, fall = self._velocity(x), self._pull * (TURN * x[:, 0]).sin()
         return self._cut(velocity).unsqueeze(-1) * torch.stack([velocity / TURN, fall / (2.0 * self.seam)], dim=-1)
 
     def drift_divergence(self, x: Tensor) -> Tensor:
         """The pendulum keeps volume; only the cut-off does not."""
-        return self._cut_slope(self.from_torus(x)[:, 1]) * self._pull * (TURN * x[:, 0]).sin()
+        return self._cut_slope(self._velocity(x)) * self._pull * (TURN * x[:, 0]).sin()
 
     def control_matrix(self, x: Tensor) -> Tensor:
-        push = self._cut(self.from_torus(x)[:, 1]) * self._push / (2.0 * self.seam)
+        push = self._cut(self._velocity(x)) * self._push / (2.0 * self.seam)
         return torch.stack([torch.zeros_like(push), push], dim=-1).unsqueeze(-1)
 
     def control_divergence(self, x: Tensor) -> Tensor:
-        return (self._cut_slope(self.from_torus(x)[:, 1]) * self._push).unsqueeze(-1)
+        return (self._cut_slope(self._velocity(x)) * self._push).unsqueeze(-1)
 
     def to_torus(self, physical: Tensor) -> Tensor:
         """Angles in radians and velocities in rad/s ``(N, 2)`` as states; raises `InputError` for a speed beyond the seam."""
@@ -120,8 +123,7 @@ class Pendulum(Problem):
 
     def from_torus(self, x: Tensor) -> Tensor:
         """States as angles in [-pi, pi) radians, 0 upright, and velocities in [-seam, seam) rad/s, ``(N, 2)``."""
-        velocity = ((x[:, 1:] + 0.5).remainder(1.0) - 0.5) * (2.0 * self.seam)
-        return torch.cat([to_radians(x[:, :1]), velocity], dim=-1)
+        return torch.stack([to_radians(x[:, 0]), self._velocity(x)], dim=-1)
 
     def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
         """The state of Pendulum-v1 that shows `(cos theta, sin theta, theta')`; speeds beyond the seam are taken at it."""
@@ -136,3 +138,27 @@ class Pendulum(Problem):
         if env != GYMNASIUM:
             return super().to_action(env, control)
         return np.clip(self.max_torque * np.asarray(control), -self.max_torque, self.max_torque)
+
+
+def optimal_contraction(A: Tensor, B: Tensor, Q: Tensor, rho: float) -> float:
+    r"""How fast the optimal flow of `dx/dt = A x + B u` for `rho int e^{-rho t} (x'Qx + |u|^2) / 2 dt` loses volume.
+
+    ``A`` and ``Q`` are ``(d, d)``, ``B`` ``(d, m)``. The closed loop is `F - BB'P + rho/2` with `F = A - rho/2` and `P` the
+    stabilising solution of `F'P + PF - PBB'P + Q = 0`, and the eigenvalues of `F - BB'P` are the stable half of those of the
+    Hamiltonian matrix, which come in pairs `+-lambda` (Laub, 1979). So its trace needs no `P`.
+    """
+    d = len(A)
+    F = A - 0.5 * rho * torch.eye(d, dtype=A.dtype)
+    hamiltonian = torch.cat([torch.cat([F, -B @ B.T], dim=1), torch.cat([-Q, -F.T], dim=1)])
+    return 0.5 * float(torch.linalg.eigvals(hamiltonian).real.abs().sum()) - 0.5 * rho * d
+
+
+def occupation_bound_at_rest(A: Tensor, B: Tensor, Q: Tensor, rho: float, exponent: float) -> float | None:
+    r"""`math.inf` if the optimal flow contracts volume at rate `rho` or more at a state of rest with `f = 0`, else `None`.
+
+    There mass gathers as fast as the discount forgets it, and `mu*` is unbounded; otherwise nothing is known. ``A`` and
+    ``B`` are the linear dynamics, ``Q`` the Hessian of `f`. For `q < 2` the control vanishes faster than linearly. A limit on
+    the control changes nothing: near the state of rest the control is small.
+    """
+    contraction = optimal_contraction(A, B, Q, rho) if exponent == 2.0 else -float(A.trace())
+    return math.inf if contraction >= rho * (1.0 - ROUNDING) else None

@@ -1,20 +1,16 @@
 r"""Spiking neurons reduced to their phases under one stimulus: break their synchrony, as deep brain stimulation should."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
 from ocp_torch.errors import require_choice, require_integer, require_number
-from ocp_torch.problems.arguments import require_numbers
-from ocp_torch.problems.problem import Problem
-from ocp_torch.problems.systems.angles import TURN, to_radians, to_turns
-from ocp_torch.problems.systems.synchrony import DESYNCHRONISE, SYNCHRONISE, goal_cost, order_parameter
+from ocp_torch.problems.systems.angles import TURN
+from ocp_torch.problems.systems.oscillators import DESYNCHRONISE, Oscillators
 
 TYPE_1, TYPE_2 = "type1", "type2"
 
 
-class PhaseNeurons(Problem):
+class PhaseNeurons(Oscillators):
     r"""`dtheta_i/dt = omega_i + (coupling / n) sum_j sin(theta_j - theta_i) + strength Z(theta_i) u`, `x = theta / 2 pi`.
 
     The phase reduction of Brown, Moehlis and Holmes (Neural Computation 16, 2004), one stimulus for all as in Wilson and
@@ -43,53 +39,31 @@ class PhaseNeurons(Problem):
         exponent: float = 2.0,
         control_limit: float | None = None,
     ) -> None:
-        n = require_integer("problem.neurons", neurons, 2, maximum=512)
+        self.neurons = n = require_integer("problem.neurons", neurons, 2, maximum=512)
         super().__init__(n, 1, discount, exponent, control_limit)
-        self.neurons = n
+        self.aim(goal, weight)
         self.response = require_choice("problem.response", response, (TYPE_1, TYPE_2))
-        self.goal = require_choice("problem.goal", goal, (DESYNCHRONISE, SYNCHRONISE))
         self.frequency = require_number("problem.frequency", frequency)
         self.spread = require_number("problem.spread", spread, at_least=0.0)
-        self.coupling = require_number("problem.coupling", coupling)
-        self.strength = require_number("problem.strength", strength, above=0.0)
-        self.weight = require_number("problem.weight", weight, above=0.0)
         factors = 1.0 + self.spread * torch.linspace(-0.5, 0.5, n, dtype=torch.float64)
         given = (self.frequency * factors).tolist() if frequencies is None else frequencies
-        self.frequencies = require_numbers("problem.frequencies", given, n)
-        self._omega = torch.tensor(self.frequencies, dtype=torch.float64)
-        self.state_cost_bound = self.weight
-
-    def order_parameter(self, x: Tensor) -> Tensor:
-        """`r` in [0, 1], ``(N,)``."""
-        return order_parameter(x)
-
-    def state_cost(self, x: Tensor) -> Tensor:
-        return self.weight * goal_cost(self.goal, x)
+        self.run_at(given, n, coupling, strength)
 
     def drift(self, x: Tensor) -> Tensor:
-        cosine, sine = (TURN * x).cos(), (TURN * x).sin()
+        cosine, sine = self.circular(x)
         pulled = cosine * sine.mean(dim=-1, keepdim=True) - sine * cosine.mean(dim=-1, keepdim=True)
         return (self._like(x, "omega", self._omega) + self.coupling * pulled) / TURN
 
     def drift_divergence(self, x: Tensor) -> Tensor:
         """`-coupling (n r^2 - 1)`: each neuron's own term is no coupling."""
-        cosine, sine = (TURN * x).cos(), (TURN * x).sin()
-        return self.coupling * (1.0 - self.neurons * (cosine.mean(dim=-1).square() + sine.mean(dim=-1).square()))
+        return self.coupling * (1.0 - self.neurons * self.square_order(x))
 
     def control_matrix(self, x: Tensor) -> Tensor:
-        angle = TURN * x
-        Z = 1.0 - angle.cos() if self.response == TYPE_1 else -angle.sin()
+        cosine, sine = self.circular(x)
+        Z = 1.0 - cosine if self.response == TYPE_1 else -sine
         return (self.strength / TURN * Z).unsqueeze(-1)
 
     def control_divergence(self, x: Tensor) -> Tensor:
-        angle = TURN * x
-        slope = angle.sin() if self.response == TYPE_1 else -angle.cos()
+        cosine, sine = self.circular(x)
+        slope = sine if self.response == TYPE_1 else -cosine
         return self.strength * slope.sum(dim=-1, keepdim=True)
-
-    def to_torus(self, phases: Tensor) -> Tensor:
-        """Phases in radians ``(N, n)`` as states."""
-        return to_turns(phases)
-
-    def from_torus(self, x: Tensor) -> Tensor:
-        """States as phases in [-pi, pi) radians, ``(N, n)``; a neuron spikes at 0."""
-        return to_radians(x)

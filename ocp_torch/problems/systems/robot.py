@@ -1,41 +1,45 @@
 r"""An arm as its URDF file describes it, under joint-velocity control: bring the tip to a point, past round obstacles."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
+from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError, shown
-from ocp_torch.problems.arguments import require_numbers
+from ocp_torch.errors import InputError, require_number, require_numbers, shown
+from ocp_torch.files.reading import kind, require_file
 from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.linkage import Linkage
-from ocp_torch.problems.systems.urdf import read_chain
 
+TURNING, STIFF = ("revolute", "continuous"), "fixed"
+# Text of a description in bytes; meshes lie in files of their own, and are not read.
+LARGEST_URDF = 2**24
 # Without a file, an elbow arm of the usual build: where each joint sits against the one before, in metres, and its axis.
-ELBOW = (
-    ((0.0, 0.0, 0.2), (0.0, 0.0, 1.0)),
-    ((0.0, 0.0, 0.2), (0.0, 1.0, 0.0)),
-    ((0.4, 0.0, 0.0), (0.0, 1.0, 0.0)),
-    ((0.2, 0.0, 0.0), (1.0, 0.0, 0.0)),
-    ((0.2, 0.0, 0.0), (0.0, 1.0, 0.0)),
-    ((0.1, 0.0, 0.0), (1.0, 0.0, 0.0)),
-    ((0.1, 0.0, 0.0), (0.0, 0.0, 0.0)),
-)
+ELBOW = [
+    [1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z, *axis]
+    for (x, y, z), axis in (
+        ((0.0, 0.0, 0.2), (0.0, 0.0, 1.0)),
+        ((0.0, 0.0, 0.2), (0.0, 1.0, 0.0)),
+        ((0.4, 0.0, 0.0), (0.0, 1.0, 0.0)),
+        ((0.2, 0.0, 0.0), (1.0, 0.0, 0.0)),
+        ((0.2, 0.0, 0.0), (0.0, 1.0, 0.0)),
+        ((0.1, 0.0, 0.0), (1.0, 0.0, 0.0)),
+        ((0.1, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    )
+]
 
 
 class RobotArm(Linkage):
-    r"""`dx/dt = speed u` and `f = target_weight |p(x) - target|^2 + obstacle_weight sum_o (1 - prod_s (1 - b_o(r_s(x))))`.
+    r"""A `Linkage` in space, with the tip at `p = T_1 R_1(x_1) ... T_n R_n(x_n) T_tip 0` in metres.
 
-    `Arm` in space: `x_i` is the angle of joint `i` in turns, `p = T_1 R_1(x_1) ... T_n R_n(x_n) T_tip 0` in metres, with the
-    fixed transforms `T` and rotations `R` about the joints' axes that the ``urdf`` file names up to the link ``tip`` (null:
-    the last one that turning joints move; without a file, a six-joint elbow arm). Every joint turns all the way round:
-    limits of joints are not part of the model. ``obstacles`` are balls `[x, y, z, radius]`, felt ``clearance`` metres from
-    their surface, along the lines from joint to joint. ``speed`` in turns per second at `u = 1`.
+    The fixed transforms `T` and rotations `R` about the joints' axes are those that the ``urdf`` file names up to the link
+    ``tip`` (null: the last one that turning joints move; without a file, a six-joint elbow arm). Every joint turns all the
+    way round: limits of joints are not part of the model. ``obstacles`` are balls `[x, y, z, radius]`, felt ``clearance``
+    metres from their surface, along the lines from joint to joint.
 
-    ``chain`` is the kinematics as numbers (`ocp_torch.problems.systems.urdf.read_chain`), in place of ``urdf``: what a saved
-    controller holds. `mu*` is declared unbounded, as for `Arm`. Raises `InputError` for wrong arguments.
+    ``chain`` is the kinematics as numbers (`read_chain`), in place of ``urdf``: what a saved controller holds. `mu*` is
+    declared unbounded, as for `Arm`. Raises `InputError` for wrong arguments.
     """
 
     points_per_link = 4  # six joints and more: the cost of obstacles is most of the work
@@ -59,15 +63,16 @@ class RobotArm(Linkage):
             raise InputError("problem.urdf and problem.chain are both given, but either alone is the kinematics.")
         if tip is not None and urdf is None:
             raise InputError(f"problem.tip is {shown(tip)}, but it names a link of problem.urdf, which is not given.")
-        given = chain if urdf is None else read_chain(urdf, tip)
-        given = _elbow() if given is None else given
+        given = read_chain(urdf, tip) if urdf is not None else ELBOW if chain is None else chain
         if isinstance(given, str) or not isinstance(given, Sequence) or len(given) < 2:
             raise InputError(
                 "problem.chain must be a list of rows of 15 numbers, one for each joint and one for the tip."
             )
         self.chain = [require_numbers(f"problem.chain[{i}]", row, 15) for i, row in enumerate(given)]
-        costs = (target, obstacles, clearance, target_weight, obstacle_weight)
-        super().__init__(len(self.chain) - 1, 3, *costs, speed, discount, exponent, control_limit)
+        joints = len(self.chain) - 1
+        super().__init__(joints, joints, discount, exponent, control_limit)
+        self.pursue(3, target, obstacles, clearance, target_weight, obstacle_weight)
+        self.speed = require_number("problem.speed", speed, above=0.0)
         self.urdf, self.tip = None, None  # a saved controller needs no file
         rows = torch.tensor(self.chain, dtype=torch.float64)
         self._fixed, self._axes = rows[:, :12].reshape(-1, 3, 4), rows[:-1, 12:]
@@ -101,5 +106,57 @@ class RobotArm(Linkage):
         return torch.linalg.cross(axes.squeeze(-1), joints[:, -1:] - joints[:, 1:-1], dim=-1).mT
 
 
-def _elbow() -> list[list[float]]:
-    return [[1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z, *axis] for (x, y, z), axis in ELBOW]
+def read_chain(path: str | Path, tip: str | None) -> list[list[float]]:
+    """From the base of a URDF file's robot to the link ``tip``: a row for each turning joint, and one for the tip.
+
+    A row is the transform from the joint before, as the 12 numbers of its upper rows, and the axis of the joint (zeros
+    for the tip). Without a ``tip``, the link behind the most turning joints, the farthest of them. Limits of joints are left
+    out. Raises `InputError` without yourdfpy, for a file that is no URDF, an unknown tip, and joints that slide on the way.
+    """
+    path = Path(path)
+    if kind(path) is None:
+        raise InputError(f"problem.urdf is {str(path)!r}, which is not a file.")
+    require_file(path, LARGEST_URDF)
+    try:
+        from yourdfpy import URDF
+    except ImportError:
+        raise InputError('problem.urdf needs yourdfpy; install it with pip install -e ".[urdf]".') from None
+    try:
+        nothing = dict.fromkeys(("build_scene_graph", "load_meshes", "build_collision_scene_graph"), False)
+        robot = URDF.load(str(path), load_collision_meshes=False, **nothing).robot
+    except Exception as error:  # the parsers beneath raise types of their own
+        raise InputError(f"problem.urdf = {path} cannot be read as a URDF ({type(error).__name__}).") from None
+    above = {joint.child: joint for joint in robot.joints}
+    chains = {link.name: _upwards(link.name, above) for link in robot.links}
+    usable = {name: chain for name, chain in chains.items() if all(j.type in (*TURNING, STIFF) for j in chain)}
+    count = lambda chain: sum(joint.type in TURNING for joint in chain)
+    if tip is None:
+        tip = max(usable, key=lambda name: (count(usable[name]), len(usable[name])), default=None)
+    if tip not in chains:
+        raise InputError(f"problem.tip is {tip!r}, but the links of {path} are {', '.join(list(chains)[:40])}.")
+    if tip not in usable:
+        raise InputError(f"problem.tip is {tip!r}, but a joint on the way there does not turn; take a link before it.")
+    if count(usable[tip]) == 0:
+        raise InputError(f"problem.tip is {tip!r}, but no joint on the way there turns.")
+    return _rows(usable[tip])
+
+
+def _upwards(link: str, above: dict) -> list:
+    """The joints from the base to ``link``."""
+    chain, seen = [], set()
+    while link in above and link not in seen:
+        seen.add(link)
+        chain.append(above[link])
+        link = above[link].parent
+    return chain[::-1]
+
+
+def _rows(chain: list) -> list[list[float]]:
+    rows, transform = [], np.eye(4)
+    for joint in chain:
+        transform = transform @ (np.eye(4) if joint.origin is None else np.asarray(joint.origin, dtype=float))
+        if joint.type in TURNING:
+            axis = np.asarray([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, dtype=float)
+            rows.append([*transform[:3].flatten().tolist(), *(axis / np.linalg.norm(axis)).tolist()])
+            transform = np.eye(4)
+    return [*rows, [*transform[:3].flatten().tolist(), 0.0, 0.0, 0.0]]

@@ -1,18 +1,12 @@
 r"""A unicycle in a periodic plane: speed and turn rate are the controls, a target and round obstacles the cost."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import require_number
 from ocp_torch.problems.systems.planar import PlanarVehicle
-
-TARGET = (2.0, 2.0)
-OBSTACLES = ((1.0, 2.6, 0.3), (2.9, 1.1, 0.3))
 
 
 class Unicycle(PlanarVehicle):
@@ -27,8 +21,8 @@ class Unicycle(PlanarVehicle):
     def __init__(
         self,
         size: float = 4.0,
-        target: Sequence[float] = TARGET,
-        obstacles: Sequence[Sequence[float]] = OBSTACLES,
+        target: Sequence[float] = (2.0, 2.0),
+        obstacles: Sequence[Sequence[float]] = ((1.0, 2.6, 0.3), (2.9, 1.1, 0.3)),
         clearance: float = 0.3,
         target_weight: float = 1.0,
         obstacle_weight: float = 4.0,
@@ -38,22 +32,13 @@ class Unicycle(PlanarVehicle):
         exponent: float = 2.0,
         control_limit: float | None = None,
     ) -> None:
-        weights = target_weight, obstacle_weight
-        super().__init__(2, size, target, obstacles, clearance, *weights, discount, exponent, control_limit)
-        self.speed = require_number("problem.speed", speed, above=0.0)
-        self.turn_rate = require_number("problem.turn_rate", turn_rate, above=0.0)
+        super().__init__(3, 2, discount, exponent, control_limit)
+        self.pursue(2, target, obstacles, clearance, target_weight, obstacle_weight)
+        self.drive(size, speed, turn_rate)
         # With V = p r^2 / 2 along the heading: p + (speed p)^2 / rho^2 = 2 target_weight, contraction speed^2 p / rho. The
         # control vanishes at the target, so that no limit changes any of it there.
         fast = self.target_weight * self.speed**2 >= self.discount**2
         self.occupation_bound = math.inf if fast and self.exponent == 2.0 else None
 
     def control_matrix(self, x: Tensor) -> Tensor:
-        ahead = self.speed / self.size * self.heading(x)
-        drive = torch.cat([ahead, torch.zeros_like(ahead[:, :1])], dim=-1)
-        turn = torch.zeros_like(drive)
-        turn[:, 2] = self.turn_rate
-        return torch.stack([drive, turn], dim=-1)
-
-    def control_divergence(self, x: Tensor) -> Tensor:
-        """Zero: the direction ahead does not depend on the position, nor the turn on the heading."""
-        return x.new_zeros(len(x), 2)
+        return torch.stack([self.ahead(x), self.turning(x)], dim=-1)

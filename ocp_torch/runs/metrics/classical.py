@@ -1,8 +1,6 @@
 """A simple classical controller for each system, as a yardstick: tuned by hand once, not to any seed."""
 
-from __future__ import annotations
-
-from functools import singledispatch
+from functools import partial, singledispatch
 
 import torch
 from torch import Tensor
@@ -17,7 +15,6 @@ from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.systems.unicycle import Unicycle
 
-# All tuned by hand, once.
 # Arms: the gain per second, and the damping of the pseudo-inverse relative to the arm's length.
 REACH, DAMPING = 1.5, 0.1
 # Vehicles: gains per second of speed and of turn rate.
@@ -29,24 +26,26 @@ DESCENT = 2.0
 PUMP, BALANCE, CATCH = 0.2, (20.0, 5.0), (0.5, 2.0)
 
 
-@singledispatch
 def classical_policy(problem: Problem) -> Policy | None:
     """The classical controller of ``problem``, or `None` where nobody has named one."""
-    return None
+    control = classical_control.dispatch(type(problem))
+    return None if control is classical_control.dispatch(Problem) else partial(control, problem)
 
 
-@classical_policy.register
-def resolved_rate(problem: Linkage) -> Policy:
+@singledispatch
+def classical_control(problem: Problem, x: Tensor) -> Tensor:
+    """The control ``(N, m)`` of the classical controller of ``problem`` at states ``(N, d)``."""
+    raise NotImplementedError
+
+
+@classical_control.register
+def resolved_rate(problem: Linkage, x: Tensor) -> Tensor:
     r"""`dtheta/dt = k J^+ (target - p)`, `J^+` the damped pseudo-inverse (Whitney, 1969; Nakamura and Hanafusa, 1986)."""
     damping = (DAMPING * problem.length) ** 2 or 1.0  # a tip on the last of its joints does not move: J = 0
-
-    def policy(x: Tensor) -> Tensor:
-        J, way = problem.jacobian(x), problem.to_target(x)
-        square = J @ J.mT + damping * torch.eye(way.shape[1]).to(x)
-        rate = REACH * (J.mT @ torch.linalg.solve(square, way.unsqueeze(-1))).squeeze(-1)
-        return rate / (TURN * problem.speed)
-
-    return policy
+    J, way = problem.jacobian(x), problem.to_target(x)
+    square = J @ J.mT + damping * torch.eye(way.shape[1]).to(x)
+    rate = REACH * (J.mT @ torch.linalg.solve(square, way.unsqueeze(-1))).squeeze(-1)
+    return rate / (TURN * problem.speed)
 
 
 def _bearing(problem: Unicycle | Dubins, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -55,54 +54,38 @@ def _bearing(problem: Unicycle | Dubins, x: Tensor) -> tuple[Tensor, Tensor]:
     return (way * ahead).sum(dim=-1), ahead[:, 0] * way[:, 1] - ahead[:, 1] * way[:, 0]
 
 
-@classical_policy.register
-def go_to_goal(problem: Unicycle) -> Policy:
+@classical_control.register
+def go_to_goal(problem: Unicycle, x: Tensor) -> Tensor:
     """Speed in proportion to the way ahead, turn rate to the bearing of the nearer end, front or back."""
-
-    def policy(x: Tensor) -> Tensor:
-        along, across = _bearing(problem, x)
-        bearing = torch.atan2(across, along.abs()) * torch.where(along < 0.0, -1.0, 1.0)
-        return torch.stack([DRIVE * along / problem.speed, STEER * bearing / (TURN * problem.turn_rate)], dim=-1)
-
-    return policy
+    along, across = _bearing(problem, x)
+    bearing = torch.atan2(across, along.abs()) * torch.where(along < 0.0, -1.0, 1.0)
+    return torch.stack([DRIVE * along / problem.speed, STEER * bearing / (TURN * problem.turn_rate)], dim=-1)
 
 
-@classical_policy.register
-def pursue(problem: Dubins) -> Policy:
+@classical_control.register
+def pursue(problem: Dubins, x: Tensor) -> Tensor:
     """Turn rate in proportion to the bearing of the target."""
-
-    def policy(x: Tensor) -> Tensor:
-        along, across = _bearing(problem, x)
-        return (STEER * torch.atan2(across, along) / (TURN * problem.turn_rate)).unsqueeze(-1)
-
-    return policy
+    along, across = _bearing(problem, x)
+    return (STEER * torch.atan2(across, along) / (TURN * problem.turn_rate)).unsqueeze(-1)
 
 
-@classical_policy.register(Kuramoto)
-@classical_policy.register(PhaseNeurons)
-def descend(problem: Problem) -> Policy:
+@classical_control.register(Kuramoto)
+@classical_control.register(PhaseNeurons)
+def descend(problem: Problem, x: Tensor) -> Tensor:
     r"""`u = -k B' grad f`: proportional feedback on how the stimulus changes the synchrony (for Kuramoto, the mean field)."""
-
-    def policy(x: Tensor) -> Tensor:
-        with torch.enable_grad():
-            at = x.detach().requires_grad_(True)
-            (slope,) = torch.autograd.grad(problem.state_cost(at).sum(), at)
-        return -DESCENT / problem.discount * torch.einsum("ndm,nd->nm", problem.control_matrix(x), slope)
-
-    return policy
+    with torch.enable_grad():
+        at = x.detach().requires_grad_(True)
+        (slope,) = torch.autograd.grad(problem.state_cost(at).sum(), at)
+    return -DESCENT / problem.discount * torch.einsum("ndm,nd->nm", problem.control_matrix(x), slope)
 
 
-@classical_policy.register
-def energy_pump(problem: Pendulum) -> Policy:
+@classical_control.register
+def energy_pump(problem: Pendulum, x: Tensor) -> Tensor:
     """Pump energy, then balance by proportional and derivative feedback (Astrom and Furuta, 2000); `|u| <= 1`."""
-
-    def policy(x: Tensor) -> Tensor:
-        angle, velocity = problem.from_torus(x).unbind(dim=-1)
-        pull = 1.5 * problem.gravity / problem.length
-        missing = pull * (1.0 - angle.cos()) - 0.5 * velocity.square()
-        pump = PUMP * missing * torch.where(velocity < 0.0, -1.0, 1.0)
-        balance = -(BALANCE[0] * angle + BALANCE[1] * velocity) / 3.0
-        near = (angle.abs() < CATCH[0]) & (velocity.abs() < CATCH[1])
-        return (torch.where(near, balance, pump) / problem.max_torque).clamp(-1.0, 1.0).unsqueeze(-1)
-
-    return policy
+    angle, velocity = problem.from_torus(x).unbind(dim=-1)
+    pull = 1.5 * problem.gravity / problem.length
+    missing = pull * (1.0 - angle.cos()) - 0.5 * velocity.square()
+    pump = PUMP * missing * torch.where(velocity < 0.0, -1.0, 1.0)
+    balance = -(BALANCE[0] * angle + BALANCE[1] * velocity) / 3.0
+    near = (angle.abs() < CATCH[0]) & (velocity.abs() < CATCH[1])
+    return (torch.where(near, balance, pump) / problem.max_torque).clamp(-1.0, 1.0).unsqueeze(-1)

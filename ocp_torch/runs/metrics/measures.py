@@ -1,12 +1,13 @@
-"""What is measured on each system, and which states are fair to start from."""
+"""Trajectories at equal times, for numbers and pictures: the certificate has its own; and what is measured on each system."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import singledispatch
 
 import torch
 from torch import Tensor
 
+from ocp_torch.control.policies import Policy
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
@@ -14,12 +15,60 @@ from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.systems.planar import PlanarVehicle
-from ocp_torch.runs.metrics.trajectories import Path
 
 # What counts as reached, relative to the arm's length or the period of the plane; as upright, in rad and rad/s. Definitions
 # of what the numbers say, not tuned.
 REACHED = 0.05
 UPRIGHT = (0.2, 0.5)
+LATE = 0.25  # the part of a trajectory that is its end
+
+
+@dataclass(frozen=True)
+class Path:
+    """``times`` ``(K,)`` in the problem's unit, ``states`` ``(K, N, d)``, and each discounted ``cost`` ``(N,)``."""
+
+    times: Tensor
+    states: Tensor
+    cost: Tensor
+
+    def each(self, function: Callable[[Tensor], Tensor], late: bool = False) -> Tensor:
+        """``function`` of all states, or of those of the last quarter of the time, as ``(K', N)``."""
+        x = self.states[-max(1, round(LATE * len(self.times))) :] if late else self.states
+        return function(x.flatten(0, 1)).reshape(x.shape[:2])
+
+
+@torch.no_grad()
+def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, steps: int) -> Path:
+    r"""From ``x0`` ``(N, d)`` for ``duration``, by RK4 with a control recomputed at each stage.
+
+    The cost is `int_0^T rho e^{-rho t} (f + R(u)) dt` by the trapezoidal rule: good to a few digits, where the certificate's
+    performance has an error bound.
+    """
+    h, rho = duration / steps, problem.discount
+    velocity = lambda x: problem.velocity(x, policy(x))
+    rate = lambda x, u: problem.state_cost(x) + problem.control_cost.cost(u)
+    times = h * torch.arange(steps + 1, dtype=x0.dtype)
+    weight = rho * h * (-rho * times).exp()
+    weight[0], weight[-1] = 0.5 * weight[0], 0.5 * weight[-1]
+    x, states = x0, [x0.remainder(1.0)]
+    cost = torch.zeros_like(x0[:, 0])
+    for k in range(steps):
+        u = policy(x)
+        cost = cost + weight[k] * rate(x, u)
+        v1 = problem.velocity(x, u)
+        v2 = velocity(x + 0.5 * h * v1)
+        v3 = velocity(x + 0.5 * h * v2)
+        v4 = velocity(x + h * v3)
+        x = (x + h / 6.0 * (v1 + 2.0 * v2 + 2.0 * v3 + v4)).remainder(1.0)
+        states.append(x)
+    return Path(times, torch.stack(states), cost + weight[-1] * rate(x, policy(x)))
+
+
+def admissible(problem: Problem, x: Tensor) -> Tensor:
+    """Which states ``(N,)`` are fair starts; all, unless there are obstacles: then those that keep the clearance."""
+    if isinstance(problem, Linkage | PlanarVehicle):
+        return problem.gap(x) > problem.clearance
+    return torch.ones_like(x[:, 0], dtype=torch.bool)
 
 
 @singledispatch
@@ -28,50 +77,29 @@ def measure(problem: Problem, path: Path) -> dict[str, float] | None:
     return None
 
 
-@singledispatch
-def admissible(problem: Problem, x: Tensor) -> Tensor:
-    """Which states ``(N,)`` are fair starts; all, unless there are obstacles: then those that keep the clearance."""
-    return torch.ones_like(x[:, 0], dtype=torch.bool)
-
-
-@admissible.register(Linkage)
-@admissible.register(PlanarVehicle)
-def _(problem, x: Tensor) -> Tensor:
-    return problem.gap(x) > problem.clearance
-
-
-def _reaching(problem, path: Path, tolerance: float) -> dict[str, float]:
-    reached = problem.distance(path.states[-1]) <= tolerance
+@measure.register(Linkage)
+@measure.register(PlanarVehicle)
+def _(problem, path: Path) -> dict[str, float]:
+    """Success: at the end within 5 % of the arm's length or the plane's period of the target, and never in an obstacle."""
+    size = problem.length if isinstance(problem, Linkage) else problem.size
+    reached = problem.distance(path.states[-1]) <= REACHED * size
     crossed = (path.each(problem.gap) < 0.0).any(dim=0)
     return {"success": _part(reached & ~crossed), "reached": _part(reached), "crossed": _part(crossed)}
 
 
 @measure.register
-def _(problem: Linkage, path: Path) -> dict[str, float]:
-    """Success: the tip within 5 % of the arm's length of the target at the end, and no link ever in an obstacle."""
-    return _reaching(problem, path, REACHED * problem.length)
-
-
-@measure.register
-def _(problem: PlanarVehicle, path: Path) -> dict[str, float]:
-    """Success: within 5 % of the plane's period of the target at the end, and never in an obstacle."""
-    return _reaching(problem, path, REACHED * problem.size)
-
-
-@measure.register
 def _(problem: Dubins, path: Path) -> dict[str, float]:
     """It cannot stop: the mean distance from the target late on, in metres; and how many were ever in an obstacle."""
-    away = path.each(problem.distance, path.late())
     crossed = (path.each(problem.gap) < 0.0).any(dim=0)
-    return {"distance": float(away.mean()), "crossed": _part(crossed)}
+    return {"distance": float(path.each(problem.distance, late=True).mean()), "crossed": _part(crossed)}
 
 
 @measure.register(Kuramoto)
 @measure.register(PhaseNeurons)
 def _(problem, path: Path) -> dict[str, float]:
     """The order parameter at the start and, over the last quarter of the time, late."""
-    late = path.each(problem.order_parameter, path.late())
-    return {"order_before": float(problem.order_parameter(path.states[0]).mean()), "order_after": float(late.mean())}
+    before, after = problem.order_parameter(path.states[0]), path.each(problem.order_parameter, late=True)
+    return {"order_before": float(before.mean()), "order_after": float(after.mean())}
 
 
 @measure.register

@@ -1,23 +1,38 @@
 """The controller, no control and a classical controller, each simulated from the same random starts."""
 
-from __future__ import annotations
+import json
+import logging
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from ocp_torch.control.policies import Policy, zero_policy
+from ocp_torch.files.storage import write_atomically
+from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import drawn_starts, starts_narrowly
 from ocp_torch.runs.metrics.classical import classical_policy
-from ocp_torch.runs.metrics.measures import admissible, has_metrics, measure
-from ocp_torch.runs.metrics.trajectories import simulate
+from ocp_torch.runs.metrics.measures import admissible, has_metrics, measure, simulate
 
+log = logging.getLogger(__name__)
+METRICS = "metrics.json"
 # A part of 512 starts has a standard error of at most 2.2 %; 240 steps for a time of 8 / rho are 30 per 1 / rho.
 STARTS, STEPS = 512, 240
 # The time of a trial in units of 1 / rho; what the discount still sees after it is e^-8.
 TRIAL = 8.0
 # Uniform states drawn for each start, of which the admissible ones are taken.
 CANDIDATES = 64
+
+
+def write_metrics(problem: Problem, policy: Policy, seed: int, folder: Path | None) -> None:
+    """Print the numbers of ``policy`` and write them as `metrics.json` in ``folder``, where the problem has any."""
+    found = metrics(problem, policy, derive_seed(seed, Branch.METRICS))
+    if found is None:
+        return
+    log.info("\n%s", metrics_table(found))
+    if folder is not None:
+        write_atomically(folder / METRICS, lambda path: path.write_text(json.dumps(found, indent=2) + "\n"))
 
 
 def metrics(problem: Problem, policy: Policy, seed: int = 0, starts: int = STARTS) -> dict | None:
@@ -32,22 +47,17 @@ def metrics(problem: Problem, policy: Policy, seed: int = 0, starts: int = START
     duration = TRIAL / problem.discount
     policies = {"controller": policy, "zero": zero_policy(problem), "classical": classical_policy(problem)}
     found = {}
+    # A classical policy knows no limit of the control, and others round.
+    within = lambda each: lambda x: problem.control_cost.within(each(x), torch.ones_like(x[:, 0]))
     for name, each in policies.items():
-        if each is None:
-            continue
-        path = simulate(problem, _within_limit(problem, each), x0, duration, STEPS)
-        found[name] = {**(measure(problem, path) or {}), "cost": float(path.cost.mean())}
+        if each is not None:
+            path = simulate(problem, within(each), x0, duration, STEPS)
+            found[name] = {**(measure(problem, path) or {}), "cost": float(path.cost.mean())}
     return {"starts": starts, "seed": seed, "duration": duration, **found}
 
 
-def _within_limit(problem: Problem, policy: Policy) -> Policy:
-    """``policy``, shrunk to the problem's control limit where it has one: a classical policy knows none, and others round."""
-    return lambda x: problem.control_cost.within(policy(x), torch.ones_like(x[:, 0]))
-
-
 def random_starts(problem: Problem, count: int, seed: int) -> Tensor:
-    """``count`` starts, ``(count, d)`` float64: drawn from `mu0` where that is narrow; else uniform admissible ones, or all
-    where hardly any is admissible."""
+    """``(count, d)`` float64: drawn from `mu0` where that is narrow; else uniform admissible ones, or any if few are."""
     if starts_narrowly(problem):
         return drawn_starts(problem, count, seed)
     generator = torch.Generator().manual_seed(seed)

@@ -1,18 +1,20 @@
-"""The numbers a method is judged by at one moment: bounds and performances of its fields, as certificates compute them."""
+"""What a contender reached, and when: points along its runs, whose numbers are bounds and performances of its fields at that
+moment, as certificates compute them."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+import math
+import statistics
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import count, groupby
 
 import torch
 from torch import Tensor, nn
 
-from ocp_torch.certificate import BOUNDS, LOWER, UPPER, CertificateSettings, Run, StageSettings
+from ocp_torch.certificate import BOUNDS, LOWER, UPPER, CertificateSettings, Run, StageSettings, Trained, bounds
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.simulated.performance import simulate_performance
-from ocp_torch.certificate.trained import Trained
-from ocp_torch.certificate.trained_context import TrainedContext
+from ocp_torch.certificate.trained import TrainedContext
 from ocp_torch.certificate.upper.penalised import DensityBounds
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import InputError
@@ -28,6 +30,62 @@ ASCENTS = 8  # from the worst states, in search of a supremum: a quarter of what
 # In one dimension a policy is simulated from a table of so many states, with straight lines between them: more
 # trajectories cost nothing then, and a policy that is steep where they part needs them.
 TABLE, ON_THE_CIRCLE = 2**14, 2048
+# The keys of a `Judge` that are performances of controllers.
+PERFORMANCES = ("value", "density", "policy")
+
+
+@dataclass(frozen=True)
+class Point:
+    """``numbers`` (see `Judge`) after ``samples`` states and ``seconds`` of CPU time spent on training alone."""
+
+    samples: int
+    seconds: float
+    numbers: dict[str, float]
+
+    @property
+    def perf(self) -> float:
+        """The better controller's performance."""
+        known = [self.numbers[n] for n in PERFORMANCES if n in self.numbers and math.isfinite(self.numbers[n])]
+        return min(known, default=math.inf)
+
+    @property
+    def gap(self) -> float:
+        """From the highest lower bound to the lowest upper one, relative to the former: infinite where one is missing, or the
+        lower is not positive."""
+        upper = min((self.numbers[n] for n in bounds.on(UPPER) if n in self.numbers), default=math.inf)
+        lower = max((self.numbers[n] for n in bounds.on(LOWER) if n in self.numbers), default=-math.inf)
+        return (upper - lower) / lower if lower > 0.0 else math.inf
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One run of one contender; ``certified`` is the gap of the full certificate of its end, `None` where it has none."""
+
+    contender: str
+    seed: int
+    points: list[Point]
+    certified: float | None = None
+    certificate_seconds: float = 0.0
+    notes: list[str] = field(default_factory=list)
+
+    def first_within(self, tolerance: float, optimum: float) -> Point | None:
+        """The first point from which on the performance stays within ``tolerance``, relative, of ``optimum``."""
+        reached = None
+        for point in self.points:
+            within = point.perf <= optimum * (1.0 + tolerance)
+            reached = (reached or point) if within else None
+        return reached
+
+
+def due(first: int, per_decade: int = 4) -> Iterator[int]:
+    """Sample counts at which to look: ``first``, and then ``per_decade`` for each factor of ten, without end."""
+    counts = (round(first * 10 ** (k / per_decade)) for k in count())
+    return (each for each, _ in groupby(counts))
+
+
+def median_and_spread(values: Sequence[float]) -> tuple[float, float, float]:
+    """Median, smallest and largest."""
+    return statistics.median(values), min(values), max(values)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -55,12 +113,12 @@ class Measured(TrainedContext):
 
 
 class Judge:
-    """Measures fields on states fixed by ``seed`` that no training sampler draws."""
+    """Measures fields on states that are the same in every run, and that no training sampler draws."""
 
-    def __init__(self, problem: Problem, constants: Constants, seed: int = 0, effort: int = 1) -> None:
-        self.problem, self.constants, self.seed, self.effort = problem, constants, seed, effort
+    def __init__(self, problem: Problem, constants: Constants) -> None:
+        self.problem, self.constants = problem, constants
         self.sets: list[Samples] = replicated_samples(
-            problem, effort * POINTS, REPLICATES, seed, divergences=problem.gives_divergences
+            problem, POINTS, REPLICATES, seed=0, divergences=problem.gives_divergences
         )
 
     @torch.no_grad()
@@ -80,13 +138,12 @@ class Judge:
 
     def performance(self, policy: Policy, value: Field | None = None, initial: list[float] | None = None) -> float:
         """`Perf` of a policy, by simulation; beyond one dimension ``value`` is the control variate."""
-        count = TRAJECTORIES
+        starts = TRAJECTORIES
         if self.problem.dim == 1:
-            policy, value, initial, count = tabulated(policy, TABLE), None, None, ON_THE_CIRCLE
-        simulated = simulate_performance(
-            self.problem, policy, self.effort * count, REPLICATES, self.seed, value, initial, tolerance=TOLERANCE
-        )
-        return simulated.perf.value
+            policy, value, initial, starts = tabulated(policy, TABLE), None, None, ON_THE_CIRCLE
+        return simulate_performance(
+            self.problem, policy, starts, REPLICATES, 0, value, initial, tolerance=TOLERANCE
+        ).perf.value
 
 
 def tabulated(policy: Policy, count: int) -> Policy:

@@ -1,21 +1,17 @@
 """Curves of several seeds as a table and as plots."""
 
-from __future__ import annotations
-
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from statistics import median
 
 import numpy as np
 
 from ocp_torch.certificate import LOWER, UPPER, bounds
 from ocp_torch.runs.canvas import blank_figure
-from ocp_torch.studies.benchmark.curve import Curve, Point, median_and_spread
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from ocp_torch.studies.benchmark.measure import Curve, median_and_spread
 
 # The certified gaps of all are held against that of the paper's primal-dual.
 BASELINE = "kernel pd"
@@ -31,22 +27,17 @@ def reference(curves: list[Curve], exact: float | None) -> tuple[float, str]:
     return max(found, default=math.nan), "the best lower bound found"
 
 
-def columns(curves: list[Curve]) -> list[str]:
-    """The names of the listed bounds on `OPT` that any of ``curves`` ends with."""
-    ends = [c.points[-1].numbers for c in curves]
-    return [n for side in (LOWER, UPPER) for n in bounds.on(side) if any(n in numbers for numbers in ends)]
-
-
 def by_contender(curves: list[Curve]) -> dict[str, list[Curve]]:
-    names = dict.fromkeys(c.contender for c in curves)
-    return {name: [c for c in curves if c.contender == name] for name in names}
+    return {name: [c for c in curves if c.contender == name] for name in dict.fromkeys(c.contender for c in curves)}
 
 
 def contest_table(curves: list[Curve], exact: float | None) -> str:
     """A Markdown table: at each contender's end, median over seeds and, where there are several, smallest to largest."""
     optimum, what = reference(curves, exact)
     off = lambda number: 100.0 * (number / optimum - 1.0)
-    names = columns(curves)
+    groups = by_contender(curves)
+    hits = {name: [hit for c in own if (hit := c.first_within(TOLERANCE, optimum))] for name, own in groups.items()}
+    names = [n for side in (LOWER, UPPER) for n in bounds.on(side) if any(n in c.points[-1].numbers for c in curves)]
     heads = ["contender", "samples", "seconds", *names, "Perf", "gap, certified", "times smaller"]
     heads += ["1 % on Perf after samples", "seconds"]
     lines = [
@@ -58,47 +49,33 @@ def contest_table(curves: list[Curve], exact: float | None) -> str:
         f"| {' | '.join(heads)} |",
         "|---" * len(heads) + "|",
     ]
-    widest = gaps(by_contender(curves).get(BASELINE, []))
-    for name, own in by_contender(curves).items():
-        ends = [c.points[-1] for c in own]
+    widest = gaps(groups.get(BASELINE, []))
+    for name, own in groups.items():
+        ends, certified, reached = [c.points[-1] for c in own], gaps(own), hits[name]
         number = lambda key, ends=ends: spread([off(p.numbers[key]) for p in ends if key in p.numbers], "+.3g", " %")
-        certified = gaps(own)
-        ratio = median_and_spread(widest)[0] / median_and_spread(certified)[0] if widest and certified else math.nan
-        hits = [c.first_within(TOLERANCE, optimum) for c in own]
-        reached = [hit for hit in hits if hit is not None]
+        ratio = median(widest) / median(certified) if widest and certified else math.nan
         few = "" if len(reached) == len(own) else f" ({len(reached)} of {len(own)} seeds)"
-        seconds = spread([p.seconds for p in ends], ".3g", "")
         later = [c.certificate_seconds for c in own if c.certificate_seconds > 0.0]
         cells = [
             name,
-            spread([float(p.samples) for p in ends], ",.0f", ""),
-            seconds + (f" + {median_and_spread(later)[0]:.3g}" if later else ""),
+            spread([p.samples for p in ends], ",.0f"),
+            spread([p.seconds for p in ends], ".3g") + (f" + {median(later):.3g}" if later else ""),
             *map(number, names),
             spread([off(p.perf) for p in ends if math.isfinite(p.perf)], "+.3g", " %"),
             spread(certified, ".3g", " %") + ("*" if certified and any(c.certified is None for c in own) else ""),
             f"{ratio:.3g}" if math.isfinite(ratio) else "-",
-            spread([float(p.samples) for p in reached], ",.0f", "") + few if reached else "not reached",
-            spread([p.seconds for p in reached], ".3g", "") if reached else "-",
+            spread([p.samples for p in reached], ",.0f") + few if reached else "not reached",
+            spread([p.seconds for p in reached], ".3g"),
         ]
         lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", *winners(curves, optimum)])
-
-
-def winners(curves: list[Curve], optimum: float) -> list[str]:
-    """Who reaches the tolerance first with every seed, in samples and in CPU seconds, by the median over seeds."""
-    reached = {
-        name: [hit for c in own if (hit := c.first_within(TOLERANCE, optimum)) is not None]
-        for name, own in by_contender(curves).items()
-    }
-    sure = {name: hits for name, hits in reached.items() if len(hits) == len(by_contender(curves)[name])}
-    if not sure:
-        return []
-    found = []
-    for unit, measure in (("samples", lambda p: p.samples), ("seconds", lambda p: p.seconds)):
-        medians = {name: median_and_spread([measure(hit) for hit in hits])[0] for name, hits in sure.items()}
-        first = min(medians, key=lambda name: medians[name])
-        found.append(f"1 % on Perf in the fewest {unit}: {first}, {medians[first]:,.6g}.")
-    return found
+    lines.append("")
+    # Who reaches the tolerance first with every seed, by the median over seeds.
+    sure = {name: reached for name, reached in hits.items() if len(reached) == len(groups[name])}
+    for unit in ("samples", "seconds") if sure else ():
+        medians = {name: median(getattr(hit, unit) for hit in reached) for name, reached in sure.items()}
+        first = min(medians, key=medians.__getitem__)
+        lines.append(f"1 % on Perf in the fewest {unit}: {first}, {medians[first]:,.6g}.")
+    return "\n".join(lines)
 
 
 def gaps(curves: list[Curve]) -> list[float]:
@@ -107,7 +84,7 @@ def gaps(curves: list[Curve]) -> list[float]:
     return [100.0 * gap for gap in found if math.isfinite(gap)]
 
 
-def spread(values: list[float], form: str, unit: str) -> str:
+def spread(values: Sequence[float], form: str, unit: str = "") -> str:
     """`median [smallest, largest]`, or the one value, or a dash."""
     if not values:
         return "-"
@@ -115,7 +92,7 @@ def spread(values: list[float], form: str, unit: str) -> str:
     return f"{middle}{unit}" + (f" [{low}, {high}]" if low != high else "")
 
 
-def plot(curves: list[Curve], exact: float | None) -> Figure:
+def plot(curves: list[Curve], exact: float | None):
     """Sub-optimality of the controller and the gap of the bounds, against samples and against CPU seconds."""
     optimum, what = reference(curves, exact)
     rows = {
@@ -137,10 +114,9 @@ def plot(curves: list[Curve], exact: float | None) -> Figure:
 
 def draw(axis, curves: list[Curve], place, height, color: str, name: str) -> None:
     """The median over seeds at each point, and the range between seeds."""
-    count = min(len(c.points) for c in curves)
-    at = lambda measure, i: [measure(c.points[i]) for c in curves]
-    x = np.array([np.median(at(place, i)) for i in range(count)])
-    values = np.array([at(height, i) for i in range(count)])
+    rows = list(zip(*(c.points for c in curves), strict=False))  # up to where the shortest run ends
+    x = np.array([np.median([place(p) for p in row]) for row in rows])
+    values = np.array([[height(p) for p in row] for row in rows])
     values[~np.isfinite(values) | (values <= 0.0)] = np.nan
     usable = ~np.isnan(values).any(axis=1) & (x > 0.0)
     if not usable.any():
@@ -157,8 +133,3 @@ def save(curves: list[Curve], exact: float | None, folder: Path) -> str:
     (folder / "benchmark.md").write_text(text + "\n")
     (folder / "curves.json").write_text(json.dumps([asdict(c) for c in curves], indent=1, default=float) + "\n")
     return text
-
-
-def load(path: Path) -> list[Curve]:
-    """The curves `save` wrote."""
-    return [Curve(**{**c, "points": [Point(**p) for p in c["points"]]}) for c in json.loads(path.read_text())]

@@ -4,22 +4,71 @@ Both move along `sum_a c_a d_a Phi(x)` at one state `x` (`d_0 Phi = Phi`), whose
 jets at one state. ``mark`` and ``restore`` go back to where a look-ahead began.
 """
 
-from __future__ import annotations
-
+import math
+from fractions import Fraction
+from functools import reduce
 from typing import Any
 
 import numpy as np
 import torch
 
+from ocp_torch.errors import require_integer
 from ocp_torch.fields.sobolev import SobolevFeatures, SobolevField
-from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
-from ocp_torch.studies.kernel.stream import Datum
+from ocp_torch.studies.kernel.rules import Datum
+
+
+def bernoulli_polynomial(n: int) -> list[Fraction]:
+    """Coefficients of `B_n`, constant first: `B_n(x) = sum_k C(n, k) B_{n-k} x^k` with Bernoulli numbers `B_k`."""
+    numbers = [Fraction(1)]
+    for j in range(1, n + 1):
+        numbers.append(-sum(math.comb(j + 1, k) * numbers[k] for k in range(j)) / Fraction(j + 1))
+    return [math.comb(n, k) * numbers[n - k] for k in range(n + 1)]
+
+
+class BernoulliKernel:
+    r"""The exact kernel `K(x, y) = prod_i kappa(x_i - y_i)` of the periodic Sobolev space of ``regularity`` `s`.
+
+    `kappa(t) = 1 + (-1)^{s+1} (2 pi)^{2s} / (2s)! B_{2s}({t})` has the Fourier coefficients 1 and `|w|^{-2s}`; for `s = 2` it
+    is the kernel of the paper's example (section 4.4). One needs derivatives up to the second, hence `s >= 2`; polynomials of
+    high degree lose digits, hence `s <= 8`. Raises `InputError` for any other than a whole number in between.
+    """
+
+    def __init__(self, regularity: int = 2) -> None:
+        self.regularity = s = require_integer("regularity", regularity, 2, maximum=8)
+        sign = (-1) ** (s + 1) * (2.0 * math.pi) ** (2 * s)
+        # B_n' = n B_{n-1}; highest power first, as np.polyval takes them.
+        self._polynomials = [
+            [sign / math.factorial(2 * s - k) * float(c) for c in reversed(bernoulli_polynomial(2 * s - k))]
+            for k in (0, 1, 2)
+        ]
+        self._polynomials[0][-1] += 1.0
+
+    def derivatives(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`kappa`, `kappa'` and `kappa''` at each entry of ``t``."""
+        t = t - np.floor(t)
+        value, slope, curvature = (np.polyval(polynomial, t) for polynomial in self._polynomials)
+        return value, slope, curvature
+
+    def jets(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Of `K(x, y)`, ``(..., d)`` each: value and derivatives in `x` by value and derivatives in `y`.
+
+        Entry ``[..., a, b]`` of ``(..., 1 + d, 1 + d)`` is differentiated in `x_a` and in `y_b`, and not for index 0.
+        """
+        factors = self.derivatives(x - y)
+        d = factors[0].shape[-1]
+        block = np.empty((*factors[0].shape[:-1], 1 + d, 1 + d))
+        for a in range(1 + d):
+            for b in range(1 + d):
+                # In each coordinate the order of the derivative; one in y changes the sign.
+                entry = reduce(np.multiply, (factors[(i + 1 == a) + (i + 1 == b)][..., i] for i in range(d)))
+                block[..., a, b] = -entry if b > 0 else entry
+        return block
 
 
 class FeatureExpansion:
     """`V = theta . features`: a step costs the same at every `n`. ``radius`` is that of the ball it is projected on."""
 
-    def __init__(self, features: SobolevFeatures, runs: int, outputs: int, radius: float | None = None) -> None:
+    def __init__(self, features: SobolevFeatures, runs: int, outputs: int, radius: float | None) -> None:
         self.features, self.radius = features, radius
         self.theta = np.zeros((runs, features.count, outputs))
         self.total, self.count = np.zeros_like(self.theta), 0
@@ -46,9 +95,13 @@ class FeatureExpansion:
         self.total += self.theta
         self.count += 1
 
+    @torch.no_grad()
     def field(self, run: int, scalar: bool) -> SobolevField:
-        """The averaged iterate of one run as a network; ``(N,)`` if ``scalar``."""
-        return as_field(self.features, self.total[run] / max(self.count, 1), scalar)
+        """The averaged iterate of one run as a float64 network in units of 1; ``(N,)`` if ``scalar``."""
+        theta = self.total[run] / max(self.count, 1)
+        field = SobolevField.of(self.features, None if scalar else theta.shape[1]).double()
+        field.coefficients.copy_(torch.from_numpy(theta[:, 0] if scalar else theta.T))
+        return field.requires_grad_(False)
 
 
 class KernelExpansion:
@@ -58,7 +111,7 @@ class KernelExpansion:
     """
 
     def __init__(
-        self, kernel: BernoulliKernel, dim: int, runs: int, outputs: int, capacity: int, radius: float | None = None
+        self, kernel: BernoulliKernel, dim: int, capacity: int, runs: int, outputs: int, radius: float | None
     ) -> None:
         self.kernel, self.radius, self.known = kernel, radius, 0
         self.x = np.zeros((runs, capacity, dim))
@@ -98,7 +151,7 @@ class KernelExpansion:
         return self.coefficients[:, : self.known].copy(), self.squared_norm
 
     def restore(self, mark: Any) -> None:
-        """States met since then stay, with the coefficient 0: the average may hold them."""
+        """States added since then stay, with the coefficient 0: the average may hold them."""
         coefficients, self.squared_norm = mark
         kept = coefficients.shape[1]
         self.coefficients[:, :kept] = coefficients
@@ -108,17 +161,3 @@ class KernelExpansion:
         """Count the present iterate in the average."""
         self.total[:, : self.known] += self.coefficients[:, : self.known]
         self.count += 1
-
-    def field(self, run: int, scalar: bool, features: SobolevFeatures) -> SobolevField:
-        """The averaged iterate of one run, as seen by ``features``: its Fourier coefficients are exact."""
-        jets = features.jets(torch.from_numpy(self.x[run, : self.known])).numpy()
-        theta = np.einsum("kaf,kao->fo", jets, self.total[run, : self.known] / max(self.count, 1))
-        return as_field(features, theta, scalar)
-
-
-@torch.no_grad()
-def as_field(features: SobolevFeatures, theta: np.ndarray, scalar: bool) -> SobolevField:
-    """The float64 network with coefficients ``theta`` ``(F, o)``, in units of 1."""
-    field = SobolevField.of(features, None if scalar else theta.shape[1]).double()
-    field.coefficients.copy_(torch.from_numpy(theta[:, 0] if scalar else theta.T))
-    return field.requires_grad_(False)

@@ -6,10 +6,8 @@ the reproducing property `V(x) = <V, Phi(x)>` and `d_i V(x) = <V, d_i Phi(x)>`; 
 Proposition 9 of the paper). The closed forms are Lemmas 2 and 3, written through the speed `|u| = |w| / mu`.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,9 +17,20 @@ from ocp_torch.maths.jets import Jet
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.generator import Generator, hjb_slack
 from ocp_torch.problems.problem import Problem
-from ocp_torch.studies.kernel.stream import Datum
 
 Jets = dict[str, np.ndarray]
+
+
+class Datum(NamedTuple):
+    """A problem's data at one state for each of `R` runs, and there the jets of the features, if there are any."""
+
+    x: np.ndarray  # (R, d)
+    f: np.ndarray  # (R,)
+    a: np.ndarray  # (R, d)
+    B: np.ndarray  # (R, d, m)
+    mu0: np.ndarray  # (R,)
+    div_B: Any  # (R, m); None where no rule reads them
+    jets: Any  # (R, 1 + d, F); None without features
 
 
 def _scalar(jet: np.ndarray) -> Jet:
@@ -44,8 +53,7 @@ class Rule(ABC):
         self.conjugate = self.q / (self.q - 1.0)
 
     @abstractmethod
-    def __call__(self, datum: Datum, jets: Jets) -> Jets:
-        """The coefficients of the improving step at ``datum``."""
+    def __call__(self, datum: Datum, jets: Jets) -> Jets: ...
 
     def _toward(self, w: np.ndarray, size: np.ndarray, speed: np.ndarray) -> np.ndarray:
         """`grad R(u) = |u|^{q-1} w / |w|` for `u` along `w` with the given speed; 0 where `w = 0`, ``(R, m)``."""
@@ -119,4 +127,4 @@ class SaddleRule(Rule):
         return {VALUE: up, CONTROL_DENSITY: down}
 
 
-RULES: dict[str, Callable[[Problem, Constants], Rule]] = {"dual": DualRule, "primal": PrimalRule, "pd": SaddleRule}
+RULES: dict[str, type[Rule]] = {"dual": DualRule, "primal": PrimalRule, "pd": SaddleRule}

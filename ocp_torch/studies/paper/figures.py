@@ -1,20 +1,13 @@
 """Every figure of the paper's numerical sections, and the cost of a step in both forms."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 
 from ocp_torch.control.policies import occupation_density, trained_policies
 from ocp_torch.problems import Circle
 from ocp_torch.runs.canvas import blank_figure
-from ocp_torch.studies.benchmark.kernels import OCCUPATION
+from ocp_torch.studies.benchmark.contenders import OCCUPATION
 from ocp_torch.studies.paper.runs import Comparison, History, circle
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 DISCOUNTS = (0.5, 1.0, 1.5, 2.0, 4.0)
 LABELS = {
@@ -26,7 +19,7 @@ LABELS = {
 }
 
 
-def _figure(columns: int, rows: int = 1, width: float = 5.0) -> tuple[Figure, np.ndarray]:
+def _figure(columns: int, rows: int = 1, width: float = 5.0):
     figure = blank_figure(width * columns, 3.8 * rows)
     return figure, figure.subplots(rows, columns, squeeze=False).ravel()
 
@@ -36,7 +29,7 @@ def _grid(count: int = 601) -> torch.Tensor:
     return ((torch.arange(count, dtype=torch.float64) + 0.5) / count).unsqueeze(-1)
 
 
-def optimal_occupation() -> Figure:
+def optimal_occupation():
     """`mu*` for several discounts: bounded exactly when `rho > 1`."""
     figure, (axis,) = _figure(1, width=6.0)
     x = _grid(2000)
@@ -47,20 +40,16 @@ def optimal_occupation() -> Figure:
     return figure
 
 
-def evolution(history: History) -> Figure:
+def evolution(history: History):
     """The costs and performances against the number of steps, in units of `OPT` and how far from it; bands are seeds."""
     figure, (axis, distance) = _figure(2)
     recipe, looks = history.recipe, list(history.numbers)
     for k, name in enumerate(recipe.numbers):
-        percents = [[m[name] for m in history.numbers[n] if name in m] for n in looks]
-        ratios = [[1.0 + p / 100.0 for p in row] for row in percents]
-        away = [[abs(p) for p in row] for row in percents]
-        for where, rows in ((axis, ratios), (distance, away)):
+        for where, shown in ((axis, lambda percent: 1.0 + percent / 100.0), (distance, abs)):
+            rows = [[shown(m[name]) for m in history.numbers[n] if name in m] for n in looks]
             where.plot(looks, [np.median(row) for row in rows], marker=".", color=f"C{k}", label=LABELS[name])
             if min(map(len, rows)) > 1:
-                where.fill_between(
-                    looks, *([pick(row) for row in rows] for pick in (min, max)), color=f"C{k}", alpha=0.2
-                )
+                where.fill_between(looks, list(map(min, rows)), list(map(max, rows)), color=f"C{k}", alpha=0.2)
     axis.axhline(1.0, color="k", linestyle=":", label="OPT")
     axis.set(xscale="log", xlabel="n", title=f"{recipe.method}, section {recipe.section}: cost / OPT")
     axis.set_ylim(0.4, 2.6 if "J" in recipe.numbers else 1.4)
@@ -71,20 +60,15 @@ def evolution(history: History) -> Figure:
 
 
 @torch.no_grad()
-def iterates(history: History) -> Figure:
+def iterates(history: History):
     """What a method learns, for growing `n`, with the exact functions: `V` or `w` and the controller; all four for pd."""
     problem, constants = circle()
     kind, x = OCCUPATION[history.recipe.method], _grid()
     u, mu = problem.exact_control(x), problem.exact_occupation(x)
     assert u is not None  # the circle has its exact truth
     assert mu is not None
-    exact = {
-        "$\\bar w_n$": u[:, 0] * mu,
-        "$\\bar V_n$": problem.exact_value(x),
-        "$\\mu_n$": mu,
-        "controller from $\\bar V_n$": u,
-        "controller $\\bar w_n / \\mu_n$": problem.exact_control(x),
-    }
+    value, density = "controller from $\\bar V_n$", "controller $\\bar w_n / \\mu_n$"
+    exact = {"$\\bar w_n$": u[:, 0] * mu, "$\\bar V_n$": problem.exact_value(x), "$\\mu_n$": mu, value: u, density: u}
 
     def learned(fields) -> dict[str, torch.Tensor]:
         policies = trained_policies(kind, problem, fields, constants)
@@ -95,27 +79,23 @@ def iterates(history: History) -> Figure:
             drawn["$\\bar V_n$"] = fields.value(x)
         if history.recipe.method == "pd":
             drawn["$\\mu_n$"] = occupation_density(kind, problem, fields, constants)(x)
-        if "density" in policies:
-            drawn["controller $\\bar w_n / \\mu_n$"] = policies["density"](x)
-        else:
-            drawn["controller from $\\bar V_n$"] = policies["value"](x)
-        return drawn
+        title, policy = (density, "density") if "density" in policies else (value, "value")
+        return drawn | {title: policies[policy](x)}
 
     curves = {n: learned(fields) for n, fields in history.fields.items()}
     titles = list(next(iter(curves.values())))
     figure, axes = _figure(2, len(titles) // 2)
     for axis, title in zip(axes, titles, strict=True):
         for k, (n, drawn) in enumerate(curves.items()):
-            axis.plot(
-                x, drawn[title], color=(max(0.0, 0.8 - 0.8 * k / max(1, len(curves) - 1)),) * 3, label=f"n = {n:,}"
-            )
+            grey = max(0.0, 0.8 - 0.8 * k / max(1, len(curves) - 1))
+            axis.plot(x, drawn[title], color=(grey,) * 3, label=f"n = {n:,}")
         axis.plot(x, exact[title], "r:", linewidth=2.0, label="exact")
         axis.set(title=title, xlabel="x")
     axes[0].legend(fontsize=8)
     return figure
 
 
-def costs(comparisons: list[Comparison]) -> Figure:
+def costs(comparisons: list[Comparison]):
     """CPU time per step against `n`: it grows for the exact kernel, and does not for truncated features."""
     figure, (axis,) = _figure(1, width=6.0)
     for k, c in enumerate(comparisons):

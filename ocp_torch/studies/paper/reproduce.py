@@ -1,7 +1,5 @@
 """Everything in the paper's numerical sections, one after the other, into one folder."""
 
-from __future__ import annotations
-
 import json
 import logging
 import time
@@ -12,10 +10,9 @@ import torch
 from tqdm import tqdm
 
 from ocp_torch.errors import InputError, require_choice, require_integer, require_section
-from ocp_torch.studies.benchmark.curve import median_and_spread
+from ocp_torch.studies.benchmark.measure import median_and_spread
 from ocp_torch.studies.paper import figures
-from ocp_torch.studies.paper.recipes import RECIPES
-from ocp_torch.studies.paper.runs import Comparison, History, carry_out, compare_with_exact
+from ocp_torch.studies.paper.runs import RECIPES, Comparison, History, carry_out, compare_with_exact
 
 log = logging.getLogger(__name__)
 
@@ -40,38 +37,30 @@ def reproduce(checked: tuple[tuple[int, ...], int, dict[str, int]], folder: Path
     torch.set_num_threads(1)
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
-    drawn = {"mu_star": figures.optimal_occupation()}
     histories: dict[str, History] = {}
+    comparisons = []
     total = sum(r.steps for r in RECIPES.values()) + 2 * sum(exact.values())
     with tqdm(total=total, unit="step", dynamic_ncols=True, disable=None) as bar:
         for name, recipe in RECIPES.items():
             bar.set_postfix_str(name)
             histories[name] = carry_out(recipe, seeds, modes, bar.update)
-        comparisons = []
         for name, recipe in RECIPES.items():
             bar.set_postfix_str(f"{name}, exact kernel")
             comparisons.append(compare_with_exact(recipe, exact[name], modes, seeds[0], tick=bar.update))
     text = report(histories, comparisons, seeds, modes) + f"\nIn all {time.perf_counter() - started:.0f} s.\n"
     (folder / "numbers.md").write_text(text)
-    record = {
-        "numbers": {name: history.numbers for name, history in histories.items()},
-        "comparisons": [asdict(c) for c in comparisons],
-    }
+    numbers = {name: history.numbers for name, history in histories.items()}
+    record = {"numbers": numbers, "comparisons": [asdict(c) for c in comparisons]}
     (folder / "numbers.json").write_text(json.dumps(record, indent=1) + "\n")
+    drawn = {"mu_star": figures.optimal_occupation(), "cost_per_step": figures.costs(comparisons)}
     for name, history in histories.items():
         drawn |= {f"{name}_performance": figures.evolution(history), f"{name}_iterates": figures.iterates(history)}
-    drawn["cost_per_step"] = figures.costs(comparisons)
     for name, figure in drawn.items():
         figure.savefig(folder / "figures" / f"{name}.png", dpi=130)
     log.info("\n%s\nwritten to %s", text, folder)
 
 
-def report(
-    histories: dict[str, History],
-    comparisons: list[Comparison],
-    seeds: tuple[int, ...],
-    modes: int,
-) -> str:
+def report(histories: dict[str, History], comparisons: list[Comparison], seeds: tuple[int, ...], modes: int) -> str:
     """The numbers as Markdown: what was found, beside what an independent re-implementation of the paper found."""
     lines = [
         f"Circle, rho = 2, M = 2, C_V = 2; regularity 2, {modes} modes; averages; seeds {', '.join(map(str, seeds))}.",
@@ -82,12 +71,10 @@ def report(
         "|---|---|---|---|---|",
     ]
     for name, history in histories.items():
-        for look in history.recipe.tabled:
+        for look, known in history.recipe.known.items():
             for number in history.recipe.numbers:
-                values = [m[number] for m in history.numbers[look]]
-                middle, low, high = median_and_spread(values)
-                known = history.recipe.known.get((look, number))
-                there = "" if known is None else f"{known[0]:+g} to {known[1]:+g}"
+                middle, low, high = median_and_spread([m[number] for m in history.numbers[look]])
+                there = f"{known[number][0]:+g} to {known[number][1]:+g}" if number in known else ""
                 label = {"value": "Perf, from V", "density": "Perf, w / mu"}.get(number, number)
                 lines.append(f"| {name} | {look:,} | {label} | {middle:+.3f} [{low:+.3f}, {high:+.3f}] | {there} |")
     lines += ["", "Exact kernel and truncation on the same samples, averaged iterates:", ""]

@@ -1,6 +1,5 @@
-"""The recipes carried out: the measured curves, the fields to draw, the exact kernel beside its truncation, and costs."""
-
-from __future__ import annotations
+"""The numerical section's recipes, all on the circle with `rho = 2`, `M = 2`, `C_V = 2`, regularity 2, from zero; and what
+they give: the measured curves, the fields to draw, the exact kernel beside its truncation, and costs."""
 
 import time
 from collections.abc import Callable
@@ -13,12 +12,10 @@ from ocp_torch.fields import Fields
 from ocp_torch.fields.sobolev import SobolevFeatures
 from ocp_torch.problems import Circle
 from ocp_torch.problems.constants import Constants, resolve_constants
-from ocp_torch.studies.benchmark.kernels import OCCUPATION
+from ocp_torch.studies.benchmark.contenders import OCCUPATION, SCHEDULE
 from ocp_torch.studies.benchmark.measure import Judge, relative
-from ocp_torch.studies.kernel import Iteration
-from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
-from ocp_torch.studies.kernel.expansions import KernelExpansion
-from ocp_torch.studies.paper.recipes import DISCOUNT, OCCUPATION_BOUND, VALUE_BOUND, Recipe
+from ocp_torch.studies.kernel.expansions import BernoulliKernel
+from ocp_torch.studies.kernel.iterations import Iteration, step_sizes
 
 Tick = Callable[[int], None]
 
@@ -26,10 +23,50 @@ Tick = Callable[[int], None]
 PARTS = 5
 
 
+@dataclass(frozen=True)
+class Recipe:
+    """``looks`` are the step counts at which the averages are measured, ``drawn`` those at which they are drawn. ``numbers``
+    are the method's own, in the order of the keys of `figures.LABELS`. The table has the step counts that ``known`` has: what
+    an independent re-implementation found there, in per cent of `OPT`, as ranges over seeds."""
+
+    method: str
+    section: str
+    numbers: tuple[str, ...]
+    step: float
+    looks: tuple[int, ...]
+    drawn: tuple[int, ...]
+    known: dict[int, dict[str, tuple[float, float]]]
+
+    @property
+    def steps(self) -> int:
+        return self.looks[-1]
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """The step size of each step."""
+        return step_sizes(self.step, self.steps, SCHEDULE[self.method])
+
+
+SHORT, SHORT_DRAWN = (200, 500, 1000, 2000, 5000, 10000, 15000, 20000), (500, 2000, 5000, 20000)
+LONG, LONG_DRAWN = tuple(10 * n for n in SHORT), (2000, 20000, 100000, 200000)
+KNOWN: dict[str, dict[int, dict[str, tuple[float, float]]]] = {
+    "dual": {5000: {"F_M": (-5.6, -5.3), "value": (2.1, 2.1)}, 20000: {"F_M": (-2.6, -2.5), "value": (0.9, 0.9)}},
+    "primal": {5000: {"G": (0.6, 0.9)}, 20000: {"G": (0.17, 0.20)}},
+    "pd": {
+        200000: {"F_M": (-13.0, -10.0), "J": (84.0, 93.0), "G": (0.7, 0.9), "value": (0.8, 0.9), "density": (0.0, 0.1)}
+    },
+}
+RECIPES = {
+    "dual": Recipe("dual", "4.4", ("F_M", "value"), 5e-4, SHORT, SHORT_DRAWN, KNOWN["dual"]),
+    "primal": Recipe("primal", "5.6", ("G", "density"), 2e-3, SHORT, SHORT_DRAWN, KNOWN["primal"]),
+    "pd": Recipe("pd", "6.3", ("F_M", "J", "G", "value", "density"), 1e-3, LONG, LONG_DRAWN, KNOWN["pd"]),
+}
+
+
 def circle() -> tuple[Circle, Constants]:
     """The paper's example and its constants."""
-    problem = Circle(DISCOUNT)
-    return problem, resolve_constants(problem, occupation_bound=OCCUPATION_BOUND, value_bound=VALUE_BOUND)
+    problem = Circle(discount=2.0)
+    return problem, resolve_constants(problem, occupation_bound=2.0, value_bound=2.0)
 
 
 @dataclass
@@ -86,14 +123,12 @@ def compare_with_exact(
     make = lambda **form: Iteration(problem, recipe.method, constants, (seed,), **form)
     exact = make(kernel=BernoulliKernel(2), capacity=2 * steps)
     truncated = make(features=SobolevFeatures(1, modes=modes))
-    forms = {"exact": exact, "truncated": truncated}
-    costs = {name: timed(form, recipe.sizes[:steps], windows, tick) for name, form in forms.items()}
+    forms = ("exact", exact), ("truncated", truncated)
+    costs = {name: timed(form, recipe.sizes[:steps], windows, tick) for name, form in forms}
     grid = np.linspace(0.0, 1.0, 201)[None, :, None]
     differences = {}
     for name, network in truncated.fields(0).networks.items():
-        expansion = exact.expansions[name]
-        assert isinstance(expansion, KernelExpansion)
-        there = expansion.at(grid, average=True)[0, :, 0, 0]
+        there = exact.expansions[name].at(grid, average=True)[0, :, 0, 0]
         here = network(torch.from_numpy(grid[0])).reshape(-1).numpy()
         differences[name] = float(np.abs(there - here).max() / np.abs(there).max())
     return Comparison(recipe.method, steps, modes, differences, costs)

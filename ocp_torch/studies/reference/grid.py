@@ -1,18 +1,29 @@
-"""A periodic grid on the unit torus: nodes, interpolation stencils and differences."""
-
-from __future__ import annotations
+"""A periodic grid on the unit torus: nodes, interpolation stencils and differences; and what such grids can solve."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
+from ocp_torch.errors import InputError, require_integer, require_number
+from ocp_torch.maths.seeds import fixed_generator
+from ocp_torch.problems.problem import Problem
 
 OFFSETS = 4  # nodes of the cubic stencil per coordinate
+# Nodes worked on at a time: the stencils of a piece stay in the cache.
+PIECE = 2**14
+MOST_DIMENSIONS = 3
+FEWEST_NODES = 8
+# Ratio of the sides of successive grids, and the finest side, by dimension: in three dimensions a grid half as fine as one
+# that is affordable shows little.
+RATIO = {1: 2.0, 2: 2.0, 3: 1.5}
+FINEST = {1: 1024, 2: 192, 3: 40}
+# Index, weights and their copies, per entry of the interpolation matrix.
+BYTES_PER_ENTRY = 40
+# A function that changes by more, relative to its size, over one period has not period 1.
+TOLERANCE = 1e-6
+# Single states and controls at which functions and the control cost are tried.
+PROBED, CONTROLS = 256, 64
 
 
 @dataclass(frozen=True)
@@ -55,6 +66,11 @@ class Grid:
             low, high = outer(low, linear[:, k]), outer(high, cubic[:, k])
         return Stencil(flat, low, high)
 
+    def interpolated(self, field: Tensor, x: Tensor) -> Tensor:
+        """A vector field ``(side^d, k)``, multilinearly between the nodes, at points ``(N, d)``; ``(N, k)``."""
+        stencil = self.stencil(x)
+        return (stencil.linear.unsqueeze(-1) * field[stencil.index]).sum(dim=1)
+
     def shifted(self, field: Tensor, coordinate: int, cells: int) -> Tensor:
         """At each node the value of ``field`` ``(side^d, ...)`` that many ``cells`` further along ``coordinate``."""
         shape = [self.side] * self.dim
@@ -62,17 +78,68 @@ class Grid:
 
     def gradient(self, values: Tensor) -> Tensor:
         """Central differences of fourth order, ``(side^d, d)``."""
-        columns = []
-        for k in range(self.dim):
-            near = self.shifted(values, k, 1) - self.shifted(values, k, -1)
-            far = self.shifted(values, k, 2) - self.shifted(values, k, -2)
-            columns.append((8.0 * near - far) / (12.0 * self.spacing))
-        return torch.stack(columns, dim=-1)
+        across = lambda k, cells: self.shifted(values, k, cells) - self.shifted(values, k, -cells)
+        slope = lambda k: (8.0 * across(k, 1) - across(k, 2)) / (12.0 * self.spacing)
+        return torch.stack([slope(k) for k in range(self.dim)], dim=-1)
 
-    def matrix(self, index: Tensor, weights: Tensor) -> csr_array:
-        """The sparse matrix whose row `i` takes ``weights[i]`` at ``index[i]``; both ``(side^d, k)``."""
-        from scipy.sparse import csr_array
 
-        rows = np.arange(0, index.numel() + 1, index.shape[1], dtype=np.int32)
-        columns = index.flatten().int().numpy()
-        return csr_array((weights.flatten().numpy(), columns, rows), shape=(self.count, self.count))
+def grid_sides(dim: int, side: int | None, memory: float) -> tuple[int, int, int]:
+    """Nodes per coordinate of the three grids, the finest ``side`` (None: by dimension); ``memory`` in gigabytes."""
+    if dim > MOST_DIMENSIONS:
+        raise InputError(
+            f"problem.dim is {dim}, but a grid needs at most {MOST_DIMENSIONS} coordinates; beyond, certificates remain."
+        )
+    ratio = RATIO[dim]
+    finest = FINEST[dim] if side is None else require_integer("side", side, 1)
+    sides = round(finest / ratio**2), round(finest / ratio), round(finest)
+    if sides[0] < FEWEST_NODES:
+        least = round(FEWEST_NODES * ratio**2)
+        raise InputError(
+            f"side is {finest}, but must be at least {least}: the coarsest of the three grids has {sides[0]}."
+        )
+    require_number("memory", memory, above=0.0)
+    entries = float(finest) ** dim * OFFSETS**dim
+    most = min(memory * 1e9 / BYTES_PER_ENTRY, 2.0**31 - 1.0)
+    if entries > most:
+        fits = int((most / OFFSETS**dim) ** (1.0 / dim))
+        need = entries * BYTES_PER_ENTRY / 1e9
+        raise InputError(
+            f"side is {finest}, which in {dim} dimensions needs about {need:.3g} GB, but memory is {memory:g}; "
+            f"at most {fits} nodes per coordinate fit."
+        )
+    return sides
+
+
+def require_solvable(problem: Problem, grid: Grid) -> None:
+    """Raise `InputError` unless the problem's functions have their shapes, are finite at the nodes of ``grid`` and have
+    period 1, and its control costs `|u|^q / q`."""
+    d, m = problem.dim, problem.control_dim
+    shapes = {"state_cost": (), "drift": (d,), "control_matrix": (d, m), "initial_density": ()}
+    probe = torch.rand(PROBED, d, generator=fixed_generator(), dtype=torch.float64)
+    parts = probe, *grid.nodes().split(PIECE)
+    for name, shape in shapes.items():
+        function = getattr(problem, name)
+        first = function(probe)
+        if tuple(first.shape) != (len(probe), *shape):
+            wanted = ", ".join(["N", *map(str, shape)])
+            raise InputError(
+                f"{name} gives shape {tuple(first.shape)} at {len(probe)} states, but must give ({wanted})."
+            )
+        size = 0.0
+        for part in parts:
+            values = function(part).reshape(len(part), -1)
+            bad = ~torch.isfinite(values).all(dim=-1)
+            if bad.any():
+                at = [round(c, 6) for c in part[bad][0].tolist()]
+                raise InputError(f"{name} is {values[bad][0].tolist()} at x = {at}, but must be finite everywhere.")
+            size = max(size, float(values.abs().max()))
+        for k in range(d):
+            moved = probe + torch.eye(d, dtype=torch.float64)[k]
+            if float((function(moved) - first).abs().max()) > TOLERANCE * max(size, 1e-12):
+                raise InputError(f"{name} does not have period 1 in x_{k + 1}, but all of a problem on the torus must.")
+    u = 3.0 * torch.randn(CONTROLS, m, generator=fixed_generator(1), dtype=torch.float64)
+    if problem.control_limit is not None:
+        u = problem.control_limit * u / (1.0 + u.norm(dim=-1, keepdim=True))
+    own, power = problem.control_cost.cost(u), u.norm(dim=-1) ** problem.exponent / problem.exponent
+    if not torch.allclose(own, power, rtol=1e-8, atol=1e-12):
+        raise InputError(f"{type(problem).__name__} has a control cost of its own, but the grid knows only |u|^q / q.")

@@ -1,20 +1,17 @@
 """A reference for `V*` and `OPT` in one to three dimensions, from grids alone: no network, no objective, no certificate."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
-from ocp_torch.studies.reference.between import look_between
-from ocp_torch.studies.reference.checks import grid_sides, require_solvable
-from ocp_torch.studies.reference.grid import Grid
+from ocp_torch.studies.reference.error import extrapolate, look_between
+from ocp_torch.studies.reference.grid import PIECE, Grid, grid_sides, require_solvable
 from ocp_torch.studies.reference.policy_iteration import GridSolution, solve
-from ocp_torch.studies.reference.richardson import Extrapolation, extrapolate
-from ocp_torch.studies.reference.semi_lagrangian import CLIP, PIECE, SemiLagrangian, minimiser
+from ocp_torch.studies.reference.semi_lagrangian import CLIP, SemiLagrangian, minimiser
 
 # The step moves a typical state by this many cells, and is at most this share of 1 / rho on the coarsest grid.
 CELLS, LONGEST = 1.0, 0.25
@@ -30,11 +27,10 @@ SPEED_SIDE, SPEED_ROUNDS = {1: 64, 2: 32, 3: 16}, 3
 class Reference:
     """What three grids say of ``problem``.
 
-    ``optimum`` is `OPT` extrapolated, ``error`` its stated error, ``order`` the order observed (see `richardson`); an error
-    that nobody knows is `None`, and ``unknown`` says why;
-    ``sides`` are nodes per coordinate and ``estimates`` the `OPT` of the three grids; ``value_change`` the largest change
-    of `V` from the second grid to the finest; ``unsettled`` is the part of ``error`` that iterations stopped early leave;
-    ``value`` ``(side,) * d`` is `V` on the finest grid.
+    ``optimum`` is `OPT` extrapolated, ``error`` its stated error, ``order`` the order observed (see `extrapolate`); an error
+    that nobody knows is `None`, and ``unknown`` says why; ``sides`` are nodes per coordinate and ``estimates`` the `OPT` of
+    the three grids; ``value_change`` the largest change of `V` from the second grid to the finest; ``unsettled`` is the part
+    of ``error`` that iterations stopped early leave; ``value`` ``(side,) * d`` is `V` on the finest grid.
     """
 
     problem: Problem
@@ -62,8 +58,16 @@ class Reference:
 
         Within two cells of a kink the control is a mean of those on its sides.
         """
-        pieces = [_interpolated(self.problem, self.solution, part) for part in x.double().split(PIECE)]
-        return torch.cat([v for v, _ in pieces]), torch.cat([u for _, u in pieces])
+        problem, grid, V = self.problem, self.solution.grid, self.solution.value
+        clip, slope = CLIP * float(V.max() - V.min()) * grid.spacing**1.5, grid.gradient(V)
+        values, controls = [], []
+        for part in x.double().split(PIECE):
+            stencil = grid.stencil(part)
+            correction = ((stencil.cubic - stencil.linear) * V[stencil.index]).sum(dim=-1)
+            values.append((stencil.linear * V[stencil.index]).sum(dim=-1) + correction.clamp(-clip, clip))
+            pull = torch.einsum("ndm,nd->nm", problem.control_matrix(part), grid.interpolated(slope, part))
+            controls.append(minimiser(-pull / problem.discount, problem.exponent, problem.control_limit))
+        return torch.cat(values), torch.cat(controls)
 
 
 def solve_reference(problem: Problem, side: int | None = None, memory: float = 4.0) -> Reference:
@@ -87,16 +91,15 @@ def solve_reference(problem: Problem, side: int | None = None, memory: float = 4
             start = solve(scheme, rough.value, rough.control, TOLERANCE)
             solutions.append(start)
         estimates = tuple(_mean(problem, s) for s in solutions)
-        between = look_between(problem, start.grid)
+        fall, missing, unknown = look_between(problem, start.grid)
         change = float((_carried(solutions[1], start.grid)[0] - start.value).abs().max())
-    spacings = tuple(1.0 / n for n in sides)
     noise = max(s.residual + s.defect for s in solutions)
-    result: Extrapolation = extrapolate(spacings, estimates, noise)
-    uneven = "the three grids do not approach evenly" if result.error is None else None
-    unknown = between.sentence or uneven
-    error = None
-    if unknown is None and result.error is not None:
-        error = result.error + noise + between.cost + between.mass * float(start.value.abs().max())
+    result = extrapolate([1.0 / n for n in sides], estimates, noise)
+    error = result.error if unknown is None else None
+    if error is not None:
+        error = error + noise + fall + missing * float(start.value.abs().max())
+    elif unknown is None:
+        unknown = "the three grids do not approach evenly"
     unsettled = max(s.residual for s in solutions)
     return Reference(problem, result.optimum, error, result.order, sides, estimates, change, unsettled, start, unknown)
 
@@ -116,7 +119,9 @@ def _speed(problem: Problem, coarsest: int) -> tuple[GridSolution, float]:
         scheme = SemiLagrangian(problem, grid, step)
         rough = solve(scheme, value, control, ROUGH)
         value, control = rough.value, rough.control
-        speed = max(scheme.speed(control), 1e-300)
+        g = scheme.a + torch.einsum("ndm,nm->nd", scheme.B, control)
+        # Of typical states: the root of the mean square, over the nodes, of the largest component.
+        speed = max(float(g.abs().amax(dim=-1).square().mean().sqrt()), 1e-300)
         step = min(longest, CELLS * grid.spacing / speed)
     return rough, min(CELLS / speed, longest * coarsest)
 
@@ -134,16 +139,5 @@ def _carried(solution: GridSolution, grid: Grid) -> tuple[Tensor, Tensor]:
 
 def _mean(problem: Problem, solution: GridSolution) -> float:
     """`int V dmu0` by the rule of equal weights, which on a torus is the trapezoidal one."""
-    density = torch.cat([problem.initial_density(part) for part in solution.grid.nodes().split(PIECE)])
+    density = batched(problem.initial_density, solution.grid.nodes(), PIECE)
     return math.fsum((solution.value * density).tolist()) / solution.grid.count
-
-
-def _interpolated(problem: Problem, solution: GridSolution, x: Tensor) -> tuple[Tensor, Tensor]:
-    grid, V = solution.grid, solution.value
-    stencil = grid.stencil(x)
-    clip = CLIP * float(V.max() - V.min()) * grid.spacing**1.5
-    extra = ((stencil.cubic - stencil.linear) * V[stencil.index]).sum(dim=-1)
-    value = (stencil.linear * V[stencil.index]).sum(dim=-1) + extra.clamp(-clip, clip)
-    gradient = (stencil.linear.unsqueeze(-1) * grid.gradient(V)[stencil.index]).sum(dim=1)
-    pull = torch.einsum("ndm,nd->nm", problem.control_matrix(x), gradient)
-    return value, minimiser(-pull / problem.discount, problem.exponent, problem.control_limit)

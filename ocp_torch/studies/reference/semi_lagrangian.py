@@ -12,20 +12,17 @@ monotone, so that it converges to the viscosity solution; what is clipped stays 
 proportional to `h` the error is `O(tau^2)`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor
 
+from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
-from ocp_torch.studies.reference.grid import Grid
+from ocp_torch.studies.reference.grid import PIECE, Grid
 
 # Of the cubic correction, relative to osc(V) h^{3/2}: a smaller one costs accuracy where V is smooth and the grid coarse, a
 # larger one overshoots more at kinks.
 CLIP = 4.0
-# Nodes worked on at a time: the stencils of a piece stay in the cache.
-PIECE = 2**14
 # Nodes of the Gauss-Legendre rule for the discounted weights: exact to rounding for steps of a part of 1 / rho.
 QUADRATURE = 12
 
@@ -55,7 +52,8 @@ def discounted_weights(rho: float, tau: float) -> list[float]:
 class SemiLagrangian:
     """The scheme for ``problem`` on ``grid``; ``step`` is `tau`, in units of time; ``rise`` is `osc V`, to which clipping is
     relative. At 0 all of the cubic correction is clipped: the scheme is monotone, and each policy lowers `V` whatever it
-    starts from. In its methods ``part`` are nodes, ``u`` ``(N, m)`` their controls, and ``value`` ``(n,)`` is `V`."""
+    starts from. In its methods ``nodes`` are indices or a slice of nodes, ``u`` ``(N, m)`` their controls, ``value``
+    ``(n,)`` is `V` and ``slope`` ``(n, d)`` its gradient at all nodes. ``pieces`` are all nodes, piece by piece."""
 
     def __init__(self, problem: Problem, grid: Grid, step: float, rise: float = 0.0) -> None:
         self.problem, self.grid, self.step = problem, grid, step
@@ -63,59 +61,45 @@ class SemiLagrangian:
         self.weights = discounted_weights(self.rho, step)
         self.gain = sum(self.weights)
         self.beta = 1.0 - self.gain
-        self.x = grid.nodes()
-        self.f, self.a, self.B = (
-            torch.cat([function(part) for part in self.x.split(PIECE)])
-            for function in (problem.state_cost, problem.drift, problem.control_matrix)
-        )
+        self.x, self.pieces = grid.nodes(), torch.arange(grid.count).split(PIECE)
+        functions = problem.state_cost, problem.drift, problem.control_matrix
+        self.f, self.a, self.B = (batched(function, self.x, PIECE) for function in functions)
         self.scale = float(self.f.max() - self.f.min())
         self.clip = CLIP * rise * grid.spacing**1.5
         self.monotone = rise == 0.0
 
-    def speed(self, control: Tensor) -> float:
-        """Root mean square over the nodes of the largest component of `a + B u`."""
-        g = self.a + torch.einsum("ndm,nm->nd", self.B, control)
-        return float(g.abs().amax(dim=-1).square().mean().sqrt())
+    def move(self, nodes: slice | Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """The midpoint and the end of the path from each of ``nodes`` under ``u``."""
+        x = self.x[nodes]
+        middle = x + 0.5 * self.step * (self.a[nodes] + torch.einsum("ndm,nm->nd", self.B[nodes], u))
+        pushed = torch.einsum("ndm,nm->nd", self.problem.control_matrix(middle), u)
+        return middle, x + self.step * (self.problem.drift(middle) + pushed)
 
-    def move(self, part: slice | Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """The midpoint and the end of the path from each node of ``part`` under ``u``."""
-        x, problem = self.x[part], self.problem
-        middle = x + 0.5 * self.step * (self.a[part] + torch.einsum("ndm,nm->nd", self.B[part], u))
-        velocity = problem.drift(middle) + torch.einsum("ndm,nm->nd", problem.control_matrix(middle), u)
-        return middle, x + self.step * velocity
-
-    def _paid(self, part: slice | Tensor, u: Tensor, middle: Tensor, end: Tensor) -> Tensor:
-        first, second, third = self.weights
-        f = self.problem.state_cost
-        return first * self.f[part] + second * f(middle) + third * f(end) + self.gain * running_cost(u, self.q)
-
-    def _arrival(self, value: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Stencil index, weights of the part that is linear in ``value``, and the clipped constant part."""
-        stencil = self.grid.stencil(end)
-        extra = stencil.cubic - stencil.linear
-        difference = (extra * value[stencil.index]).sum(dim=-1)
-        clipped = difference.abs() > self.clip
+    def right_side(self, value: Tensor, nodes: slice | Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The right side ``(N,)`` under ``u``, which is linear in `V`; with it the nodes of `V` that enter, their weights,
+        and the rest, in which is what was clipped."""
+        middle, end = self.move(nodes, u)
+        stencil, f = self.grid.stencil(end), self.problem.state_cost
+        correction = ((stencil.cubic - stencil.linear) * value[stencil.index]).sum(dim=-1)
+        clipped = correction.abs() > self.clip
         weights = torch.where(clipped.unsqueeze(-1), stencil.linear, stencil.cubic)
-        return stencil.index, weights, torch.where(clipped, difference.clamp(-self.clip, self.clip), 0.0)
+        constant = torch.where(clipped, correction.clamp(-self.clip, self.clip), 0.0)
+        first, second, third = self.weights
+        paid = first * self.f[nodes] + second * f(middle) + third * f(end) + self.gain * running_cost(u, self.q)
+        constant = paid + self.beta * constant
+        return constant + self.beta * (weights * value[stencil.index]).sum(dim=-1), stencil.index, weights, constant
 
-    def right_side(self, value: Tensor, part: slice | Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The right side ``(N,)`` under ``u``, which is linear in `V`; with it stencil, weights and constant of that."""
-        middle, end = self.move(part, u)
-        index, weights, constant = self._arrival(value, end)
-        constant = self._paid(part, u, middle, end) + self.beta * constant
-        return constant + self.beta * (weights * value[index]).sum(dim=-1), index, weights, constant
-
-    def closed_form(self, slope: Tensor, part: slice | Tensor, u: Tensor) -> Tensor:
-        """The minimiser that `grad V` gives midway along the path under ``u``."""
-        return minimiser(self.pull(slope, part, u), self.q, self.limit)
-
-    def pull(self, slope: Tensor, part: slice | Tensor, u: Tensor) -> Tensor:
-        """`-B^T grad V / rho`, ``(N, m)``, midway along the path under ``u``; ``slope`` is `grad V` at the nodes."""
-        middle, _ = self.move(part, u)
-        stencil = self.grid.stencil(middle)
-        gradient = (stencil.linear.unsqueeze(-1) * slope[stencil.index]).sum(dim=1)
+    def pull(self, slope: Tensor, nodes: Tensor, u: Tensor) -> Tensor:
+        """`-B^T grad V / rho`, ``(N, m)``, midway along the path under ``u``."""
+        middle, _ = self.move(nodes, u)
+        gradient = self.grid.interpolated(slope, middle)
         return -torch.einsum("ndm,nd->nm", self.problem.control_matrix(middle), gradient) / self.rho
 
-    def push(self, part: slice, change: Tensor) -> Tensor:
+    def closed_form(self, slope: Tensor, nodes: Tensor, u: Tensor, otherwise: Tensor) -> Tensor:
+        """The minimiser that `grad V` gives midway along the path under ``u``; ``otherwise`` where that is not finite."""
+        found = minimiser(self.pull(slope, nodes, u), self.q, self.limit)
+        return torch.where(torch.isfinite(found), found, otherwise)
+
+    def push(self, nodes: Tensor, change: Tensor) -> Tensor:
         """How far a ``change`` of control moves the end of the path, ``(N,)``."""
-        return self.step * torch.einsum("ndm,nm->nd", self.B[part], change).abs().amax(dim=-1)
+        return self.step * torch.einsum("ndm,nm->nd", self.B[nodes], change).abs().amax(dim=-1)

@@ -1,6 +1,5 @@
-"""A function of each state alone: not of the other rows, nor of what was asked before, and one that autograd may call."""
-
-from __future__ import annotations
+"""A function of each state alone, with period 1: not of the other rows, nor of what was asked before or of whole turns; and
+one that autograd may call."""
 
 import math
 
@@ -8,14 +7,18 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import ProblemError
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.blame import place
 from ocp_torch.problems.checks.functions import DATA, Functions
 
 # Answers that differ by more than that part of the largest are not the same; rounding in single precision stays below.
 SAME = 1e-5
-# States compared, some rows of them asked alone, and their designs (see `functions.FIRST_DESIGN`).
-COMPARED, ALONE, DESIGN = 37, (0, 18, 36), 1
+# States of each check and their designs (see `functions.FIRST_DESIGN`), and the rows that are asked alone.
+COMPARED, DESIGN, ALONE = 37, 1, (0, 18, 36)
 DIFFERENTIATED, DIFFERENTIATED_DESIGN = 5, 2
+TURNED, TURNED_DESIGN = 256, 5
+# The whole numbers that are added to states, and how many of them a sentence shows.
+LOWEST, HIGHEST, MOST_SHOWN = -2, 3, 8
 OTHER_ROWS = "is no function of the state alone, but changes with the other states or what was asked before"
 TWICE = "is no function of the state alone, but changes when it is asked again"
 OVERWRITES = "overwrites an answer it gave before; it must give a new tensor each time"
@@ -28,16 +31,14 @@ def require_purity(functions: Functions) -> Answers:
     x = functions.exact_states(COMPARED, DESIGN)
     kept = {name: functions.ask(name, x) for name in DATA}
     first = {name: values.clone() for name, values in kept.items()}
-    turned = x.flip(0)
     for name in reversed(DATA):
-        _require_same(functions, name, x, first[name], functions.ask(name, turned).flip(0), OTHER_ROWS)
+        _require_same(functions, name, x, first[name], functions.ask(name, x.flip(0)).flip(0), OTHER_ROWS)
     for name, values in kept.items():
         _require_same(functions, name, x, first[name], values, OVERWRITES)
-    for name in DATA:
+    for name, values in first.items():
         for row in ALONE:
-            part = slice(row, row + 1)
-            alone = functions.ask(name, x[part])
-            _require_same(functions, name, x[part], first[name][part], alone, OTHER_ROWS, first[name])
+            one = x[row : row + 1]
+            _require_same(functions, name, one, values[row : row + 1], functions.ask(name, one), OTHER_ROWS, values)
     return x, first
 
 
@@ -57,6 +58,21 @@ def require_differentiable(functions: Functions) -> None:
             functions.called(lambda at, f=function: f(at.requires_grad_(True)), x.clone(), name)
 
 
+def require_period(functions: Functions) -> None:
+    """The same values a few whole periods away, in all coordinates at once, added without rounding."""
+    x = functions.exact_states(min(TURNED, functions.count), TURNED_DESIGN)
+    whole = torch.randint(LOWEST, HIGHEST + 1, x.shape, generator=fixed_generator()).to(x)
+    for name in DATA:
+        here = functions.ask(name, x)
+        worst, change = _worst((here - functions.ask(name, x + whole)).abs())
+        if not change <= SAME * float(here.abs().max()):
+            raise ProblemError(
+                f"{name} of {functions.name} is not periodic: at {place(x[worst])} it changes by {change:.3g} when "
+                f"the whole numbers {[int(k) for k in whole[worst][:MOST_SHOWN]]} are added to x, but it must have period 1 "
+                "in each coordinate; x = x.remainder(1.0) first makes it so."
+            )
+
+
 def _require_same(
     functions: Functions, name: str, x: Tensor, one: Tensor, other: Tensor, how: str, whole: Tensor | None = None
 ) -> None:
@@ -64,7 +80,13 @@ def _require_same(
     whole = one if whole is None else whole
     size = float(torch.cat([whole, other]).nan_to_num(0.0, 0.0, 0.0).abs().max())
     alike = (one == other) | (one.isnan() & other.isnan())  # what is not finite is told elsewhere
-    change = torch.where(alike, 0.0, (one - other).abs()).reshape(len(x), -1).amax(dim=-1)
+    worst, change = _worst(torch.where(alike, 0.0, (one - other).abs()))
+    if not change <= SAME * size:
+        raise ProblemError(f"{name} of {functions.name} {how}: at {place(x[worst])} it differs by {change:.3g}.")
+
+
+def _worst(changes: Tensor) -> tuple[int, float]:
+    """The row of ``changes`` ``(N, ...)`` that holds the largest of them or a NaN, and that number."""
+    change = changes.reshape(len(changes), -1).amax(dim=-1)
     worst = int(change.nan_to_num(nan=math.inf).argmax())
-    if not float(change[worst]) <= SAME * size:
-        raise ProblemError(f"{name} of {functions.name} {how}: at {place(x[worst])} it differs by {change[worst]:.3g}.")
+    return worst, float(change[worst])

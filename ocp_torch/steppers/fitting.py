@@ -1,19 +1,30 @@
-"""Optimisers and schedules by name: `torch.optim`'s, and SOAP from `pytorch_optimizer`."""
-
-from __future__ import annotations
+"""What a fit is made of beside its stepper, and the loop that all share: draw, step, average. Optimisers are `torch.optim`'s,
+and SOAP from `pytorch_optimizer`; averages of the iterates those of `torch.optim.swa_utils`."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import CosineAnnealingWarmRestarts, LambdaLR, LRScheduler, StepLR
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_multi_avg_fn
 
 from ocp_torch.errors import InputError, require_call, require_choice, require_integer, require_number
+from ocp_torch.fields import Fields
+from ocp_torch.objectives import Objective, Phase
+from ocp_torch.problems.samples import Samples
+from ocp_torch.steppers.simultaneous import Simultaneous
+from ocp_torch.steppers.stepper import Stepper, StepReport
 
 # A larger learning rate moves weights, which are about 1, so far at once that nothing is learnt; it is a slip.
 LARGEST_RATE = 1e6
+# A memory of about 1 / (1 - decay) = 50 steps: a longer one lags behind the last steps of the cosine schedule.
+DECAY = 0.98
+# At 1 the average would never leave the first iterate.
+MOST_DECAY = 0.999999
 
 
 def _sgd(parameters: list[Tensor], lr: float, momentum: float = 0.0) -> Optimizer:
@@ -75,10 +86,54 @@ def schedule_maker(
         if name == "decay":
             return StepLR(optimizer, step_size=period, gamma=factor)
         factors = {
-            "constant": lambda moved: 1.0,
             "power": lambda moved: (moved + 1.0) ** -exponent,
             "horizon": lambda moved: float(moves) ** -exponent,
         }
-        return LambdaLR(optimizer, factors[name])
+        return LambdaLR(optimizer, factors.get(name, lambda moved: 1.0))
 
     return make
+
+
+class Average(AveragedModel):
+    """The average of the iterates that were counted is in ``module``."""
+
+    module: Fields
+
+    def count(self, iterate: Sequence[Tensor]) -> None:
+        """Take ``iterate``, all parameters in the order of those of the fields, into the average."""
+        alike: Any = SimpleNamespace(parameters=lambda: iterate, buffers=self.module.buffers)
+        self.update_parameters(alike)
+
+
+def averaged(fields: Fields, kind: str = "ema", decay: float = DECAY) -> Average:
+    """A running average of ``fields``: ``ema`` (exponential with ``decay``), ``uniform`` as in the paper, or ``none``.
+
+    Raises `InputError` for another ``kind``, or a ``decay`` outside of [0, 0.999999].
+    """
+    require_choice("averaging.kind", kind, ("ema", "uniform", "none"))
+    decay = require_number("averaging.decay", decay, at_least=0.0, at_most=MOST_DECAY)
+    exponential = get_ema_multi_avg_fn(decay if kind == "ema" else 0.0)  # with 0 that is the last iterate
+    rule = get_swa_multi_avg_fn() if kind == "uniform" else exponential
+    return Average(fields, multi_avg_fn=rule, use_buffers=False).requires_grad_(False)
+
+
+def advance(stepper: Stepper, average: Average, draw: Callable[[Phase], Samples], phase: Phase) -> StepReport:
+    """One step at ``phase`` on as many batches of ``draw`` as the stepper takes; its iterate is counted in ``average``.
+
+    Raises `NonFiniteError` as `Stepper.step` does; nothing is counted then.
+    """
+    report = stepper.step([draw(phase) for _ in range(stepper.draws)], phase)
+    average.count(report.counted)
+    return report
+
+
+def short_fit(
+    fields: Fields, objective: Objective, lr: float, steps: int, unit: float = 1.0
+) -> tuple[Simultaneous, Average]:
+    """Stepper and average of a fit that nobody configures: SOAP, a learning rate that falls from ``lr`` to 0 in ``steps``.
+
+    ``unit`` is what losses are divided by (see `cost_unit`).
+    """
+    makers = {player: optimizer_maker("soap", lr) for player in objective.players}
+    stepper = Simultaneous(fields, objective, makers, schedule_maker("cosine", steps), unit=unit)
+    return stepper, averaged(fields)

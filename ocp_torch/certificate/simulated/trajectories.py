@@ -1,0 +1,166 @@
+r"""The closed loop along its trajectories: forwards what it costs, with `V` as control variate; backwards its density.
+
+For any smooth `V`, `V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt` exactly along the closed loop, with the Bellman slack
+`Q_u = V - f - R(u) - grad V . (a + B u) / rho`. So `Perf(u) = E[V mu0] - E int rho e^{-rho t} Q_u`, and what is left to
+simulate, with all its errors, is as small as `Q_u`.
+
+For every `z` with `z = V` at the start, the integral of `f + R(u) - z + z' / rho`, discounted, is the cost less that `V`. On
+a sliding mode, where a controller jumps to and fro at a kink of `V`, no step is small enough for `grad V . g` to be the rate
+at which `V` changes: there `z`, the sum of `grad V . g` along the trajectory, takes the place of `V`. Along smooth
+trajectories `z - V` vanishes with the steps.
+"""
+
+import math
+from typing import cast
+
+import torch
+from torch import Tensor
+
+from ocp_torch.control.policies import Policy, ValuePolicy
+from ocp_torch.maths import jets
+from ocp_torch.maths.jets import Field
+from ocp_torch.maths.runge_kutta import Dynamics, Integrate, discounted_integral
+from ocp_torch.maths.seeds import fixed_generator
+from ocp_torch.maths.sums import summed
+from ocp_torch.maths.supremum import supremum
+from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.problems.generator import Generator
+from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.samples import Samples
+
+# `z - V` must shrink to that part of it when steps are halved; a sixteenth is expected of a method of order four.
+SETTLING = 0.25
+# The integral over the past is taken in pieces of so many discount times, until the last one adds next to nothing; what
+# has not settled after so many pieces is extrapolated.
+PIECE, PIECES, SETTLED = 5.0, 8, 1e-2
+# Steps of a piece: in each no more than that part of a discount time passes, and no state moves farther than that part of a
+# turn, but so few and so many at least and at most; more are more exact and take longer.
+DISCOUNTED, MOVED, FEWEST_STEPS, MOST_STEPS = 0.25, 0.1, 20, 150
+# The logarithm at which the growth of a density is cut off, so that it stays a number: e^60 is unbounded to any check.
+LARGEST_GROWTH = 60.0
+# Of the states looked at, the highest are looked at again from close by.
+TOP, NEARBY = 6, 48
+# Ascents to the suprema of the a-priori bound, which is shown beside the density itself and decides nothing.
+ASCENTS, ASCENT_STEPS = 16, 20
+# Step of a difference quotient of the velocity: truncation is then about 1e-7 of its second derivatives, rounding 1e-9.
+DIFFERENCE = 1e-7
+
+
+def closed_loop_dynamics(problem: Problem, policy: Policy, value: Field | None) -> Dynamics:
+    """The closed loop and what it costs; with ``value`` its slack `-Q_u`, and as one more coordinate `z`, the sum of
+    `grad V . g` from `V` at the start on, with `z - V` as a second rate."""
+    cost = problem.control_cost
+
+    def dynamics(state: Tensor) -> tuple[Tensor, Tensor]:
+        if value is None:
+            u = policy(state)
+            return problem.velocity(state, u), problem.state_cost(state) + cost.cost(u)
+        x, summed = state[:, :-1], state[:, -1]
+        samples = Samples.of(problem, x, divergences=False)
+        generator, V = Generator.of(problem, samples), jets.jet(value, x)
+        u = policy.control(samples.B, V) if isinstance(policy, ValuePolicy) and policy.value is value else policy(x)
+        velocity = samples.a + torch.einsum("ndm,nm->nd", samples.B, u)
+        slack = generator.bellman_slack(V, u)
+        change = (V.gradient * velocity).sum(dim=-1, keepdim=True)
+        return torch.cat([velocity, change], dim=-1), torch.stack([-slack, summed - V.value], dim=-1)
+
+    return dynamics
+
+
+class Sliding:
+    """Results of ``integrate`` for ``count`` trajectories, by `-Q_u`, or with `z - V` taken off where that stays above
+    ``allowed`` however fine the steps."""
+
+    def __init__(self, integrate: Integrate, count: int, allowed: float) -> None:
+        self.integrate, self.allowed = integrate, allowed
+        self.off = torch.full((count,), math.inf, dtype=torch.float64)
+        self.stays = torch.zeros(count, dtype=torch.bool)
+
+    def __call__(self, rows: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+        rates, end = self.integrate(rows, steps)
+        off = rates[:, 1].abs()
+        self.stays[rows] = (off > self.allowed) & (off > SETTLING * self.off[rows])
+        self.off[rows] = off
+        return self.corrected(rates, rows), end
+
+    def corrected(self, rates: Tensor, rows: Tensor) -> Tensor:
+        """The first column of ``rates`` ``(n, 2)`` of ``rows``, less the second where that is to be taken off."""
+        return torch.where(self.stays[rows], rates[:, 0] - rates[:, 1], rates[:, 0])
+
+
+def backward_flow(problem: Problem, policy: Policy) -> Dynamics:
+    r"""`dy/dt = -g(y)` for the closed loop `g = a + B u`, with the logarithm of the density's growth as one more coordinate.
+
+    Its discounted integral is `mu^u(x) = rho int e^{-rho t} mu0(y_t) exp(-int_0^t div g(y_s) ds) dt`, `y_0 = x`: the density
+    of a flow changes by its divergence (the representation behind Proposition 8 of the paper). Valid for a Lipschitz loop.
+    Differences of `g`, all in one call, are cheaper than derivatives of a controller that is a derivative itself.
+    """
+
+    def backward(state: Tensor) -> tuple[Tensor, Tensor]:
+        y, log_factor = state[:, :-1], state[:, -1]
+        moves = DIFFERENCE * torch.eye(y.shape[1], dtype=y.dtype)
+        around = torch.cat([y, *(y + move for move in moves)])
+        here, *moved = problem.velocity(around, policy(around)).chunk(len(moves) + 1)
+        divergence = summed((g[:, i] - here[:, i]) / DIFFERENCE for i, g in enumerate(moved))
+        motion = torch.cat([-here, -divergence.unsqueeze(-1)], dim=-1)
+        return motion, problem.initial_density(y) * log_factor.clamp_max(LARGEST_GROWTH).exp()
+
+    return backward
+
+
+def settled_occupation(problem: Problem, policy: Policy, x: Tensor) -> Tensor:
+    """`mu^u` ``(N,)`` along the `backward_flow`, as far back as it takes; infinite where the past adds ever more.
+
+    Where the flow contracts nearly as fast as the discount forgets, the integral settles slowly, and geometrically: what
+    is left is extrapolated from the last pieces.
+    """
+    rho, dynamics = problem.discount, backward_flow(problem, policy)
+    horizon = PIECE / rho
+    with torch.no_grad():
+        speed = float(problem.velocity(x, policy(x)).norm(dim=-1).max())
+    wanted = math.ceil(horizon * max(rho / DISCOUNTED, speed / MOVED))
+    steps = int(min(MOST_STEPS, max(FEWEST_STEPS, wanted)))
+    state = torch.cat([x, x.new_zeros(len(x), 1)], dim=-1)
+    pieces: list[Tensor] = []
+    for _ in range(PIECES):
+        piece, state = discounted_integral(dynamics, state, rho, horizon, steps, wrap=False)
+        pieces.append(piece)
+        # From here on the discount of the time that has passed is part of the factor.
+        state = torch.cat([state[:, :-1].remainder(1.0), state[:, -1:] - PIECE], dim=-1)
+        if bool((piece <= SETTLED * summed(pieces)).all()):
+            return summed(pieces)
+    before, last = summed(pieces[-4:-2]), summed(pieces[-2:])
+    ratio = last / before.clamp_min(1e-300)
+    rest = torch.where(ratio < 1.0, last * ratio / (1.0 - ratio), math.inf)
+    return summed(pieces) + torch.where(last > SETTLED * summed(pieces), rest, 0.0)
+
+
+def estimated_sup_occupation(problem: Problem, policy: Policy, end_states: Tensor, states: int) -> float:
+    """The largest `mu^u` met: at the ends of trajectories, where mass accumulates, at uniform states, and then near the
+    highest of them."""
+    count = max(1, 2 * states // 3)
+    picked = end_states[:: max(1, len(end_states) // count)][:count]
+    generator = fixed_generator()
+    uniform = torch.rand(states - len(picked), problem.dim, dtype=picked.dtype, generator=generator)
+    x = torch.cat([picked, uniform])
+    met = lambda x: settled_occupation(problem, policy, x).nan_to_num(nan=math.inf, posinf=math.inf)
+    density = met(x)
+    if not bool(torch.isfinite(density).all()):
+        return math.inf
+    top = x[density.topk(min(TOP, len(x))).indices]
+    around = top[torch.arange(NEARBY) % len(top)]
+    steps = torch.randn(around.shape, dtype=x.dtype, generator=generator) / math.sqrt(problem.dim)
+    sizes = 10.0 ** (-1.0 - 2.0 * torch.rand(NEARBY, 1, dtype=x.dtype, generator=generator))
+    return max(float(density.max()), float(met((around + sizes * steps).remainder(1.0)).max()))
+
+
+def a_priori_sup_occupation(problem: Problem, policy: Policy, points: Tensor) -> float | None:
+    r"""`sup mu^u <= rho sup mu0 / (rho - sup(-div g))` where that is positive, else `None`; both suprema as met at
+    ``points`` and climbed. For a Lipschitz closed loop only: contraction on a jump has no divergence to show it."""
+    if not problem.gives_divergences:
+        return None
+    loop = ClosedLoop(problem, policy)
+    largest = lambda function: supremum(function, points, ASCENTS, ASCENT_STEPS, differentiable=False).value
+    contraction = lambda x: -cast(Tensor, loop.drift_divergence(x))  # there is one: the problem gives divergences
+    excess = problem.discount - max(0.0, largest(contraction))
+    return problem.discount * largest(problem.initial_density) / excess if excess > 0.0 else None
