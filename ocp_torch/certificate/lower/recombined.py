@@ -79,7 +79,7 @@ class Program:
 
 @torch.no_grad()
 def recombined(problem: Problem, value: Field, seed: int) -> Field | None:
-    """`W` for ``value`` `V` in float64; `None` where its model does not show its features, or no weights were found."""
+    """`W` for ``value`` `V` in float64; `None` where it is no `PeriodicMLP`, or no weights were found."""
     if not isinstance(value, PeriodicMLP):
         return None
     width = value.features(torch.zeros(1, problem.dim, dtype=torch.float64)).shape[1]

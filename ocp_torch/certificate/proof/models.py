@@ -75,10 +75,8 @@ def equal_cells(dim: int, side: int, degree: int) -> Box:
 
 @dataclass(frozen=True)
 class SmoothModel:
-    """A layer's values `h` and their slopes: `|h - P| <= r_0` and `|dh/dt_i - dP/dt_i| <= r_i` on each cell.
-
-    ``P`` ``(K, N, width)`` by the order of ``basis``; ``radii`` ``(1 + d, N, width)``: of `h`, then of each `dh/dt_i`.
-    """
+    """A layer's values `h` and their slopes: `|h - P| <= r_0` and `|dh/dt_i - dP/dt_i| <= r_i` on each cell. ``P`` is
+    ``(K, N, width)`` by the order of ``basis``; ``radii`` ``(1 + d, N, width)``: of `h`, then of each `dh/dt_i`."""
 
     P: Tensor
     radii: Tensor

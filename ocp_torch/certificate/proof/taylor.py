@@ -102,8 +102,8 @@ class TaylorModel:
 
     def __getitem__(self, index) -> "TaylorModel":
         """Entries of the axes after the cells."""
-        index = (slice(None), *(index if isinstance(index, tuple) else (index,)))
-        return TaylorModel(self.coefficients[(slice(None), *index)], self.radius[index], self.basis)
+        own = (slice(None), *index) if isinstance(index, tuple) else (slice(None), index)
+        return TaylorModel(self.coefficients[(slice(None),) + own], self.radius[own], self.basis)
 
     def __neg__(self) -> "TaylorModel":
         return TaylorModel(-self.coefficients, self.radius, self.basis)
