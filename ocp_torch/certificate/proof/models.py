@@ -75,10 +75,8 @@ def equal_cells(dim: int, side: int, degree: int) -> Box:
 
 @dataclass(frozen=True)
 class SmoothModel:
-    """A layer's values `h` and their slopes: `|h - P| <= r_0` and `|dh/dt_i - dP/dt_i| <= r_i` on each cell.
-
-    ``P`` ``(K, N, width)`` by the order of ``basis``; ``radii`` ``(1 + d, N, width)``: of `h`, then of each `dh/dt_i`.
-    """
+    """A layer's values `h` and their slopes: `|h - P| <= r_0` and `|dh/dt_i - dP/dt_i| <= r_i` on each cell. ``P`` is
+    ``(K, N, width)`` by the order of ``basis``; ``radii`` ``(1 + d, N, width)``: of `h`, then of each `dh/dt_i`."""
 
     P: Tensor
     radii: Tensor
@@ -149,8 +147,7 @@ def power(g: TaylorModel, exponent: float) -> TaylorModel:
     if exponent == 1.0:
         return g
     degree = g.basis.degree
-    low, high = g.bounds()
-    low, high = low.clamp_min(0.0), high.clamp_min(0.0)
+    low, high = (end.clamp_min(0.0) for end in g.bounds())
     smooth = low > SMOOTH * high
     centre = torch.where(smooth, g.coefficients[0], 1.0)
     binomials = list(itertools.accumulate(range(degree + 1), lambda b, k: b * (exponent - k) / (k + 1), initial=1.0))
