@@ -80,7 +80,6 @@ def mollified_shift(own: Shift) -> Shift:
             break
         tried = averaged(radius, own.sets, own.ascents)
         best = max(best, tried, key=lambda shift: shift.bound)
-        found = own.problem.samples(tried.largest.x.unsqueeze(0), divergences=False)
-        worst = Samples.concatenate([worst, found])
+        worst = Samples.concatenate([worst, own.problem.samples(tried.largest.x.unsqueeze(0), divergences=False)])
         looks = {r: on_few(r) for r, look in looks.items() if r != radius and look > best.bound}
     return best

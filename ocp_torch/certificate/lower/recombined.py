@@ -45,8 +45,7 @@ class Program:
         self.gain = gain @ self.basis  # E[h mu0], per direction
 
     def _evaluated(self, x: Tensor) -> tuple[SlackParts, Tensor, Tensor, Tensor]:
-        """The parts of `Q_V` at ``x``; what each weight adds to their ``value`` ``(N, n)`` and ``push`` ``(N, m, n)``; and
-        `E[h mu0]` ``(n,)``."""
+        """The parts of `Q_V` at ``x``, what each feature adds to their ``value`` and ``push``, and `E[h mu0]` ``(n,)``."""
         problem, rho = self.problem, self.problem.discount
         samples = Samples.of(problem, x, divergences=False)
         generator = Generator.of(problem, samples)
@@ -84,7 +83,7 @@ class Program:
 
 @torch.no_grad()
 def recombined(problem: Problem, value: Field, seed: int) -> Field | None:
-    """`W` for ``value`` `V` in float64; `None` where its model does not show its features, or no weights were found."""
+    """`W` for ``value`` `V` in float64; `None` where it is no `PeriodicMLP`, or no weights were found."""
     if not isinstance(value, PeriodicMLP):
         return None
     width = value.features(torch.zeros(1, problem.dim, dtype=torch.float64)).shape[1]

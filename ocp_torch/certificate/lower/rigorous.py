@@ -39,8 +39,7 @@ def _proved(context: Context) -> tuple[Estimate | None, list[str], list[str]]:
     V = context.sampled_value
     if V is None:
         return None, [], []
-    # Loaded only where a proof is asked for.
-    from ocp_torch.certificate.proof.rigorous import obstacle, rigorous_lower_bound
+    from ocp_torch.certificate.proof.rigorous import obstacle, rigorous_lower_bound  # only where it is asked for
 
     context.progress("proof")
     why, own = obstacle(context.problem, V.value), V.own

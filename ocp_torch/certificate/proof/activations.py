@@ -54,9 +54,8 @@ class Gelu:
         if k == 1:
             return 1.13
         # |(2 - z^2) phi| <= (2 + R^2) e^{R^2/2} / sqrt(2 pi) on the strip |Im z| <= R.
-        radii = [0.05 * i for i in range(10, 80)]
-        best = min(0.4 * (2.0 + R * R) * math.exp(0.5 * R * R) * R ** (2 - k) for R in radii)
-        return best / (k * (k - 1))
+        within = lambda R: 0.4 * (2.0 + R * R) * math.exp(0.5 * R * R) * R ** (2 - k)
+        return min(within(0.05 * i) for i in range(10, 80)) / (k * (k - 1))
 
 
 class Tanh:

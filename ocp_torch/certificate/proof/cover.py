@@ -59,10 +59,9 @@ class Cover:
         """The cells with ``centre`` and ``half``, evaluated."""
         box = Box(centre, half, degree(problem))
         Q, initial = cell_models(problem, value, theta, box)
-        _, upper = Q.bounds()
         mean, radius = initial.mean()
         volume = (2.0 * half).prod(dim=-1)
-        upper = upper.nan_to_num(nan=math.inf, posinf=math.inf)
+        upper = Q.bounds()[1].nan_to_num(nan=math.inf, posinf=math.inf)
         reached = (Q.coefficients[0] - Q.radius).nan_to_num(nan=-math.inf)
         return cls(centre, half, upper, reached, mean * volume, radius * volume, _loosest(Q, box))
 

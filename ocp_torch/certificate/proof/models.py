@@ -117,8 +117,7 @@ def power(g: TaylorModel, exponent: float) -> TaylorModel:
     if exponent == 1.0:
         return g
     degree = g.basis.degree
-    low, high = g.bounds()
-    low, high = low.clamp_min(0.0), high.clamp_min(0.0)
+    low, high = (end.clamp_min(0.0) for end in g.bounds())
     smooth = low > SMOOTH * high
     centre = torch.where(smooth, g.coefficients[0], 1.0)
     binomials = list(itertools.accumulate(range(degree + 1), lambda b, k: b * (exponent - k) / (k + 1), initial=1.0))

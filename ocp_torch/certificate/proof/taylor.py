@@ -102,9 +102,8 @@ class TaylorModel:
 
     def __getitem__(self, index) -> "TaylorModel":
         """Entries of the axes after the cells."""
-        index = index if isinstance(index, tuple) else (index,)
-        every = (slice(None),)
-        return TaylorModel(self.coefficients[every + every + index], self.radius[every + index], self.basis)
+        own = (slice(None), *index) if isinstance(index, tuple) else (slice(None), index)
+        return TaylorModel(self.coefficients[(slice(None),) + own], self.radius[own], self.basis)
 
     def __neg__(self) -> "TaylorModel":
         return TaylorModel(-self.coefficients, self.radius, self.basis)
@@ -149,8 +148,7 @@ class TaylorModel:
         even = torch.tensor([all(e % 2 == 0 for e in a) for a in self.basis.exponents])
         even[0] = False
         half, rest = self.coefficients[even], self.coefficients[~even]
-        spread = self.radius + rest[1:].abs().sum(dim=0)
-        room = upward(spread + ROUNDING * self.size)
+        room = upward(self.radius + rest[1:].abs().sum(dim=0) + ROUNDING * self.size)
         centre = rest[0]
         return centre + half.clamp_max(0.0).sum(dim=0) - room, centre + half.clamp_min(0.0).sum(dim=0) + room
 

@@ -65,11 +65,10 @@ def closed_loop_samples(samples: Samples, policy: Policy, cost: PowerCost) -> Sa
     for part in samples.split(CHUNK):
         div_a, div_B = part.require_divergences("the closed loop")
         u, flux = control_flux_divergence(policy, part.x, part.B, div_B)
-        pushed = torch.einsum("ndm,nm->nd", part.B, u)
-        loop = replace(part, f=part.f + cost.cost(u), a=part.a + pushed, div_a=div_a + flux)
-        none = torch.zeros_like(part.x)
-        pieces.append(replace(loop, B=none.unsqueeze(-1), div_B=none[:, :1]))
-    return Samples.concatenate(pieces)
+        flow = part.a + torch.einsum("ndm,nm->nd", part.B, u)
+        pieces.append(replace(part, f=part.f + cost.cost(u), a=flow, div_a=div_a + flux))
+    loop = Samples.concatenate(pieces)
+    return replace(loop, B=torch.zeros_like(loop.x).unsqueeze(-1), div_B=torch.zeros_like(loop.x[:, :1]))
 
 
 class RecordedFit(NamedTuple):
