@@ -15,13 +15,12 @@ class Reproducible:
 
     @property
     def parameters(self) -> dict:
-        """The arguments that make this object again: each `__init__` argument is read from the attribute of its name, or,
-        where there is none, is what was given."""
+        """The arguments that make this object again: each `__init__` argument is read from the object's own attribute of its
+        name, or, where there is none (a method or a property may have that name), is what was given."""
         signature, (args, kwargs) = inspect.signature(type(self).__init__), self._given
         bound = signature.bind(self, *args, **kwargs)
         bound.apply_defaults()
         found = dict(list(bound.arguments.items())[1:])
         for name in (n for n, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD):
             found |= found.pop(name)
-        kept = {name: getattr(self, name, value) for name, value in found.items()}
-        return {name: found[name] if inspect.ismethod(value) else value for name, value in kept.items()}
+        return {name: vars(self).get(name, value) for name, value in found.items()}

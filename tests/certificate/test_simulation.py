@@ -57,8 +57,8 @@ def wrong_policy(problem):
 def test_the_exact_controller_performs_at_the_optimum(problem):
     perf = simulate_performance(problem, problem.exact_control, trajectories=64, replicates=8, seed=0).perf
     assert abs(perf.value - problem.exact_optimum) <= 4.0 * perf.se + perf.bias
-    # An error bar that covers everything proves nothing.
-    assert 4.0 * perf.se + perf.bias < 0.02 * problem.exact_optimum
+    # An error bar that covers everything proves nothing; paths with noise scatter more.
+    assert 4.0 * perf.se + perf.bias < (0.05 if problem.noisy else 0.02) * problem.exact_optimum
 
 
 @zoo.on(zoo.KINKED)
