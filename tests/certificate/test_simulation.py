@@ -130,7 +130,7 @@ def test_with_noise_the_occupation_density_is_the_mean_over_paths(problem):
     assert float((found / exact).mean()) > 0.7
 
 
-@zoo.on(("noisy 1-d", "noisy 2-d degenerate"))
+@zoo.on(("noisy 1-d", pytest.param("noisy 2-d degenerate", marks=pytest.mark.nightly)))
 @pytest.mark.parametrize("horizon", ["truncated", pytest.param("random", marks=pytest.mark.nightly)])
 def test_any_control_variate_gives_the_performance_with_noise(problem, horizon):
     """`Perf = E[V mu0] - E int rho e^{-rho t} Q_u` for a rough `V`, by Ito's formula; of 12 intervals 3 may miss, 1 is
@@ -177,7 +177,7 @@ class Step(Problem):
         return (x[:, 0] < self.edge).to(x) + self.slope * (1.0 + torch.sin(2.0 * math.pi * x[:, 0]))
 
 
-@pytest.mark.parametrize("slope", [0.0, 0.2])
+@pytest.mark.parametrize("slope", [0.0, pytest.param(0.2, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("starts", [16, 64])
 def test_intervals_cover_the_cost_of_a_jump_however_alike_the_replicates(slope, starts):
     """The start of the stratum with the edge nearly always falls on one side. At 5 % no more than 9 of 80 may miss."""

@@ -27,7 +27,7 @@ from ocp_torch.runs.resume import result_of
 from ocp_torch.training.checkpoint import load_checkpoint
 from support.strangers import make_run, seal, signed
 
-pytestmark = pytest.mark.usefixtures("quick_composition")
+pytestmark = [pytest.mark.usefixtures("quick_composition"), pytest.mark.nightly]
 
 ROUNDS = 100
 

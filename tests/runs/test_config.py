@@ -25,6 +25,7 @@ NEEDS = {
 CHOICES = sorted(f"{path.parent.name}={path.stem}" for path in CONFIGS.glob("*/*.yaml"))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("choice", CHOICES)
 def test_every_choice_of_every_group_composes_and_builds_a_trainer(choice, tmp_path):
     group, name = choice.split("=")
