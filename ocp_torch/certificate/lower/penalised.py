@@ -27,7 +27,7 @@ class PenalisedDual(Bound):
 
     def evaluate(self, context: Context) -> Estimate | None:
         V = context.sampled_value
-        return None if V is None else penalised(V, context.constants.M)
+        return None if V is None else penalised(V, context.informed.M)
 
 
 class RecordedDual(PenalisedDual):
@@ -44,7 +44,7 @@ class RecordedDual(PenalisedDual):
             generator = Generator.of(context.problem, samples)
             V = generator.chunked_jet(context.value)
             slack = generator.hjb_slack(V)
-            values.append(integral(samples, V.value * samples.mu0 - context.constants.M * slack.clamp_min(0.0)))
+            values.append(integral(samples, V.value * samples.mu0 - context.informed.M * slack.clamp_min(0.0)))
         return Estimate.of(values)
 
 
