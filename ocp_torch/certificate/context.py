@@ -21,6 +21,7 @@ from ocp_torch.control.policies import Policy
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import Constants
+from ocp_torch.problems.needs import GUESSED
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.scan import odd_states
@@ -146,7 +147,8 @@ class Context:
     @cached_property
     def informed(self) -> Constants:
         """The constants by which bounds are computed: an `M` that nobody gave follows from what was met of the density."""
-        return self.constants.informed(self.densest)
+        guessed = self.constants.basis("M") == GUESSED  # else nobody has to look
+        return self.constants.informed(self.densest) if guessed else self.constants
 
     @property
     def hidden(self) -> Hidden | None:

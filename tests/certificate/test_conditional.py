@@ -6,6 +6,9 @@ import pytest
 import torch
 
 from ocp_torch.certificate import Run, StageSettings, Trained, certify_fields
+from ocp_torch.certificate.estimate import replicated_samples
+from ocp_torch.certificate.lower.penalised import levelled
+from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.report import table
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.trained import TrainedContext
@@ -13,7 +16,8 @@ from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems import Circle
 from ocp_torch.problems.constants import FROM_DENSITY, OBSERVED_ROOM, resolve_constants
 from ocp_torch.problems.needs import GIVEN, GUESSED
-from support.formulas import Field
+from support import zoo
+from support.formulas import ERRORS, Field
 
 NOISE, DISCOUNT = 1e-2, 2.0
 # Of the circle with that noise, by finite differences (tests/studies/test_noisy_reference.py).
@@ -95,6 +99,7 @@ def test_the_density_of_the_controller_gives_a_conditional_bound_near_the_optimu
     assert f"gap, if {bound['if']}: " in table(said)
     assert not bound["counts"]
     assert said["gap"]["lower_from"] == "shifted"
+    assert said["lower"]["shifted"]["value"] < bound["value"]
     assert said["gap"]["conditional"] < said["gap"]["certified"]
     assert found.hold
 
@@ -116,6 +121,36 @@ def test_a_density_that_is_far_too_small_enters_nothing_that_counts(solved, monk
     sure = [line for line in table(said).splitlines() if "sure" in line]
     assert len(sure) == 1
     assert "mu*" not in sure[0]
+
+
+@zoo.on(("circle rho=2", "noisy 2-d sigma(x)"))
+@pytest.mark.parametrize("M", [1.0, 1.7, 30.0, 1e9])
+def test_the_best_multiple_and_constant_are_found_and_leave_a_bound(problem, M):
+    """Against other multiples and constants, the shifted bound and, where `M` is large enough, the optimum."""
+    network = zoo.rough_network(problem.dim, seed=3, size=0.05)
+    value = lambda x: problem.exact_value(x) + 7.0 + network(x)
+    sets = replicated_samples(problem, 2048, 4, 0, divergences=False)
+    shift = SampledValue(problem, value, sets).own
+    found, mean = levelled(shift, M), sum(shift.initial) / len(shift.initial)
+    highest = -float("inf")
+    for theta in torch.linspace(0.0, 1.2, 13).tolist():
+        slack = torch.cat([part.slack(theta) for part in shift.parts])
+        off = (slack.unsqueeze(-1) - (c := slack.sort().values[::128])).clamp_min(0.0).mean(dim=0)
+        highest = max(highest, float((theta * mean - c - M * off).max()))
+    assert found.value >= shift.bound - ERRORS * found.se - 1e-9
+    if M == 1e9:
+        assert found.value == pytest.approx(shift.bound)
+    else:
+        assert highest - ERRORS * found.se - 1e-3 <= found.value <= 1.05 * highest + ERRORS * found.se
+    if M >= problem.occupation_bound:
+        assert found.value <= problem.exact_optimum + ERRORS * found.se
+
+
+def test_a_constant_in_the_value_changes_nothing_of_the_best(solved):
+    V, *_ = solved
+    sets = replicated_samples(Unsaid(), 512, 2, 0, divergences=False)
+    low, high = (levelled(SampledValue(Unsaid(), interpolated(V + c), sets).own, 2.0).value for c in (-0.01, 3.0))
+    assert low == pytest.approx(high, abs=1e-7)
 
 
 INF, NAN = float("inf"), float("nan")

@@ -1,7 +1,8 @@
 r"""Upper bounds on `Perf(u)` for one given controller, from any `V` and any `mu >= 0`, without simulation.
 
 Write `Q_u` for the Bellman slack of `V` and `r = mu0 - mu - div(mu g_u) / rho` for the Liouville residual of `mu`, and let
-`mu^u` be the true occupation density, so that `Perf(u) = E_{mu^u}[f + R(u)]`.
+`mu^u` be the true occupation density, so that `Perf(u) = E_{mu^u}[f + R(u)]`. With noise `r` has `div div(D mu) / rho` beside
+that, and what is said along trajectories holds in the mean over paths (Ito's formula).
 
 1. Along the closed loop `d/dt (e^{-rho t} V(x_t)) = -rho e^{-rho t} (Q_u + f + R(u))(x_t)`. Integrated from 0 to infinity:
    `V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt`, hence `V - eps_lo <= V^u <= V + eps_hi` with
