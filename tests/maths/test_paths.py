@@ -1,0 +1,35 @@
+"""Weights along paths with noise, and that no two groups of paths share their noise."""
+
+import math
+
+import pytest
+import torch
+
+from ocp_torch.maths.brownian import TOGETHER, Grid, at_random_times, discounted, expectation
+
+RHO = 2.0
+
+
+def test_at_random_times_a_constant_rate_counts_once_in_the_mean():
+    """`E int weight ds = 1` for `T ~ Exp(rho)`, by its quantiles; with times that are fixed `1 - e^{-rho T}`."""
+    count, steps = 200_000, 64
+    times = -torch.log1p(-(torch.arange(count, dtype=torch.float64) + 0.5) / count) / RHO
+    total = lambda weight: sum(weight(times, (k + 0.5) / steps) for k in range(steps)) / steps
+    assert float(total(at_random_times(RHO)).mean()) == pytest.approx(1.0, rel=2e-3)
+    torch.testing.assert_close(total(discounted(RHO)), 1.0 - torch.exp(-RHO * times), rtol=1e-2, atol=1e-3)
+
+
+def test_groups_of_paths_from_one_start_are_independent():
+    count = 2 * TOGETHER
+    x0, weights = torch.zeros(count, 1, dtype=torch.float64), torch.ones(count, dtype=torch.float64)
+    grid = Grid(torch.ones(count, dtype=torch.float64), 4, 1.0)
+    noise = lambda x: torch.ones(len(x), 1, 1, dtype=x.dtype)
+    run = lambda seed: expectation(
+        lambda x: (0.0 * x, x[:, 0]), noise, x0, weights, grid, discounted(RHO), 1.0, seed, lambda r: float(r.std())
+    )
+    result, end, _ = run(0)
+    for values in (result, end[:, 0]):
+        first, second = values[:TOGETHER], values[TOGETHER:]
+        assert abs(float(torch.corrcoef(torch.stack([first, second]))[0, 1])) < 5.0 / math.sqrt(TOGETHER)
+    assert float(end.square().mean()) == pytest.approx(1.0, rel=0.2)
+    assert not torch.equal(run(1)[1], end)
