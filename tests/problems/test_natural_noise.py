@@ -32,6 +32,16 @@ NOISY = {
 }
 
 
+@pytest.mark.parametrize("cls", [Arm, Dubins, Kuramoto, Pendulum])
+def test_noise_of_a_system_stands_beside_that_of_its_coordinates(cls):
+    """`D` of both is the sum."""
+    own = {"Arm": "joint_noise", "Dubins": "heading_noise", "Kuramoto": "phase_noise", "Pendulum": "torque_noise"}
+    both, one, other = cls(noise=0.01, **{own[cls.__name__]: 0.3}), cls(noise=0.01), cls(**{own[cls.__name__]: 0.3})
+    x = zoo.states(both, 20)
+    D = lambda problem: 0.5 * problem.noise(x) @ problem.noise(x).mT
+    torch.testing.assert_close(D(both), D(one) + D(other))
+
+
 def ends(problem, start, time, steps=32):
     """Where `PATHS` paths from the one state ``start`` are after ``time`` without control, whole turns included."""
     x = torch.tensor([start], dtype=torch.float64).repeat(PATHS, 1)
