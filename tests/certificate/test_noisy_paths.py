@@ -40,7 +40,7 @@ def test_paths_spread_as_their_noise_says_and_differently_in_each_piece(nu):
 
 
 def test_what_is_simulated_beside_a_control_variate_has_its_curvature():
-    """With `V* + s mu*` the curvature is `s E[mu* D : hess mu*] / rho` of the answer, far more than what simulation is off."""
+    """With `V* + s mu*` the curvature is `s E[mu* D : hess mu*] / rho` of the answer, far more than simulation is off."""
     problem = Manufactured(dim=1, noise=0.4)
     size, side = 0.3 * problem.exact_optimum, torch.arange(64, dtype=torch.float64) / 64
     value = lambda x: problem.exact_value(x) + size * problem.exact_occupation(x)
