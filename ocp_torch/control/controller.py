@@ -50,8 +50,9 @@ class Controller:
         self._like = next(self.fields.parameters())
 
     def __call__(self, x: States) -> States:
-        """Controls ``(N, m)`` at states ``(N, d)``: any reals, wrapped to the torus; NumPy in gives NumPy out. Raises
-        `InputError` for another shape."""
+        """Controls ``(N, m)`` at states ``(N, d)``: any reals, wrapped to the torus; NumPy in gives NumPy out.
+
+        Raises `InputError` for another shape."""
         states = torch.as_tensor(x)
         if states.ndim != 2 or states.shape[1] != self.problem.dim:
             raise InputError(f"x has shape {tuple(states.shape)}, but must have shape (N, {self.problem.dim}).")

@@ -14,7 +14,7 @@ from ocp_torch.problems.blame import named
 from ocp_torch.problems.checks.functions import Functions
 from ocp_torch.problems.checks.mass import require_mass
 from ocp_torch.problems.checks.sameness import require_differentiable, require_period, require_purity, require_still
-from ocp_torch.problems.checks.values import require_divergences, require_finite, require_signs
+from ocp_torch.problems.checks.values import require_divergences, require_finite, require_kept_noise, require_signs
 from ocp_torch.problems.control_limit import control_cost
 from ocp_torch.problems.problem import MOST_COORDINATES, Problem
 from ocp_torch.problems.simulator.simulator import Simulator
@@ -55,7 +55,14 @@ def _check(functions: Functions) -> None:
     first = require_purity(functions)
     if not functions.simulator:
         require_differentiable(functions)
-    for require in (require_finite, require_period, require_signs, require_divergences, require_mass):
+    for require in (
+        require_finite,
+        require_period,
+        require_signs,
+        require_kept_noise,
+        require_divergences,
+        require_mass,
+    ):
         require(functions)
     require_still(functions, first)
 
