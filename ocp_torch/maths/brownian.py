@@ -164,7 +164,8 @@ def expectation(
             moved = (2.0 * change - before[:, of]).flatten()
             size, error = abs(float(moved.mean())), float(moved.std()) / math.sqrt(len(moved))
             bias = max(LEFT * size, size + 2.0 * error)
-            if bias <= max(tolerance, GOOD_PART * float(extrapolated.std()) / math.sqrt(replicates)):
+            chance = float(extrapolated.std()) / math.sqrt(replicates) if replicates > 1 else 0.0
+            if bias <= max(tolerance, GOOD_PART * chance):
                 break
         coarse, before = fine, change
     return Mean(integrals.flatten(), extrapolated - (mass * integrals).mean(dim=1), end, bias)

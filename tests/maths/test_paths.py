@@ -24,15 +24,14 @@ def test_groups_of_paths_from_one_start_are_independent():
     x0, weights = torch.zeros(count, 1, dtype=torch.float64), torch.ones(count, dtype=torch.float64)
     grid = Grid(torch.ones(count, dtype=torch.float64), 4, 1.0)
     noise = lambda x: torch.ones(len(x), 1, 1, dtype=x.dtype)
-    run = lambda seed: expectation(
-        lambda x: (0.0 * x, x[:, 0]), noise, x0, weights, grid, discounted(RHO), 1.0, seed, lambda r: float(r.std())
-    )
-    result, end, _ = run(0)
+    dynamics = lambda x: (0.0 * x, x[:, 0])
+    run = lambda seed: expectation(dynamics, noise, x0, weights, 1, grid, discounted(RHO), 1.0, seed)
+    result, _, end, _ = run(0)
     for values in (result, end[:, 0]):
         first, second = values[:TOGETHER], values[TOGETHER:]
         assert abs(float(torch.corrcoef(torch.stack([first, second]))[0, 1])) < 5.0 / math.sqrt(TOGETHER)
     assert float(end.square().mean()) == pytest.approx(1.0, rel=0.2)
-    assert not torch.equal(run(1)[1], end)
+    assert not torch.equal(run(1).end, end)
 
 
 @pytest.mark.parametrize("steps", [64, 128])
@@ -46,7 +45,7 @@ def test_means_are_extrapolated_and_the_bias_covers_what_is_left(steps):
     finest = Grid(grid.horizon, 4 * steps, 1.0)
     moves = torch.zeros(4 * steps, 3, 1, dtype=torch.float64)
     plain = float(path_integral(dynamics, still, x0, finest, moves, discounted(RHO))[0].mean()) - exact
-    result, _, bias = expectation(dynamics, still, x0, weights, grid, discounted(RHO), math.inf, 0, lambda r: 0.0)
-    error = float(result.mean()) - exact
+    found = expectation(dynamics, still, x0, weights, 3, grid, discounted(RHO), math.inf, 0)
+    error, bias = float(found.integrals.mean() + found.refinement.mean()) - exact, found.bias
     assert abs(error) < 0.3 * abs(plain)
     assert abs(error) <= bias < 8.0 * abs(plain)
