@@ -257,7 +257,7 @@ def test_importance_weights_make_any_law_serve(tmp_path):
     assert float(values.mean()) == pytest.approx(0.35, abs=0.03)  # half the contrast, without the weights
 
 
-@pytest.mark.parametrize("name", ["manufactured 2-d mu0", "manufactured 3-d m=2", "limited 2-d"])
+@pytest.mark.parametrize("name", ["manufactured 2-d mu0", "manufactured 3-d m=2", "limited 2-d", "box-limited 2-d"])
 def test_closed_loops_from_samples_are_those_of_the_problem(tmp_path, name):
     problem = zoo.build(name)
     data = Dataset(str(record(tmp_path, problem, 400)))
