@@ -355,7 +355,7 @@ def test_random_networks_obey_weak_duality_and_the_limit(name, seed, size):
 
 
 @settings(max_examples=10)
-@given(st.integers(0, 10**6), st.sampled_from([0.1, 1.0, 5.0]), st.sampled_from([0.02, 0.1, 0.3]))
+@given(st.integers(0, 10**6), st.sampled_from([0.1, 1.0, 5.0]), st.sampled_from([0.02, 0.1, 0.3, [0.02, 0.3]]))
 def test_without_drift_the_closed_occupation_carries_any_flux(seed, size, limit):
     problem = Torus(control_limit=limit, seed=1)
     fields, constants = random_fields(problem, seed, size), resolve_constants(problem)
@@ -407,11 +407,19 @@ def test_the_kernel_methods_refuse_a_limit():
         DualRule(problem, resolve_constants(problem))
 
 
-@pytest.mark.parametrize("problem", [Manufactured(dim=1, control_limit=0.5, exponent=1.5), Circle(control_limit=0.1)])
-def test_the_grid_knows_the_limit(problem):
+@pytest.mark.parametrize(
+    ("problem", "side"),
+    [
+        (Manufactured(dim=1, control_limit=0.5, exponent=1.5), 128),
+        (Circle(control_limit=0.1), 128),
+        (Manufactured(control_limit=[0.6, 0.3], seed=2), 48),
+    ],
+)
+def test_the_grid_knows_the_limit(problem, side):
     """Against exact truth, or against an upper and a lower bound that are easy to have."""
-    reference = solve_reference(problem, side=128)
-    assert float(reference.control.norm(dim=-1).max()) <= problem.control_limit * (1.0 + 1e-9)
+    reference = solve_reference(problem, side=side)
+    for u in (reference.control, reference.interpolate(zoo.states(problem, 200))[1]):
+        assert float(least(problem.control_cost, u.reshape(-1, problem.control_dim)).max()) <= 1.0 + 1e-9
     if problem.exact_optimum is not None:
         assert abs(reference.optimum - problem.exact_optimum) <= max(reference.error, 1e-6)
     else:
@@ -419,13 +427,15 @@ def test_the_grid_knows_the_limit(problem):
         assert free + 1e-4 < reference.optimum < 1.0 / 12.0  # doing nothing costs the mean of f
 
 
-def test_a_given_controller_that_breaks_the_limit_is_refused_with_its_state_and_size():
-    problem = Manufactured(control_limit=0.5)
+@pytest.mark.parametrize(("limit", "shown"), [(0.5, r"0\.5;"), ([0.65, 0.5], r"\[0\.65, 0\.5\];")], ids=str)
+def test_a_given_controller_that_breaks_the_limit_is_refused_with_its_state_and_size(limit, shown):
+    problem = Manufactured(control_limit=limit)
     too_much = lambda x: 0.6 * torch.ones(len(x), 2)
-    with pytest.raises(InputError, match=r"size 0\.848528 at x = \[.*control_limit is 0\.5"):
+    with pytest.raises(InputError, match=rf"u = \[0\.6, 0\.6\] of size 0\.848528 at x = \[.*control_limit is {shown}"):
         BlackBox(too_much, problem)(zoo.states(problem, 3))
-    rounded = BlackBox(lambda x: torch.full((len(x), 2), 0.5 / math.sqrt(2.0) * (1.0 + 1e-6)), problem)
-    assert float(rounded(zoo.states(problem, 5)).norm(dim=-1).max()) <= 0.5 * (1.0 + 1e-12)
+    x, share = zoo.states(problem, 5), float(least(problem.control_cost, too_much(zoo.states(problem, 1)).double()))
+    rounded = BlackBox(lambda x: too_much(x) / share * (1.0 + 1e-6), problem)
+    assert float(least(problem.control_cost, rounded(x)).max()) <= 1.0 + 1e-12
     settings = CertificateSettings(points=64, replicates=2, trajectories=2, stage=StageSettings(steps=0))
     with pytest.raises(InputError, match="control_limit"):
         certify(problem, too_much, settings=settings, train_steps=0)
@@ -438,19 +448,22 @@ def test_one_trained_under_another_limit_is_held_against_this_one():
     for parameter in free.fields.parameters():
         parameter.data.mul_(3.0)
     settings = CertificateSettings(points=64, replicates=2, trajectories=2, stage=StageSettings(steps=0))
-    with pytest.raises(InputError, match=r"control_limit is 0\.0001"):
-        certify(Manufactured(control_limit=1e-4), free, settings=settings, train_steps=0)
+    for limit, shown in ((1e-4, r"0\.0001"), ([9.0, 1e-4], r"\[9\.0, 0\.0001\]")):
+        with pytest.raises(InputError, match=f"control_limit is {shown}"):
+            certify(Manufactured(control_limit=limit), free, settings=settings, train_steps=0)
 
 
 @pytest.mark.nightly
+@pytest.mark.parametrize("limit", [0.02, [0.02, 0.05]], ids=str)
 @pytest.mark.parametrize("overrides", [("method=primal",), ("method=pd",), ("method=pd", "method.augmentation=0")])
-def test_every_method_trains_with_a_limit_and_hands_out_a_controller_that_obeys(overrides, tmp_path):
+def test_every_method_trains_with_a_limit_and_hands_out_a_controller_that_obeys(overrides, limit, tmp_path):
     quick = ("certificate.points=256", "certificate.trajectories=4", "certificate.ascents=2", "trainer.figures=false")
-    trainer = small("problem=manufactured", "problem.dim=1", "problem.control_limit=0.02", *quick, *overrides)
+    limited = (f"problem.dim={2 if isinstance(limit, list) else 1}", f"problem.control_limit={limit}")
+    trainer = small("problem=manufactured", *limited, *quick, *overrides)
     certificate = session(trainer, tmp_path)
     u = load_controller(tmp_path / "controller.safetensors")
-    assert u.problem.control_limit == 0.02
-    assert float(u(torch.rand(500, 1)).norm(dim=-1).max()) <= 0.02 * (1.0 + 1e-5)
+    assert u.problem.control_limit == limit
+    assert float(least(u.problem.control_cost, u(torch.rand(500, u.problem.dim)).double()).max()) <= 1.0 + 1e-5
     exact = certificate.exact
     for low in certificate.lower.values():
         assert low is None or low.interval(0.99999)[0] <= exact
