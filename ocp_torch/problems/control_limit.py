@@ -25,7 +25,8 @@ SMALLEST, LARGEST = 1e-9, 1e9
 
 
 class ConstrainedCost(PowerCost):
-    """`R_K` of a class that gives `gauge` and `within`. In ``bend`` times `K` is where `R_K* = R*`."""
+    """`R_K` of a class that gives `gauge` and `within`. Within ``bend`` times `K` the conjugate is `R*`; and the maximiser at
+    any other `p` is that of the nearest point there."""
 
     bend = 1.0
 
