@@ -4,12 +4,13 @@ from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.problems import PROBLEMS, Circle, Dataset, Manufactured, Problem, Simulator, Torus
 from ocp_torch.problems.control_cost import PowerCost
-from ocp_torch.problems.control_limit import LimitedCost
+from ocp_torch.problems.control_limit import BoxLimitedCost, LimitedCost
 from ocp_torch.runs.external import certify
 
 __version__ = "0.1.0"
 __all__ = [
     "PROBLEMS",
+    "BoxLimitedCost",
     "Simulator",
     "Circle",
     "Controller",

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError, require_number
+from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.angles import TURN, to_radians, to_turns
 from ocp_torch.problems.systems.rest import occupation_bound_at_rest
@@ -44,7 +45,7 @@ class Pendulum(Problem):
         torque_cost: float = 0.1,
         discount: float = 2.0,
         exponent: float = 2.0,
-        control_limit: float | None = None,
+        control_limit: Limit = None,
         torque_noise: float = 0.0,
         noise: float | Sequence[float] = 0.0,
     ) -> None:
