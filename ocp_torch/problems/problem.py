@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError, require_integer, require_number
 from ocp_torch.maths import jets
+from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.constant_noise import column_matrix, constant_diffusion
@@ -139,6 +140,11 @@ class Problem(Reproducible, Placed):
     def initial_density(self, x: Tensor) -> Tensor:
         """Density `mu0` of the initial state, ``(N,)``, with mean 1 over the torus; uniform unless overridden."""
         return torch.ones_like(x[:, 0])
+
+    @property
+    def initial_mixture(self) -> Mixture | None:
+        """A density to draw starts from, of which `mu0` is nowhere a large multiple; `None` where one has to be found."""
+        return None
 
     @property
     def scan_factor(self) -> int:

@@ -10,11 +10,13 @@ from hypothesis import strategies as st
 from ocp_torch import Angle, Interval, Points, System
 from ocp_torch.errors import InputError
 from ocp_torch.maths.jets import diffusion_divergences, divergence
+from ocp_torch.maths.mixtures import effective_part
 from ocp_torch.problems import Pendulum, Problem
 from ocp_torch.problems.checks.check import check_once
 from ocp_torch.problems.physical.chart import Chart
 from ocp_torch.problems.physical.start import start_density
 from ocp_torch.problems.samples import Samples
+from ocp_torch.problems.starts import initial_points
 from support import zoo
 from support.systems import Cart, Conveyor, Swing
 
@@ -279,3 +281,21 @@ def test_a_limit_and_a_weight_are_in_the_unit_of_the_control():
 @pytest.mark.parametrize("make", [Swing, Cart, Conveyor, lambda: Swing(turn=360.0, start={"angle": (170, 190)})])
 def test_a_sound_system_passes_the_checks_of_users_problems(make):
     check_once(make())
+
+
+@pytest.mark.parametrize(
+    "start",
+    [
+        None,
+        {"trolley": (-1e-3, 1e-3), "pole": (3.1, 3.3), "spin": (0.0, 1e-4)},
+        Points([[0.3, 1.0, 2.0], [-1.0, 3.1, 0.0]], [1e-2, 0.3, 1e-3]),
+    ],
+    ids=["box", "narrow", "points"],
+)
+def test_starts_however_narrow_are_drawn_where_they_are(start):
+    """Trajectories carry all the mass of `mu0`, and their weights are about the same."""
+    system = Cart(start=start)
+    x, weight = initial_points(system, 4096, 0, 0)
+    assert float(weight.mean()) == pytest.approx(1.0, abs=0.02)
+    assert effective_part(weight) > 0.3
+    assert not system.outside(x)[weight > 0.0].any()

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError, nearest, require_numbers, shown
-from ocp_torch.maths.mixture_fit import fitted_mixture
+from ocp_torch.maths.mixture_fit import FITTED_PART, fitted_mixture
+from ocp_torch.maths.mixtures import WIDEST, Mixture
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.physical.chart import Chart, smooth_step
 from ocp_torch.problems.physical.coordinates import Interval
@@ -22,6 +23,9 @@ KERNEL_MASS = 32.0 / 35.0
 STATES, UNCERTAIN, OUTSIDE = 2**13, 5e-3, 1e-3
 # Independent estimates, and Student's t quantile of their mean at the two-sided level 0.999 (7 degrees of freedom).
 REPLICATES, QUANTILE = 8, 5.4079
+# Starts in a range are drawn normally, with a deviation of that part of its half, where four of five weigh about the same; or
+# evenly where it fills at least that part of a turn.
+DEVIATION, MOST = 0.6, 0.75
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,14 @@ class _Ranges(Placed):
         factors = smooth_step((off - (half - edge)) / edge) / (2.0 * half - edge)
         return self.whole * factors.prod(dim=-1)
 
+    @property
+    def mixture(self) -> Mixture:
+        """A normal density over the ranges, which is flat along coordinates that fill most of a turn."""
+        length = self.chart.length[self.columns]
+        widths = torch.full_like(self.middle, WIDEST)
+        widths[self.columns] = torch.where(2.0 * self.half > MOST * length, WIDEST, DEVIATION * self.half / length)
+        return _normal(self.chart, self.middle.unsqueeze(0), widths)
+
 
 class _Bumps(Placed):
     def __init__(self, chart: Chart, points: Points) -> None:
@@ -107,6 +119,11 @@ class _Bumps(Placed):
         z = self.chart.wrapped(s[:, None] - self._like(s, "states", self.states)) / spread
         kernel = (1.0 - z.square()).clamp_min(0.0) ** 3 / (KERNEL_MASS * spread)
         return kernel.prod(dim=-1).mean(dim=-1)
+
+    @property
+    def mixture(self) -> Mixture:
+        """Normal densities of the deviation of the kernels, and a little more."""
+        return _normal(self.chart, self.states, (0.4 * self.spread / self.chart.length).clamp_max(WIDEST))
 
 
 class _Scaled:
@@ -134,6 +151,15 @@ class _Scaled:
 
     def __call__(self, s: Tensor) -> Tensor:
         return self.function(s) * (self.window(s) / (self.level * self.total))
+
+
+def _normal(chart: Chart, centres: Tensor, widths: Tensor) -> Mixture:
+    if bool((widths == WIDEST).all()):
+        return Mixture.uniform(len(widths))
+    count = len(centres)
+    return Mixture(
+        torch.full((count,), FITTED_PART / count).double(), chart.to_torus(centres), widths.expand(count, -1)
+    )
 
 
 def _mass(chart: Chart, density: Density) -> tuple[float, float]:

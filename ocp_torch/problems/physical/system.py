@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError, require_number, require_numbers
 from ocp_torch.maths import jets
+from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.problems.constant_noise import one_or_each
 from ocp_torch.problems.physical.chart import Chart
@@ -30,7 +31,7 @@ class System(Problem):
     and work in the precision and on the device of `s`; angles have no preferred turn, so functions of them are periodic.
 
     On the torus `x_i = (s_i - centre_i) / length_i` and `v_i = r_i^{1/q} u_i`. The model is exact in the box of the
-    intervals. Beyond, time slows down to a stop at the seam (`a`, `B` and `sigma` times a twice differentiable cut-off `chi`),
+    intervals. Beyond, time slows to a stop at the seam (`a`, `B` and `sigma` times a twice differentiable cut-off `chi`),
     which is never crossed, and the cost becomes ``failure_cost`` (`chi cost + (1 - chi) failure_cost`): leaving the box is a
     failure that costs so much for ever. By default that is the largest cost met in the box. Costs keep their unit.
 
@@ -169,6 +170,16 @@ class System(Problem):
         if self._density is None:
             self._density = start_density(self.chart, self.start)
         return self._density(self.from_torus(x)) * self.chart.volume
+
+    @property
+    def initial_mixture(self) -> Mixture | None:
+        if type(self).initial_density is not System.initial_density:
+            return None
+        return getattr(self._density, "mixture", None)
+
+    def outside(self, x: Tensor) -> Tensor:
+        """Whether states of the torus ``(N, d)`` are outside the box, where the model is slowed down, ``(N,)``."""
+        return self.chart.outside(self.from_torus(x))
 
     @cached_property
     @torch.no_grad()
