@@ -2,6 +2,7 @@ r"""A problem in physical units: what a user writes in radians, metres and newto
 
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from functools import cached_property
 
 import torch
@@ -97,6 +98,13 @@ class System(Problem):
     def from_controls(self, v: Tensor) -> Tensor:
         """Controls ``(N, m)`` of the torus problem in their units."""
         return v / self._like(v, "roots", self._roots)
+
+    @property
+    def units(self) -> dict:
+        """What states and controls are measured in, as JSON can hold it: ``scale`` is `v_i / u_i`."""
+        scales = self._roots.tolist()
+        controls = [{**asdict(c), "scale": scale} for c, scale in zip(self.controls, scales, strict=True)]
+        return {"coordinates": [asdict(c) for c in self.coordinates], "controls": controls}
 
     def state_cost(self, x: Tensor) -> Tensor:
         s = self.from_torus(x)
