@@ -134,6 +134,20 @@ def divergence(vector_field: Field, x: Tensor) -> Tensor:
     return torch.diagonal(jacobian, dim1=0, dim2=2).sum(dim=-1)
 
 
+def column_divergences(columns: Tensor, at: Tensor) -> Tensor:
+    """The divergence of each of the ``columns`` ``(N, d, m)``, which were made of the states ``at`` ``(N, d)``; ``(N, m)``. A
+    reverse pass for each entry: where they do not vary, as they are not in the graph, there is none."""
+    total = at.new_zeros(len(at), columns.shape[-1])
+    if not columns.requires_grad:
+        return total
+    for i, row in enumerate(columns.unbind(dim=-2)):
+        slopes = [
+            torch.autograd.grad(c.sum(), at, retain_graph=True, materialize_grads=True)[0][:, i] for c in row.unbind(-1)
+        ]
+        total += torch.stack(slopes, dim=-1)
+    return total
+
+
 def diffusion_divergences(noise: Callable[[Tensor], Any], x: Tensor) -> tuple[Tensor, Tensor]:
     """`div D` ``(N, d)``, with components `sum_j d_j D_ij`, and `div div D` ``(N,)``, of `D = sigma sigma^T / 2` for the
     field ``noise``, `sigma`: ``(N, d) -> (N, d, k)``."""

@@ -4,11 +4,14 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError
+from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.problems.physical.coordinates import Coordinate, Interval
 from ocp_torch.problems.placed import Placed
 
 # Coordinates of a state that a sentence shows, and the part of a turn by which rounding may carry a state beyond a seam.
 MOST_SHOWN, ROUNDING = 8, 1e-6
+# The number of the design of states spread over a box, and how many corners of it are among them at most.
+DESIGN, MOST_CORNERS = 31, 2**12
 
 
 def smooth_step(z: Tensor) -> Tensor:
@@ -92,6 +95,17 @@ class Chart(Placed):
         low = [c.low if isinstance(c, Interval) else -torch.inf for c in self.coordinates]
         high = [c.high if isinstance(c, Interval) else torch.inf for c in self.coordinates]
         return s.clamp(s.new_tensor(low), s.new_tensor(high))
+
+    def spread(self, count: int) -> Tensor:
+        """``count`` states spread over the box, and its corners where they are few, an angle there at 0 and half a period."""
+        ends = [(c.low, c.high) if isinstance(c, Interval) else (0.0, 0.5 * c.length) for c in self.coordinates]
+        low, high = (torch.tensor(side, dtype=torch.float64) for side in zip(*ends, strict=True))
+        turns = torch.tensor([1.0 if isinstance(c, Interval) else 2.0 for c in self.coordinates], dtype=torch.float64)
+        s = low + (high - low) * turns * scrambled_sobol(count, len(ends), DESIGN, torch.float64)
+        if 2 ** len(ends) > MOST_CORNERS:
+            return s
+        corners = torch.cartesian_prod(*(torch.tensor(pair, dtype=torch.float64) for pair in ends))
+        return torch.cat([s, corners.reshape(-1, len(ends))])
 
     def place(self, s: Tensor) -> str:
         """One state ``(d,)`` for a sentence, as in ``pole = 0.3 rad, velocity = 2 m/s``."""

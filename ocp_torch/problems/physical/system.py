@@ -1,6 +1,5 @@
 r"""A problem in physical units: what a user writes in radians, metres and newtons, made a problem on the torus."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import cached_property
@@ -8,18 +7,17 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError, require_number, require_numbers
+from ocp_torch.errors import InputError, require_number
 from ocp_torch.maths import jets
 from ocp_torch.maths.mixtures import Mixture
-from ocp_torch.maths.sampling import scrambled_sobol
-from ocp_torch.problems.constant_noise import one_or_each
 from ocp_torch.problems.physical.chart import Chart
-from ocp_torch.problems.physical.coordinates import Control, Coordinate, Interval, require_controls, require_coordinates
+from ocp_torch.problems.physical.coordinates import Control, Coordinate, require_controls, require_coordinates
+from ocp_torch.problems.physical.prices import scaled_limit, weight_roots
 from ocp_torch.problems.physical.start import Density, Start, start_density
 from ocp_torch.problems.problem import Problem
 
-# States at which the largest cost in the box is sought, the number of their design, and corners at most.
-COSTED, COST_DESIGN, MOST_CORNERS = 2**14, 31, 2**12
+# States at which the largest cost in the box is sought.
+COSTED = 2**14
 
 
 class System(Problem):
@@ -59,8 +57,8 @@ class System(Problem):
     ) -> None:
         self.coordinates, self.controls = require_coordinates(coordinates), require_controls(controls)
         q = require_number("problem.exponent", exponent, above=1.0, at_most=2.0)
-        roots = _roots(control_weight, len(self.controls), q)
-        limit = _scaled_limit(control_limit, roots)
+        roots = weight_roots(control_weight, len(self.controls), q)
+        limit = scaled_limit(control_limit, roots)
         super().__init__(len(self.coordinates), len(self.controls), discount, q, limit, noise)
         self.chart = Chart(self.coordinates)
         self.start = start
@@ -136,7 +134,7 @@ class System(Problem):
         at = self.from_torus(x).detach().requires_grad_(True)
         with torch.enable_grad():
             a, B = self.dynamics(at)
-            div_a, div_B = _divergences(a.unsqueeze(-1), at).squeeze(-1), _divergences(B, at)
+            div_a, div_B = jets.column_divergences(a.unsqueeze(-1), at).squeeze(-1), jets.column_divergences(B, at)
         s, a, B = at.detach(), a.detach(), B.detach()
         chi, slope = self.chart.cut_with_slope(s)
         div_a = chi * div_a + (slope * a).sum(dim=-1)
@@ -195,53 +193,4 @@ class System(Problem):
         """What a state at a seam costs."""
         if self.failure_cost is not None:
             return self.failure_cost
-        ends = [(c.low, c.high) if isinstance(c, Interval) else (0.0, 0.5 * c.length) for c in self.coordinates]
-        axes = [torch.tensor(pair, dtype=torch.float64) for pair in ends]
-        low, high = (torch.tensor(side, dtype=torch.float64) for side in zip(*ends, strict=True))
-        s = low + (high - low) * scrambled_sobol(COSTED, self.dim, COST_DESIGN, torch.float64)
-        # Half of an angle's turns are on the other side of 0.
-        mirrored = torch.tensor([-1.0 if not isinstance(c, Interval) else 1.0 for c in self.coordinates]).double()
-        corners = torch.cartesian_prod(*axes).reshape(-1, self.dim) if 2**self.dim <= MOST_CORNERS else s[:0]
-        return float(self.cost(torch.cat([s, s * mirrored, corners])).max())
-
-
-def _divergences(columns: Tensor, at: Tensor) -> Tensor:
-    """The divergence of each of the ``columns`` ``(N, d, m)``, a function of the states ``at`` ``(N, d)``; ``(N, m)``."""
-    total = at.new_zeros(len(at), columns.shape[-1])
-    if not columns.requires_grad:
-        return total
-    for i, row in enumerate(columns.unbind(dim=-2)):
-        slopes = [
-            torch.autograd.grad(c.sum(), at, retain_graph=True, materialize_grads=True)[0][:, i] for c in row.unbind(-1)
-        ]
-        total += torch.stack(slopes, dim=-1)
-    return total
-
-
-def _roots(weight: object, count: int, exponent: float) -> list[float]:
-    """`r_i^{1/q}` of each control."""
-    each = one_or_each("problem.control_weight", weight, count)
-    for value in each:
-        require_number("problem.control_weight", value, above=0.0)
-    if exponent != 2.0 and min(each) != max(each):
-        raise InputError(
-            f"problem.control_weight is {weight}, but must be the same for all controls with problem.exponent = "
-            f"{exponent:g}; with exponent 2 each may have its own."
-        )
-    return [value ** (1.0 / exponent) for value in each]
-
-
-def _scaled_limit(limit: object, roots: list[float]):
-    """``limit``, of `u`, as one of `v = roots u`."""
-    if limit is None:
-        return None
-    if isinstance(limit, Sequence) and not isinstance(limit, str):
-        each = require_numbers("problem.control_limit", limit, len(roots), above=0.0)
-        return [c * root for c, root in zip(each, roots, strict=True)]
-    number = require_number("problem.control_limit", limit, above=0.0)
-    if not math.isclose(min(roots), max(roots)):
-        raise InputError(
-            f"problem.control_limit is {number:g}, a limit on |u|, but the weights of the controls differ; give a list of "
-            f"{len(roots)} limits, one for each control."
-        )
-    return number * roots[0]
+        return float(self.cost(self.chart.spread(COSTED)).max())
