@@ -18,31 +18,38 @@ from ocp_torch.fields.embedding import FourierEmbedding
 
 @dataclass(frozen=True)
 class Along:
-    """The directions derivatives are taken along, and the noise as a quadratic form of such derivatives."""
+    """The directions derivatives are taken along: the columns of the noise, or else the coordinates."""
 
-    directions: Tensor | None  # (N, d, p); None for the coordinates, p = d
-    sigma: Tensor  # (N, d, k)
-    diagonal: Tensor | None  # (N, d): of D, where that is all of it and the directions are the coordinates
+    columns: Tensor | None = None  # (N, d, p): directions that are not coordinates
+    scales: Tensor | None = None  # (N, d): by which coordinates are multiplied, so that they are columns of the noise
+    sigma: Tensor | None = None  # (N, d, k): the noise, where directions are not its columns
 
     @classmethod
     def of(cls, sigma: Tensor) -> "Along":
         """The cheapest directions for the noise ``sigma`` ``(N, d, k)``."""
-        d, k = sigma.shape[1:]
-        if k < d:
-            return cls(sigma, sigma, None)
-        plain = d == k and torch.equal(sigma, torch.diag_embed(sigma.diagonal(dim1=1, dim2=2)))
-        return cls(None, sigma, 0.5 * sigma.diagonal(dim1=1, dim2=2).square() if plain else None)
+        if sigma.shape[2] < sigma.shape[1]:
+            return cls(columns=sigma)
+        scales = sigma.diagonal(dim1=1, dim2=2)
+        plain = sigma.shape[1] == sigma.shape[2] and torch.equal(sigma, torch.diag_embed(scales))
+        return cls(scales=scales) if plain and bool(scales.all()) else cls(sigma=sigma)
+
+    def derivatives(self, waves: Tensor, count: int) -> Tensor:
+        """The derivatives ``(p, N, J)`` of linear functions with gradients ``waves`` ``(J, d)`` at ``count`` states `N`."""
+        if self.columns is not None:
+            return torch.einsum("jd,ndp->pnj", waves, self.columns)
+        along = waves.T.unsqueeze(1).expand(-1, count, -1)
+        return along if self.scales is None else along * self.scales.T.unsqueeze(-1)
+
+    def gradient(self, slopes: Tensor) -> Tensor:
+        """The gradient ``(N, d)`` of what has derivatives ``slopes`` ``(d, N)`` along the coordinates."""
+        return slopes.T if self.scales is None else slopes.T / self.scales
 
     def form(self, left: Tensor, right: Tensor) -> Tensor:
         """`sum_ij D_ij left_i right_j` ``(N, F)`` of derivatives ``(p, N, F)``."""
-        if self.directions is not None:
-            return 0.5 * (left * right).sum(dim=0)
-        if self.diagonal is not None:
-            return (self.diagonal.T.unsqueeze(-1) * (left * right)).sum(dim=0)
-        driven = torch.einsum("ndk,dnf->knf", self.sigma, left)
-        return 0.5 * (driven * (driven if left is right else torch.einsum("ndk,dnf->knf", self.sigma, right))).sum(
-            dim=0
-        )
+        if self.sigma is not None:
+            driven = torch.einsum("ndk,dnf->knf", self.sigma, left)
+            left, right = driven, driven if left is right else torch.einsum("ndk,dnf->knf", self.sigma, right)
+        return 0.5 * (left * right).sum(dim=0)
 
 
 @dataclass(frozen=True)
@@ -59,8 +66,7 @@ class Sweep:
         value = embedding(x)
         cosines, sines = value.chunk(2, dim=-1)
         waves = 2.0 * math.pi * embedding.waves(x.shape[1]).to(x)  # (J, d)
-        coordinates = waves.T.unsqueeze(1).expand(-1, len(x), -1)
-        moved = coordinates if along.directions is None else torch.einsum("jd,ndp->pnj", waves, along.directions)
+        moved = along.derivatives(waves, len(x))
         bent = along.form(moved, moved).repeat(1, 2)
         return cls(value, torch.cat([-sines * moved, cosines * moved], dim=-1), -bent * value)
 
@@ -91,9 +97,9 @@ def _tanh(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _gelu(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    below = 0.5 * (1.0 + torch.erf(z / math.sqrt(2.0)))
-    density = torch.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
-    return nn.functional.gelu(z), below + z * density, (2.0 - z * z) * density
+    below, square = torch.special.ndtr(z), z * z
+    density = torch.exp(-0.5 * square - 0.5 * math.log(2.0 * math.pi))
+    return z * below, below + z * density, (2.0 - square) * density
 
 
 def _silu(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -112,9 +112,9 @@ class PeriodicMLP(nn.Module):
         if sigma is None:
             return reverse_jet(self, x)
         along = Along.of(sigma)
-        if along.directions is None:
+        if along.columns is None:
             swept = self._swept(x, along)
-            return Jet(swept.value, swept.slopes.T, swept.curvature)
+            return Jet(swept.value, along.gradient(swept.slopes), swept.curvature)
         curvature: list[Tensor] = []
 
         def value(at: Tensor) -> Tensor:
