@@ -1,6 +1,7 @@
 """A simple classical controller for each system, as a yardstick: tuned by hand once, not to any seed."""
 
-from functools import partial, singledispatch
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -28,17 +29,10 @@ PUMP, BALANCE, CATCH = 0.2, (20.0, 5.0), (0.5, 2.0)
 
 def classical_policy(problem: Problem) -> Policy | None:
     """The classical controller of ``problem``, or `None` where nobody has named one."""
-    control = classical_control.dispatch(type(problem))
-    return None if control is classical_control.dispatch(Problem) else partial(control, problem)
+    found = (control for kind, control in CONTROLS.items() if isinstance(problem, kind))
+    return next((partial(control, problem) for control in found), None)
 
 
-@singledispatch
-def classical_control(problem: Problem, x: Tensor) -> Tensor:
-    """The control ``(N, m)`` of the classical controller of ``problem`` at states ``(N, d)``."""
-    raise NotImplementedError
-
-
-@classical_control.register
 def resolved_rate(problem: Linkage, x: Tensor) -> Tensor:
     r"""`dtheta/dt = k J^+ (target - p)`, `J^+` the damped pseudo-inverse (Whitney, 1969; Nakamura and Hanafusa, 1986)."""
     damping = (DAMPING * problem.length) ** 2 or 1.0  # a tip on the last of its joints does not move: J = 0
@@ -54,7 +48,6 @@ def _bearing(problem: Unicycle | Dubins, x: Tensor) -> tuple[Tensor, Tensor]:
     return (way * ahead).sum(dim=-1), ahead[:, 0] * way[:, 1] - ahead[:, 1] * way[:, 0]
 
 
-@classical_control.register
 def go_to_goal(problem: Unicycle, x: Tensor) -> Tensor:
     """Speed in proportion to the way ahead, turn rate to the bearing of the nearer end, front or back."""
     along, across = _bearing(problem, x)
@@ -62,15 +55,12 @@ def go_to_goal(problem: Unicycle, x: Tensor) -> Tensor:
     return torch.stack([DRIVE * along / problem.speed, STEER * bearing / (TURN * problem.turn_rate)], dim=-1)
 
 
-@classical_control.register
 def pursue(problem: Dubins, x: Tensor) -> Tensor:
     """Turn rate in proportion to the bearing of the target."""
     along, across = _bearing(problem, x)
     return (STEER * torch.atan2(across, along) / (TURN * problem.turn_rate)).unsqueeze(-1)
 
 
-@classical_control.register(Kuramoto)
-@classical_control.register(PhaseNeurons)
 def descend(problem: Problem, x: Tensor) -> Tensor:
     r"""`u = -k B' grad f`: proportional feedback on how the stimulus changes the synchrony (for Kuramoto, the mean field)."""
     with torch.enable_grad():
@@ -79,7 +69,6 @@ def descend(problem: Problem, x: Tensor) -> Tensor:
     return -DESCENT / problem.discount * torch.einsum("ndm,nd->nm", problem.control_matrix(x), slope)
 
 
-@classical_control.register
 def energy_pump(problem: Pendulum, x: Tensor) -> Tensor:
     """Pump energy, then balance by proportional and derivative feedback (Astrom and Furuta, 2000); `|u| <= 1`."""
     angle, velocity = problem.from_torus(x).unbind(dim=-1)
@@ -89,3 +78,14 @@ def energy_pump(problem: Pendulum, x: Tensor) -> Tensor:
     balance = -(BALANCE[0] * angle + BALANCE[1] * velocity) / 3.0
     near = (angle.abs() < CATCH[0]) & (velocity.abs() < CATCH[1])
     return (torch.where(near, balance, pump) / problem.max_torque).clamp(-1.0, 1.0).unsqueeze(-1)
+
+
+# The control ``(N, m)`` at states ``(N, d)``, for each kind of problem that has one.
+CONTROLS: dict[type[Problem], Callable[..., Tensor]] = {
+    Linkage: resolved_rate,
+    Unicycle: go_to_goal,
+    Dubins: pursue,
+    Kuramoto: descend,
+    PhaseNeurons: descend,
+    Pendulum: energy_pump,
+}
