@@ -5,21 +5,28 @@ from ocp_torch.errors import InputError
 from ocp_torch.problems import PROBLEMS, Circle, Dataset, Manufactured, Problem, Simulator, Torus
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.control_limit import BoxLimitedCost, LimitedCost
+from ocp_torch.problems.physical.coordinates import Angle, Interval
+from ocp_torch.problems.physical.start import Points
+from ocp_torch.problems.physical.system import System
 from ocp_torch.runs.external import certify
 
 __version__ = "0.1.0"
 __all__ = [
     "PROBLEMS",
     "BoxLimitedCost",
+    "Angle",
     "Simulator",
     "Circle",
     "Controller",
     "Dataset",
     "InputError",
+    "Interval",
     "LimitedCost",
     "Manufactured",
+    "Points",
     "PowerCost",
     "Problem",
+    "System",
     "Torus",
     "certify",
     "load_controller",

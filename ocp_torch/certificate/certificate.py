@@ -26,7 +26,8 @@ class Certificate:
     them was found, ``speaks`` by name whether an upper bound is about the controller that is handed out. ``confidence`` is
     the level of the intervals; ``subject`` names the controller in ``perf`` that all this is about, by default the best of
     them. ``contradiction`` is the sentence that says why nothing counts, where two bounds exclude each other; ``refuted``
-    are the names of guesses that another bound excludes.
+    are the names of guesses that another bound excludes. ``outside`` is the part of the discounted time that the controller
+    spends outside the box of a system in physical units.
     """
 
     run: Run
@@ -44,6 +45,7 @@ class Certificate:
     perf_lower: dict[str, Estimate | None] = field(default_factory=dict)
     contradiction: str | None = None
     refuted: frozenset[str] = frozenset()
+    outside: Estimate | None = None
 
     def needs(self, name: str) -> tuple[Need, ...]:
         """What the bound ``name`` rests on; nothing for simulations, the truth, and names that nobody listed."""

@@ -15,6 +15,7 @@ from ocp_torch.certificate.estimate import Estimate, known_of
 from ocp_torch.certificate.external.controller import ControllerContext
 from ocp_torch.certificate.external.dataset import RecordedContext
 from ocp_torch.certificate.settings import CertificateSettings, Progress, Run, silent
+from ocp_torch.certificate.simulated.outside import outside_note
 from ocp_torch.certificate.trained import FieldsContext, Trained, TrainedContext
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import InputError
@@ -40,6 +41,7 @@ def certify(context: Context) -> Certificate:
     assumptions = context.assumptions  # before the lower side, whose `M` may follow from what is met here
     context.progress("bounds")
     lower = evaluated(LOWER)
+    outside = context.outside
     sides = {LOWER: lower, UPPER: upper, PERFORMANCE: perf_lower}
     certificate = Certificate(
         run=context.run,
@@ -60,12 +62,14 @@ def certify(context: Context) -> Certificate:
                 if estimate is not None and estimate.bias
             ),
             *context.remarks,
+            *outside_note(context.problem, outside),
         ],
         searches=list(dict.fromkeys(line for bound in bounds for line in bound.searches(context))),
         speaks={bound.name: bound.speaks(context) for bound in bounds if bound.side == UPPER},
         confidence=context.settings.confidence,
         subject=context.kind if context.recorded or context.external else None,
         perf_lower=perf_lower,
+        outside=outside,
     )
     return examined(certificate)
 

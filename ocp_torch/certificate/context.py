@@ -14,6 +14,7 @@ from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.settings import CertificateSettings, Progress, Run, silent
+from ocp_torch.certificate.simulated.outside import time_outside
 from ocp_torch.certificate.simulated.performance import Candidate, Simulated, simulate_candidates
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.upper.penalised import DensityBounds
@@ -127,6 +128,12 @@ class Context:
             return {}, None
         self.progress("simulation")
         return simulate_candidates(self.problem, candidates, self.settings, self.seed, best_only=not self.external)
+
+    @cached_property
+    def outside(self) -> Estimate | None:
+        """The part of the discounted time that the controller handed out spends outside the box of a system."""
+        handed_out = self.candidates.get(self.kind) if self.kind in self.simulated[0] else None
+        return handed_out and time_outside(self.problem, handed_out.policy, self.settings, self.seed)
 
     def bounds_of(
         self, policy: Policy, value: Field, log_occupation: Field, initial: list[float] | None

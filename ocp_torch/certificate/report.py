@@ -48,6 +48,7 @@ def to_dict(certificate: Certificate) -> dict:
         "share": certificate.share,
         "suboptimality": certificate.suboptimality,
         **({PERFORMANCE: {name: one(e) for name, e in below.items()}} if below else {}),
+        **({} if certificate.outside is None else {"outside_box": one(certificate.outside)}),
         "assumptions": {**certificate.assumptions.to_dict(), "hold": certificate.hold},
         "contradiction": certificate.contradiction,
         "warnings": list(certificate.warnings),
@@ -97,6 +98,11 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
         guesses = dict.fromkeys(visible(b["if"]) for b in certificate["lower"].values() if b and "if" in b)
         lines.append(f"gap, if {' and '.join(guesses)}: {100.0 * gap['conditional']:.4f}%, which rests on a guess")
     lines += in_words(certificate)
+    if (outside := certificate.get("outside_box")) is not None:
+        half = outside["interval"][1] - outside["value"]
+        lines.append(
+            f"outside the box: {100.0 * outside['value']:.3g} % of the discounted time (+- {100.0 * half:.1g})"
+        )
     lines += searches
     lines += [f"warning: {visible(warning)}" for warning in certificate["warnings"]]
     return "\n".join(lines)

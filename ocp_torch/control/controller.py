@@ -9,15 +9,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ocp_torch.control.described import described, problem_name, require_same
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, trained_policies
 from ocp_torch.errors import InputError, notes
 from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, MODELS, VALUE, Fields
 from ocp_torch.files.limits import require_held, require_modest_problem
-from ocp_torch.files.storage import finite, load_tensors, save_tensors
+from ocp_torch.files.storage import load_tensors, save_tensors
 from ocp_torch.problems import PROBLEMS, Problem
 from ocp_torch.problems.checks.check import check_once
 from ocp_torch.problems.commands import ForeignProblem, current_name, current_section, made_by, naming
 from ocp_torch.problems.constants import Constants
+from ocp_torch.problems.physical.system import System
 
 # Of `controller.safetensors`; raised when an older version could not read what is written.
 SCHEMA = 1
@@ -53,41 +55,41 @@ class Controller:
         """Controls ``(N, m)`` at states ``(N, d)``: any reals, wrapped to the torus; NumPy in gives NumPy out.
 
         Raises `InputError` for another shape."""
-        states = torch.as_tensor(x)
-        if states.ndim != 2 or states.shape[1] != self.problem.dim:
-            raise InputError(f"x has shape {tuple(states.shape)}, but must have shape (N, {self.problem.dim}).")
-        if not states.is_floating_point():
-            states = states.double()
+        states = self._states("x", x)
         with torch.no_grad():
             # Wrapped before it is rounded, so that states far from the unit cell keep their place in it.
             u = self._policy(states.remainder(1.0).to(self._like))
         return u.cpu().numpy() if isinstance(x, np.ndarray) else u
 
+    def physical(self, s: States) -> States:
+        """Controls ``(N, m)`` at states ``(N, d)``, both in the units of a `System`; beyond its box what they are at the
+        nearest state of it. Raises `InputError` for another shape, and for a problem without physical units."""
+        if not isinstance(self.problem, System):
+            raise InputError(
+                f"the problem {problem_name(self.problem)} has no physical units; give states of the torus to controller(x)."
+            )
+        states = self._states("s", s)
+        u = self.problem.from_controls(self(self.problem.to_torus(self.problem.chart.nearest(states))))
+        return u.cpu().numpy() if isinstance(s, np.ndarray) else u
+
+    def _states(self, name: str, given: States) -> Tensor:
+        """``given`` as floats, if it is of shape ``(N, d)``."""
+        states = torch.as_tensor(given)
+        if states.ndim != 2 or states.shape[1] != self.problem.dim:
+            raise InputError(f"{name} has shape {tuple(states.shape)}, but must have shape (N, {self.problem.dim}).")
+        return states if states.is_floating_point() else states.double()
+
     def save(self, path: str | Path) -> None:
         """Write `controller.safetensors`: weights, and as JSON everything needed to build the controller again."""
         metadata = {
             "schema": SCHEMA,
-            "problem": {"name": problem_name(self.problem), "parameters": plain_parameters(self.problem.parameters)},
+            "problem": described(self.problem),
             "dtype": str(self._like.dtype).removeprefix("torch."),
             "fields": list(self.fields.networks),
             "bounds": asdict(self.constants),
             **{name: getattr(self, name) for name in PLAIN},
         }
         save_tensors(Path(path), dict(self.fields.state_dict()), metadata)
-
-
-def problem_name(problem: Problem) -> str:
-    """The name of a built-in problem, or the class name of a user's own in lower case (with its module if that is taken)."""
-    cls = type(problem)
-    own = cls.__name__.lower()
-    return next((n for n, c in PROBLEMS.items() if c is cls), own if own not in PROBLEMS else f"{cls.__module__}.{own}")
-
-
-def plain_parameters(parameters: dict) -> dict:
-    """Those of a problem's ``parameters`` that JSON can hold. Others only a user's own problem has, which is handed in on
-    loading."""
-    listed = {k: list(v) if isinstance(v, tuple) else v for k, v in parameters.items()}
-    return {k: v for k, v in listed.items() if isinstance(v, bool | int | float | str | list | type(None))}
 
 
 def load_controller(path: str | Path, problem: Problem | None = None, device: str = "cpu") -> Controller:
@@ -145,7 +147,7 @@ def _rebuilt(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
     if shapes != {name: t.shape for name, t in tensors.items()}:
         fit = f"its weights are not those of its model on a problem of dimension {problem.dim}"
         raise InputError(f"{path} does not fit: {fit}.")
-    _require_same_arguments(path, problem, saved["parameters"])
+    require_same(path, problem, saved)
     dtype = metadata["dtype"]
     if dtype not in ("float32", "float64"):
         raise InputError(f"{path} has dtype {dtype!r}, but must have float32 or float64.")
@@ -168,17 +170,6 @@ def _section(saved: dict, config: dict) -> dict:
     name = str(current_name(saved["name"], config.get("problem")))
     same = target.rpartition(".")[2].lower() == name.rpartition(".")[2]
     return section if same else saved["parameters"]
-
-
-def _require_same_arguments(path: Path, problem: Problem, saved: dict) -> None:
-    """Raise `InputError` where ``problem`` is not made as that of the run was."""
-    given = finite(plain_parameters(problem.parameters))
-    for name in given.keys() & saved.keys() - set(problem.incidental):
-        if given[name] != saved[name]:
-            raise InputError(
-                f"problem.{name} is {given[name]!r}, but the run of {path} has {repr(saved[name])[:80]}; a controller is "
-                "loaded with the problem it was trained for."
-            )
 
 
 def _require_run(path: Path, certificate: object, config: object) -> None:

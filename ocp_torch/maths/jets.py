@@ -134,15 +134,33 @@ def divergence(vector_field: Field, x: Tensor) -> Tensor:
     return torch.diagonal(jacobian, dim1=0, dim2=2).sum(dim=-1)
 
 
+def column_divergences(columns: Tensor, at: Tensor) -> Tensor:
+    """The divergence of each of the ``columns`` ``(N, d, m)``, which were made of the states ``at`` ``(N, d)``; ``(N, m)``. A
+    reverse pass for each entry: where they do not vary, as they are not in the graph, there is none."""
+    total = at.new_zeros(len(at), columns.shape[-1])
+    if not columns.requires_grad:
+        return total
+    for i, row in enumerate(columns.unbind(dim=-2)):
+        slopes = [
+            torch.autograd.grad(c.sum(), at, retain_graph=True, materialize_grads=True)[0][:, i] for c in row.unbind(-1)
+        ]
+        total += torch.stack(slopes, dim=-1)
+    return total
+
+
 def diffusion_divergences(noise: Callable[[Tensor], Any], x: Tensor) -> tuple[Tensor, Tensor]:
     """`div D` ``(N, d)``, with components `sum_j d_j D_ij`, and `div div D` ``(N,)``, of `D = sigma sigma^T / 2` for the
     field ``noise``, `sigma`: ``(N, d) -> (N, d, k)``."""
 
     def row_divergence(y: Tensor) -> Tensor:
-        D = lambda z: 0.5 * torch.einsum("nik,njk->nij", noise(z), noise(z)).flatten(1)
-        d = y.shape[1]
-        _, jacobian = value_and_jacobian(D, y)  # (d d, N, d)
-        return torch.einsum("ijnj->ni", jacobian.unflatten(0, (d, d)))
+        # Of sigma_ik sigma_jk / 2 by the product rule: d k reverse passes, where D itself would take d^2.
+        flat, jacobian = value_and_jacobian(lambda z: noise(z).flatten(1), y)
+        sigma, slope = (
+            flat.unflatten(1, (y.shape[1], -1)),
+            jacobian.unflatten(0, (y.shape[1], -1)),
+        )  # slope (i, k, N, j)
+        along = torch.einsum("njk,iknj->ni", sigma, slope)
+        return 0.5 * (along + torch.einsum("nik,jknj->ni", sigma, slope))
 
     div_D, jacobian = value_and_jacobian(row_divergence, x)
     return div_D, torch.einsum("ini->n", jacobian)

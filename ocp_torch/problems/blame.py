@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError, ProblemError
+from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
 
 PACKAGE = Path(__file__).resolve().parent.parent
@@ -19,6 +20,8 @@ LIBRARIES = tuple(
     {str(PACKAGE), str(PACKAGE.parent / "scripts"), str(Path(torch.__file__).resolve().parent.parent)}
     | {sysconfig.get_paths()[key] for key in ("stdlib", "platstdlib", "purelib", "platlib")}
 )
+# What a user writes of physical states.
+PHYSICAL = ("cost", "dynamics", "disturbance")
 # Coordinates of a state, and signs of a message, that a sentence shows.
 MOST_SHOWN, LONGEST = 8, 300
 
@@ -111,7 +114,11 @@ def _at(frame: FrameType, owner: object) -> str:
         state = failing_state(function, x.detach()) if x.ndim == 2 else None
     except Exception:  # a tensor of a transform that is over
         return ""
-    return "" if state is None else f" at {place(state)}"
+    if state is None:
+        return ""
+    if isinstance(owner, System) and code.co_name in PHYSICAL:
+        return f" at {owner.chart.place(state)}"
+    return f" at {place(state)}"
 
 
 def _is_users(file: str, of: type | None) -> bool:

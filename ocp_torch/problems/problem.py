@@ -12,10 +12,12 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError, require_integer, require_number
 from ocp_torch.maths import jets
+from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.constant_noise import column_matrix, constant_diffusion
 from ocp_torch.problems.control_limit import Limit, control_cost
+from ocp_torch.problems.placed import Placed
 from ocp_torch.problems.reproducible import Reproducible
 from ocp_torch.problems.samples import Samples
 
@@ -44,7 +46,7 @@ class Lipschitz:
     noise: float | None = None
 
 
-class Problem(Reproducible):
+class Problem(Reproducible, Placed):
     """Base class: override `state_cost`, and whatever else differs from `dx/dt = u` with a uniform start.
 
     All methods are batched, take states ``(N, d)``, work in the precision and on the device of their argument, and have
@@ -92,7 +94,6 @@ class Problem(Reproducible):
         self.lipschitz: Lipschitz | None = None
         self.diffusion = constant_diffusion(noise, self.dim)
         self._sigma = column_matrix(self.diffusion)
-        self._placed: dict = {}
 
     def state_cost(self, x: Tensor) -> Tensor:
         """Running state cost `f >= 0`, ``(N,)``. The one method every problem must override."""
@@ -143,6 +144,11 @@ class Problem(Reproducible):
         return torch.ones_like(x[:, 0])
 
     @property
+    def initial_mixture(self) -> Mixture | None:
+        """A density to draw starts from, of which `mu0` is nowhere a large multiple; `None` where one has to be found."""
+        return None
+
+    @property
     def scan_factor(self) -> int:
         """How many states are scanned for narrow features of the data, for each at which a bound is evaluated. The package's
         own problems have none narrower than those states show."""
@@ -167,6 +173,12 @@ class Problem(Reproducible):
         along = lambda e: torch.func.jvp(self.control_matrix, (x,), (e.expand_as(x),))[1]
         tangents = torch.func.vmap(along)(basis)  # (d, N, d, m): derivative of B along coordinate i
         return torch.einsum("inim->nm", tangents)
+
+    def vector_fields(self, x: Tensor, divergences: bool = True) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+        """`a`, `B` and their divergences (`None` where unknown, or where no ``divergences`` are asked for): what `drift`,
+        `control_matrix`, `drift_divergence` and `control_divergence` give, for a class that has them from one evaluation."""
+        div_a, div_B = (self.drift_divergence(x), self.control_divergence(x)) if divergences else (None, None)
+        return self.drift(x), self.control_matrix(x), div_a, div_B
 
     @property
     def unknown_divergences(self) -> str:
@@ -236,10 +248,3 @@ class Problem(Reproducible):
     def _unknown(self, env: str) -> InputError:
         must = "it must define from_observation and to_action"
         return InputError(f"{type(self).__name__} does not know the environment {env}: {must}.")
-
-    def _like(self, x: Tensor, name: str, constant: Tensor) -> Tensor:
-        """``constant`` in the precision and on the device of ``x``, converted once."""
-        key = (name, x.dtype, x.device)
-        if key not in self._placed:
-            self._placed[key] = constant.to(x)
-        return self._placed[key]

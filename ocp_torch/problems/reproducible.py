@@ -6,6 +6,8 @@ import inspect
 class Reproducible:
     """Remembers what it was made of, so that ``type(x)(**x.parameters)`` makes it again."""
 
+    # Arguments whose attributes of the same name hold something else.
+    not_arguments: tuple[str, ...] = ()
     _given: tuple[tuple, dict]  # what `__init__` was called with
 
     def __new__(cls, *args, **kwargs) -> "Reproducible":
@@ -23,4 +25,5 @@ class Reproducible:
         found = dict(list(bound.arguments.items())[1:])
         for name in (n for n, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD):
             found |= found.pop(name)
-        return {name: vars(self).get(name, value) for name, value in found.items()}
+        kept = {name: value for name, value in vars(self).items() if name not in self.not_arguments}
+        return {name: kept.get(name, value) for name, value in found.items()}

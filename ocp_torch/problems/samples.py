@@ -42,15 +42,16 @@ class Samples:
         noise = problem.noise(x)
         spread = problem.noise_divergences(x) if divergences and noise is not None else None
         div_D, div_div_D = spread or (None, None)
+        a, B, div_a, div_B = problem.vector_fields(x, divergences)
         return cls(
             x=x,
             f=problem.state_cost(x),
-            a=problem.drift(x),
-            B=problem.control_matrix(x),
+            a=a,
+            B=B,
             mu0=problem.initial_density(x),
             weight=torch.ones_like(x[:, 0]) if weight is None else weight,
-            div_a=problem.drift_divergence(x) if divergences else None,
-            div_B=problem.control_divergence(x) if divergences else None,
+            div_a=div_a,
+            div_B=div_B,
             noise=noise,
             div_D=div_D,
             div_div_D=div_div_D,
@@ -62,7 +63,8 @@ class Samples:
         without start and divergences."""
         one = torch.ones_like(x[:, 0])
         with torch.set_grad_enabled(x.requires_grad and torch.is_grad_enabled()):
-            f, a, B, noise = problem.state_cost(x), problem.drift(x), problem.control_matrix(x), problem.noise(x)
+            a, B, _, _ = problem.vector_fields(x, divergences=False)
+            f, noise = problem.state_cost(x), problem.noise(x)
         return cls(x, f, a, B, one, one, noise=noise)
 
     def __len__(self) -> int:

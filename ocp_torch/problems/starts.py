@@ -31,7 +31,7 @@ ASKED = 2**12
 
 def start_distribution(problem: Problem) -> Mixture:
     """The density starts are drawn from: near `mu0` and spikes of `f`, and uniform where both are broad."""
-    density, cost = _fits(problem)
+    density, cost = fits(problem)
     if density.is_uniform:
         return cost.scaled(SPIKE_STARTS)
     spikes = [] if cost.is_uniform else [cost.scaled(SPIKE_STARTS)]
@@ -40,14 +40,14 @@ def start_distribution(problem: Problem) -> Mixture:
 
 def evaluation_distribution(problem: Problem) -> Mixture:
     """The density states are drawn from at which bounds are evaluated; uniform where neither `mu0` nor `f` is narrow."""
-    narrow = [d for d in _fits(problem) if not d.is_uniform]
+    narrow = [d for d in fits(problem) if not d.is_uniform]
     parts = [d.scaled((1.0 - UNIFORM_STATES) / len(narrow)) for d in narrow]
     return Mixture.join([Mixture.uniform(problem.dim), *parts])
 
 
 def starts_narrowly(problem: Problem) -> bool:
     """Whether hardly any uniform state carries mass of `mu0`."""
-    return not _fits(problem)[0].is_uniform
+    return not fits(problem)[0].is_uniform
 
 
 @torch.no_grad()
@@ -67,12 +67,14 @@ def drawn_starts(problem: Problem, count: int, seed: int) -> Tensor:
     return x[torch.multinomial(weight, count, replacement=True, generator=generator)]
 
 
-def _fits(problem: Problem) -> tuple[Mixture, Mixture]:
+def fits(problem: Problem) -> tuple[Mixture, Mixture]:
     """The densities fitted to `mu0` and to `f`; found once for a problem."""
     kept = vars(problem)
     if "_fits" not in kept:
         everywhere = getattr(problem.initial_density, "__func__", None) is Problem.initial_density
         fit = partial(fitted_mixture, dim=problem.dim, scanned=ASKED if isinstance(problem, Simulator) else SCANNED)
-        density = Mixture.uniform(problem.dim) if everywhere else fit(problem.initial_density)
+        density = (
+            Mixture.uniform(problem.dim) if everywhere else problem.initial_mixture or fit(problem.initial_density)
+        )
         kept["_fits"] = density, fit(problem.state_cost, broad=BROAD_COST)
     return kept["_fits"]

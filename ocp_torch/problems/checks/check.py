@@ -13,9 +13,17 @@ from ocp_torch.errors import ProblemError, require_integer, require_number, show
 from ocp_torch.problems.blame import named
 from ocp_torch.problems.checks.functions import Functions
 from ocp_torch.problems.checks.mass import require_mass
-from ocp_torch.problems.checks.sameness import require_differentiable, require_period, require_purity, require_still
+from ocp_torch.problems.checks.physical import SystemFunctions, require_turns
+from ocp_torch.problems.checks.sameness import (
+    Answers,
+    require_differentiable,
+    require_period,
+    require_purity,
+    require_still,
+)
 from ocp_torch.problems.checks.values import require_divergences, require_finite, require_kept_noise, require_signs
 from ocp_torch.problems.control_limit import control_cost
+from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import MOST_COORDINATES, Problem
 from ocp_torch.problems.simulator.simulator import Simulator
 
@@ -41,20 +49,14 @@ def check_once(problem: Problem) -> None:
     simulator = isinstance(problem, Simulator)
     if simulator or not type(problem).__module__.startswith("ocp_torch."):
         with torch.random.fork_rng(devices=[]), torch.no_grad():
+            if isinstance(problem, System):
+                require_system(SystemFunctions(problem))
             _check(Functions(problem, simulator))
     require_units(problem)
 
 
 def _check(functions: Functions) -> None:
-    for dtype in (torch.float64, torch.float32):
-        for size in SIZES:
-            x = functions.states(size).to(dtype)
-            for name in functions.forms:
-                functions.given(name, x)
-            functions.require_silence(x)
-    first = require_purity(functions)
-    if not functions.simulator:
-        require_differentiable(functions)
+    first = _require_functions(functions)
     for require in (
         require_finite,
         require_period,
@@ -65,6 +67,28 @@ def _check(functions: Functions) -> None:
     ):
         require(functions)
     require_still(functions, first)
+
+
+def require_system(functions: SystemFunctions) -> None:
+    """Raise where what a user wrote of a system, in physical units, is not what `System` says."""
+    first = _require_functions(functions)
+    for require in (require_finite, require_turns, require_signs):
+        require(functions)
+    require_still(functions, first)
+
+
+def _require_functions(functions: Functions) -> Answers:
+    """They are functions of the state, of the right shapes; and what was first answered."""
+    for dtype in (torch.float64, torch.float32):
+        for size in SIZES:
+            x = functions.states(size).to(dtype)
+            for name in functions.forms:
+                functions.given(name, x)
+            functions.require_silence(x)
+    first = require_purity(functions)
+    if not functions.simulator:
+        require_differentiable(functions)
+    return first
 
 
 def require_made(problem: Problem) -> None:

@@ -33,8 +33,12 @@ class Functions:
     """The functions of ``problem`` by name; ``simulator`` where each state may cost milliseconds.
 
     ``name`` is the class as a command line has it, ``count`` the number of states for checks that need many, ``forms`` the
-    shapes of all there are and ``data`` of those that must be there.
+    shapes of all there are and ``data`` of those that must be there; ``cost`` and ``density`` are the names of what is not
+    negative and ``sigma`` that of the noise, ``where`` says where all of it is finite.
     """
+
+    cost, density, sigma = "state_cost", "initial_density", NOISE
+    own_forms, own_data, spread, where = FORMS, DATA, SPREAD, "on the whole torus"
 
     def __init__(self, problem: Problem, simulator: bool) -> None:
         self.problem, self.simulator = problem, simulator
@@ -43,14 +47,19 @@ class Functions:
         entries = problem.dim * problem.control_dim
         most = STATES_OF_A_SIMULATOR if simulator else STATES
         self.count = max(FEWEST_STATES, min(most, MOST_ENTRIES // entries))
-        self.forms, self.data = FORMS, DATA
-        first = self.called(problem.noise, self.states(FEWEST_STATES), NOISE)
+        self.forms, self.data = self.own_forms, self.own_data
+        first = self.called(self.function(self.sigma), self.states(FEWEST_STATES), self.sigma)
         self.noisy = first is not None
         if self.noisy:
             self.sizes["k"] = max(1, *first.shape[2:3]) if isinstance(first, Tensor) and first.ndim == 3 else 1
-            self.data = {**DATA, NOISE: "dk"}
+            self.data = {**self.own_data, self.sigma: "dk"}
             # Those of a simulator are differences of its own.
-            self.forms = {**FORMS, **self.data, **({} if simulator else SPREAD)}
+            self.forms = {**self.own_forms, **self.data, **({} if simulator else self.spread)}
+
+    def place(self, x: Tensor) -> str:
+        """One state ``(d,)`` of the torus for a sentence, in physical units where the problem has some."""
+        chart = getattr(self.problem, "chart", None)
+        return place(x) if chart is None else chart.place(chart.from_torus(x.unsqueeze(0))[0])
 
     def states(self, count: int, design: int = 0) -> Tensor:
         """Evenly spread states, ``(count, d)`` float64."""
@@ -62,10 +71,10 @@ class Functions:
 
     def require_silence(self, x: Tensor) -> None:
         """Where there is no noise at some states there is none at ``x``."""
-        if not self.noisy and self.called(self.problem.noise, x.clone(), NOISE) is not None:
+        if not self.noisy and self.called(self.function(self.sigma), x.clone(), self.sigma) is not None:
             raise ProblemError(
-                f"noise of {self.name} gives None for some states and a matrix for others; it must give None always, or "
-                "always a matrix of shape (N, d, k), which may be 0."
+                f"{self.sigma} of {self.name} gives None for some states and a matrix for others; it must give None always, "
+                "or always a matrix of shape (N, d, k), which may be 0."
             )
 
     def ask(self, name: str, x: Tensor) -> Tensor:
@@ -112,7 +121,7 @@ class Functions:
             raise
         except (Exception, SystemExit) as error:  # whatever a stranger's code may raise
             state = failing_state(function, x)
-            at = f"states of shape {tuple(x.shape)} in {_kind(x)}" if state is None else place(state)
+            at = f"states of shape {tuple(x.shape)} in {_kind(x)}" if state is None else self.place(state)
             where = origin(error, type(self.problem))
             raise ProblemError(f"{name} of {self.name} raised {words(error)} at {at}{where}.") from None
 

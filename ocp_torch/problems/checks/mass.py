@@ -11,6 +11,7 @@ from ocp_torch.errors import ProblemError
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import Branch, derive_seed, fixed_generator
 from ocp_torch.problems.checks.functions import Functions
+from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.simulator import Simulator
 
@@ -62,8 +63,8 @@ class Mass:
 def require_mass(functions: Functions) -> None:
     """Raise where `mu0` certainly does not integrate to 1."""
     problem = functions.problem
-    uniform = type(problem).initial_density is Problem.initial_density
-    if uniform or (isinstance(problem, Simulator) and not problem._oracle.gives_mu0):
+    known = type(problem).initial_density in (Problem.initial_density, System.initial_density)
+    if known or (isinstance(problem, Simulator) and not problem._oracle.gives_mu0):
         return
     found = sampled_mass(lambda x: functions.ask("initial_density", x), problem.dim, functions.count // 4)
     if found.wrong:

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from ocp_torch.errors import ProblemError
 from ocp_torch.maths.seeds import fixed_generator
-from ocp_torch.problems.blame import place
 from ocp_torch.problems.checks.functions import Functions
 
 # Answers that differ by more than that part of the largest are not the same; rounding in single precision stays below.
@@ -54,7 +53,7 @@ def require_differentiable(functions: Functions) -> None:
     x = functions.states(DIFFERENTIATED, DIFFERENTIATED_DESIGN)
     for name in functions.data:
         with torch.enable_grad():
-            function = getattr(functions.problem, name)
+            function = functions.function(name)
             functions.called(lambda at, f=function: f(at.requires_grad_(True)), x.clone(), name)
 
 
@@ -64,10 +63,10 @@ def require_period(functions: Functions) -> None:
     whole = torch.randint(LOWEST, HIGHEST + 1, x.shape, generator=fixed_generator()).to(x)
     for name in functions.data:
         here = functions.ask(name, x)
-        worst, change = _worst((here - functions.ask(name, x + whole)).abs())
+        worst, change = worst_of((here - functions.ask(name, x + whole)).abs())
         if not change <= SAME * float(here.abs().max()):
             raise ProblemError(
-                f"{name} of {functions.name} is not periodic: at {place(x[worst])} it changes by {change:.3g} when "
+                f"{name} of {functions.name} is not periodic: at {functions.place(x[worst])} it changes by {change:.3g} when "
                 f"the whole numbers {[int(k) for k in whole[worst][:MOST_SHOWN]]} are added to x, but it must have period 1 "
                 "in each coordinate; x = x.remainder(1.0) first makes it so."
             )
@@ -80,12 +79,14 @@ def _require_same(
     whole = one if whole is None else whole
     size = float(torch.cat([whole, other]).nan_to_num(0.0, 0.0, 0.0).abs().max())
     alike = (one == other) | (one.isnan() & other.isnan())  # what is not finite is told elsewhere
-    worst, change = _worst(torch.where(alike, 0.0, (one - other).abs()))
+    worst, change = worst_of(torch.where(alike, 0.0, (one - other).abs()))
     if not change <= SAME * size:
-        raise ProblemError(f"{name} of {functions.name} {how}: at {place(x[worst])} it differs by {change:.3g}.")
+        raise ProblemError(
+            f"{name} of {functions.name} {how}: at {functions.place(x[worst])} it differs by {change:.3g}."
+        )
 
 
-def _worst(changes: Tensor) -> tuple[int, float]:
+def worst_of(changes: Tensor) -> tuple[int, float]:
     """The row of ``changes`` ``(N, ...)`` that holds the largest of them or a NaN, and that number."""
     change = changes.reshape(len(changes), -1).amax(dim=-1)
     worst = int(change.nan_to_num(nan=math.inf).argmax())

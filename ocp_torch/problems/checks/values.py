@@ -8,7 +8,6 @@ from torch import Tensor
 
 from ocp_torch.errors import ProblemError
 from ocp_torch.maths.supremum import supremum
-from ocp_torch.problems.blame import place
 from ocp_torch.problems.checks.functions import DIV_D, DIV_DIV_D, NOISE, Functions
 from ocp_torch.problems.problem import Problem
 
@@ -47,8 +46,8 @@ def require_finite(functions: Functions) -> None:
                 if bool(bad.any()):
                     at = int(bad.nonzero()[0])
                     raise ProblemError(
-                        f"{name} of {functions.name} gives {values[at].tolist()}{how} at {place(x[at])}, but must be finite "
-                        "on the whole torus."
+                        f"{name} of {functions.name} gives {values[at].tolist()}{how} at {functions.place(x[at])}, but must "
+                        f"be finite {functions.where}."
                     )
 
 
@@ -65,26 +64,27 @@ def _special(functions: Functions) -> Tensor:
 def require_signs(functions: Functions) -> None:
     """`f >= 0` and `mu0 >= 0`, at states and downhill from the least; and `f` within the bound the problem declares."""
     x = functions.states(functions.count, SIGN)
-    largest, at = _require_sign(functions, "state_cost", x, "; a constant added to it changes no optimal control.")
+    largest, at = _require_sign(functions, functions.cost, x, "; a constant added to it changes no optimal control.")
     bound = functions.problem.state_cost_bound
     if bound is not None and not largest <= bound + ROUNDING * abs(largest):
         raise ProblemError(
-            f"state_cost of {functions.name} is {largest:.6g} at {place(at)}, above its state_cost_bound = "
+            f"{functions.cost} of {functions.name} is {largest:.6g} at {functions.place(at)}, above its state_cost_bound = "
             f"{float(bound):.6g}."
         )
-    _require_sign(functions, "initial_density", x, ".")
+    if functions.density:
+        _require_sign(functions, functions.density, x, ".")
 
 
 def _require_sign(functions: Functions, name: str, x: Tensor, hint: str) -> tuple[float, Tensor]:
     """The function ``name`` is not negative; the largest size of its values at ``x``, and where it is largest."""
-    function = getattr(functions.problem, name)
+    function = functions.function(name)
     values = functions.ask(name, x)
     lowest = x[values.topk(min(DESCENTS, len(x)), largest=False).indices]
     found = supremum(lambda at: -function(at), lowest, ascents=DESCENTS, steps=STEPS, differentiable=False)
     least, largest = -found.value, float(values.abs().max())
     if not least >= -ROUNDING * largest:
         raise ProblemError(
-            f"{name} of {functions.name} is {least:.6g} at {place(found.x)}, but must be at least 0{hint}"
+            f"{name} of {functions.name} is {least:.6g} at {functions.place(found.x)}, but must be at least 0{hint}"
         )
     return largest, x[int(values.argmax())]
 
@@ -102,8 +102,8 @@ def require_kept_noise(functions: Functions) -> None:
     if float(least.min()) < -ROUNDING * float(square.abs().max()):
         raise ProblemError(
             f"noise(x) of {functions.name} leaves out the noise that its __init__ gives to super().__init__(noise=..) or "
-            f"add_noise, at {place(x[int(least.argmin())])} for one; it must hold the columns of super().noise(x) beside its "
-            "own (torch.cat(.., dim=-1)), or nothing must be given there."
+            f"add_noise, at {functions.place(x[int(least.argmin())])} for one; it must hold the columns of super().noise(x) "
+            "beside its own (torch.cat(.., dim=-1)), or nothing must be given there."
         )
 
 
@@ -128,9 +128,9 @@ def require_divergences(functions: Functions) -> None:
         if 2 * int(settled.sum()) > len(x) and 2 * int(wrong.sum()) > int(settled.sum()):
             at = int((off * wrong).argmax())
             raise ProblemError(
-                f"{name} of {functions.name} is {_listed(claimed[at])} at {place(x[at])}, but by differences of {source} it "
-                f"is {_listed(fine[at])}; give the divergence of {source}, or None where it is not known (as where "
-                f"{source} detaches x or leaves PyTorch, which loses its derivative)."
+                f"{name} of {functions.name} is {_listed(claimed[at])} at {functions.place(x[at])}, but by differences of "
+                f"{source} it is {_listed(fine[at])}; give the divergence of {source}, or None where it is not known (as "
+                f"where {source} detaches x or leaves PyTorch, which loses its derivative)."
             )
 
 

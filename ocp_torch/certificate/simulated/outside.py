@@ -1,0 +1,64 @@
+"""What part of the discounted time a controller spends outside the box of a system, where the model is not the user's."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
+from ocp_torch.certificate.settings import CertificateSettings
+from ocp_torch.certificate.simulated.performance import BASELINE_PART, simulate_performance
+from ocp_torch.control.policies import Policy, zero_policy
+from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.problems.physical.system import System
+from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.starts import fits
+
+# A part of the time above this is worth a warning; and how exact the part of one trajectory has to be.
+MUCH, TOLERANCE = 0.01, 2e-3
+# The control variate, a number: near to what the clock shows in the box, so that the weights of the starts add little noise.
+LEVEL = 1.05
+
+
+class _Clock(ClosedLoop):
+    """The closed loop, at a rate of 1 in the box and of 2 outside: a simulation of what it costs is one of where it is."""
+
+    def __init__(self, problem: System, policy: Policy) -> None:
+        super().__init__(problem, policy)
+        self.system = problem
+        self._fits = fits(problem)  # it starts where the problem does
+
+    def state_cost(self, x: Tensor) -> Tensor:
+        return torch.where(self.system.outside(x), 2.0, 1.0).to(x)
+
+
+def time_outside(problem: Problem, policy: Policy, settings: CertificateSettings, seed: int) -> Estimate | None:
+    """`E[rho int e^{-rho t} 1[x_t is outside the box] dt]` along the closed loop of ``policy``; `None` where there is no box
+    or nothing is simulated."""
+    if not isinstance(problem, System) or not problem.chart.boxed or not settings.trajectories:
+        return None
+    loop = _Clock(problem, policy)
+    effort = max(2, settings.trajectories // BASELINE_PART), settings.replicates, seed
+    found = simulate_performance(
+        loop,
+        zero_policy(loop),
+        *effort,
+        lambda x: torch.full_like(x[:, 0], LEVEL),
+        [LEVEL],
+        settings.horizon,
+        TOLERANCE,
+    )
+    return replace(found.perf, value=max(0.0, found.perf.value - 1.0))
+
+
+def outside_note(problem: Problem, found: Estimate | None) -> list[str]:
+    """The warning that so much time is spent outside, if it is much."""
+    if found is None or not found.value > MUCH:
+        return []
+    assert isinstance(problem, System)
+    names = " and ".join(problem.coordinates[i].name for i in problem.chart.boxed)
+    half = found.half_width(CONFIDENCE)
+    return [
+        f"the controller spends {100.0 * found.value:.2g} % (+- {100.0 * half:.1g}) of the discounted "
+        f"time outside the box of {names}, where the model is not yours: widen the box, or raise failure_cost."
+    ]

@@ -1,0 +1,42 @@
+"""The problem of a controller as its file names it, and whether another is the same."""
+
+from pathlib import Path
+
+from ocp_torch.errors import InputError
+from ocp_torch.files.storage import finite
+from ocp_torch.problems import PROBLEMS, Problem
+from ocp_torch.problems.physical.system import System
+
+
+def problem_name(problem: Problem) -> str:
+    """The name of a built-in problem, or the class name of a user's own in lower case (with its module if that is taken)."""
+    cls = type(problem)
+    own = cls.__name__.lower()
+    return next((n for n, c in PROBLEMS.items() if c is cls), own if own not in PROBLEMS else f"{cls.__module__}.{own}")
+
+
+def plain_parameters(parameters: dict) -> dict:
+    """Those of a problem's ``parameters`` that JSON can hold. Others only a user's own problem has, which is handed in on
+    loading."""
+    listed = {k: list(v) if isinstance(v, tuple) else v for k, v in parameters.items()}
+    return {k: v for k, v in listed.items() if isinstance(v, bool | int | float | str | list | type(None))}
+
+
+def described(problem: Problem) -> dict:
+    """What a file says of ``problem``: its name, the arguments that make it again, and its units where it has some."""
+    units = problem.units if isinstance(problem, System) else {}
+    return {"name": problem_name(problem), "parameters": plain_parameters(problem.parameters), **units}
+
+
+def require_same(path: Path, problem: Problem, saved: dict) -> None:
+    """Raise `InputError` where ``problem`` is not made, or not measured, as that of the run, ``saved``, was."""
+    given = finite(described(problem))
+    own = {k: v for k, v in given["parameters"].items() if k not in problem.incidental}
+    units = {k: v for k, v in given.items() if k not in ("name", "parameters")}
+    for group, before in ((own, saved["parameters"]), (units, saved)):
+        for name in group.keys() & before.keys():
+            if group[name] != before[name]:
+                raise InputError(
+                    f"problem.{name} is {group[name]!r:.80}, but the run of {path} has {before[name]!r:.80}; a controller is "
+                    "loaded with the problem it was trained for."
+                )

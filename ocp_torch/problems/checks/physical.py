@@ -1,0 +1,67 @@
+"""What a user writes of a system, `cost`, `dynamics` and `disturbance`, under the names and in the units he wrote it in."""
+
+from collections.abc import Callable
+from typing import Any
+
+from torch import Tensor
+
+from ocp_torch.errors import ProblemError
+from ocp_torch.problems.checks.functions import Functions
+from ocp_torch.problems.checks.sameness import SAME, worst_of
+from ocp_torch.problems.physical.coordinates import Angle
+from ocp_torch.problems.physical.system import System
+
+COST, DRIFT, MATRIX, NOISE = "cost", "a of dynamics", "B of dynamics", "disturbance"
+# States that are compared a turn apart, and their design (see `functions.FIRST_DESIGN`).
+TURNED, TURNED_DESIGN = 256, 8
+
+
+class SystemFunctions(Functions):
+    """The functions of a ``system`` at states of the torus, which is asked at the physical ones there."""
+
+    cost, density, sigma = COST, "", NOISE
+    own_forms = own_data = {COST: "", DRIFT: "d", MATRIX: "dm"}
+    spread, where = {}, "in the box and its margins"
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+        super().__init__(system, simulator=False)
+
+    def function(self, name: str) -> Callable[[Tensor], Any]:
+        physical = self.physical(name)
+        return lambda x: physical(self.system.from_torus(x))
+
+    def physical(self, name: str) -> Callable[[Tensor], Any]:
+        """The function ``name`` of physical states."""
+        if name in (DRIFT, MATRIX):
+            return lambda s: self._pair(s)[name == MATRIX]
+        return self.system.cost if name == COST else self.system.disturbance
+
+    def _pair(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        pair = self.system.dynamics(s)
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise ProblemError(
+                f"dynamics of {self.name} gave a {type(pair).__name__}, but must give two tensors, a of shape (N, d) and B "
+                "of shape (N, d, m)."
+            )
+        return pair[0], pair[1]
+
+
+def require_turns(functions: SystemFunctions) -> None:
+    """The same values a whole turn of an angle away."""
+    system = functions.system
+    s = system.from_torus(functions.states(min(TURNED, functions.count), TURNED_DESIGN))
+    for i, c in enumerate(system.coordinates):
+        if not isinstance(c, Angle):
+            continue
+        turned = s.clone()
+        turned[:, i] += c.length
+        for name in functions.data:
+            function = functions.physical(name)
+            here, there = function(s.clone()), function(turned.clone())
+            row, change = worst_of((here - there).abs())
+            if not change <= SAME * float(here.abs().max()):
+                raise ProblemError(
+                    f"{name} of {functions.name} changes by {change:.3g} when {c.name} goes on by a turn of {c.length:.6g} "
+                    f"{c.unit}, at {system.chart.place(s[row])}, but an angle has no preferred turn: use its sine and cosine."
+                )

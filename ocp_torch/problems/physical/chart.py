@@ -1,0 +1,114 @@
+"""Between states in physical units and on the torus, and the cut-off that closes an interval to a circle."""
+
+import torch
+from torch import Tensor
+
+from ocp_torch.errors import InputError
+from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.problems.physical.coordinates import Coordinate, Interval
+from ocp_torch.problems.placed import Placed
+
+# Coordinates of a state that a sentence shows, and the part of a turn by which rounding may carry a state beyond a seam.
+MOST_SHOWN, ROUNDING = 8, 1e-6
+# The number of the design of states spread over a box, and how many corners of it are among them at most.
+DESIGN, MOST_CORNERS = 31, 2**12
+
+
+def smooth_step(z: Tensor) -> Tensor:
+    """From 1 at `z <= 0` to 0 at `z >= 1`, twice differentiable: `1 - z^3 (10 - 15 z + 6 z^2)`."""
+    z = z.clamp(0.0, 1.0)
+    return 1.0 - z**3 * (10.0 - 15.0 * z + 6.0 * z**2)
+
+
+class Chart(Placed):
+    """`x_i = (s_i - centre_i) / length_i` mod 1, of ``coordinates``; an interval's seam is at `x_i = 1/2`."""
+
+    def __init__(self, coordinates: tuple[Coordinate, ...]) -> None:
+        self.coordinates = coordinates
+        column = lambda name: torch.tensor([getattr(c, name) for c in coordinates], dtype=torch.float64)
+        self.centre, self.length = column("centre"), column("length")
+        boxed = [(i, c) for i, c in enumerate(coordinates) if isinstance(c, Interval)]
+        self.boxed = [i for i, _ in boxed]
+        self.volume = float(self.length.prod())
+        self._half = torch.tensor([0.5 * (c.high - c.low) for _, c in boxed], dtype=torch.float64)
+        self._seam = torch.tensor([c.seam for _, c in boxed], dtype=torch.float64)
+
+    def from_torus(self, x: Tensor) -> Tensor:
+        """States ``(N, d)`` in physical units: angles within half a period of 0, intervals up to their seams."""
+        turns = (x + 0.5).remainder(1.0) - 0.5
+        return self._like(x, "centre", self.centre) + turns * self.lengths(x)
+
+    def to_torus(self, s: Tensor) -> Tensor:
+        """States ``(N, d)`` in physical units as states of the torus in [0, 1); raises `InputError` beyond a seam."""
+        turns = (s - self._like(s, "centre", self.centre)) / self.lengths(s)
+        beyond = turns[:, self.boxed].abs() > 0.5 + ROUNDING
+        if bool(beyond.any()):
+            row, which = beyond.nonzero()[0].tolist()
+            c = self.coordinates[self.boxed[which]]
+            raise InputError(
+                f"{c.name} is {float(s[row, self.boxed[which]]):g} {c.unit}".rstrip()
+                + f", beyond the seam of the model at {c.centre - 0.5 * c.length:g} and {c.centre + 0.5 * c.length:g}."
+            )
+        return turns.remainder(1.0)
+
+    def lengths(self, like: Tensor) -> Tensor:
+        """What a turn of each coordinate is in its unit, ``(d,)``."""
+        return self._like(like, "length", self.length)
+
+    def wrapped(self, offset: Tensor) -> Tensor:
+        """The shortest of the ``offset``s ``(.., d)`` of two states on the torus, in physical units."""
+        length = self.lengths(offset)
+        return (offset + 0.5 * length).remainder(length) - 0.5 * length
+
+    def cut(self, s: Tensor) -> Tensor:
+        """The cut-off `chi` ``(N,)``: 1 in the box, 0 at the seams."""
+        chi = torch.ones_like(s[:, 0])
+        for step in smooth_step(self._beyond(s)).unbind(-1) if self.boxed else ():
+            chi = chi * step
+        return chi
+
+    def cut_with_slope(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        """`chi` ``(N,)`` and its gradient in the units of `s`, ``(N, d)``."""
+        slope = torch.zeros_like(s)
+        if not self.boxed:
+            return torch.ones_like(s[:, 0]), slope
+        z = self._beyond(s)
+        steps = smooth_step(z)
+        side = (s - self._like(s, "centre", self.centre))[:, self.boxed].sign() / self._like(s, "seam", self._seam)
+        for k, i in enumerate(self.boxed):
+            rest = torch.cat([steps[:, :k], steps[:, k + 1 :]], dim=-1).prod(dim=-1)
+            slope[:, i] = -30.0 * (z[:, k] * (1.0 - z[:, k])).square() * side[:, k] * rest
+        return steps.prod(dim=-1), slope
+
+    def _beyond(self, s: Tensor) -> Tensor:
+        """How far each interval's coordinate is between its end and the seam, 0 to 1, ``(N, K)``."""
+        off = (s - self._like(s, "centre", self.centre))[:, self.boxed].abs()
+        return ((off - self._like(s, "half", self._half)) / self._like(s, "seam", self._seam)).clamp(0.0, 1.0)
+
+    def outside(self, s: Tensor) -> Tensor:
+        """Whether states ``(N, d)`` are beyond the end of an interval, ``(N,)``."""
+        off = (s - self._like(s, "centre", self.centre))[:, self.boxed].abs()
+        return (off > self._like(s, "half", self._half) * (1.0 + ROUNDING)).any(dim=-1)
+
+    def nearest(self, s: Tensor) -> Tensor:
+        """The states of the box that are nearest to ``s`` ``(N, d)``, coordinate by coordinate."""
+        low = [c.low if isinstance(c, Interval) else -torch.inf for c in self.coordinates]
+        high = [c.high if isinstance(c, Interval) else torch.inf for c in self.coordinates]
+        return s.clamp(s.new_tensor(low), s.new_tensor(high))
+
+    def spread(self, count: int) -> Tensor:
+        """``count`` states spread over the box, and its corners where they are few, an angle there at 0 and half a period."""
+        ends = [(c.low, c.high) if isinstance(c, Interval) else (0.0, 0.5 * c.length) for c in self.coordinates]
+        low, high = (torch.tensor(side, dtype=torch.float64) for side in zip(*ends, strict=True))
+        turns = torch.tensor([1.0 if isinstance(c, Interval) else 2.0 for c in self.coordinates], dtype=torch.float64)
+        s = low + (high - low) * turns * scrambled_sobol(count, len(ends), DESIGN, torch.float64)
+        if 2 ** len(ends) > MOST_CORNERS:
+            return s
+        corners = torch.cartesian_prod(*(torch.tensor(pair, dtype=torch.float64) for pair in ends))
+        return torch.cat([s, corners.reshape(-1, len(ends))])
+
+    def place(self, s: Tensor) -> str:
+        """One state ``(d,)`` for a sentence, as in ``pole = 0.3 rad, velocity = 2 m/s``."""
+        pairs = list(zip(self.coordinates, s.tolist(), strict=True))[:MOST_SHOWN]
+        text = ", ".join(f"{c.name} = {value:.6g} {c.unit}".rstrip() for c, value in pairs)
+        return text + (", .." if len(s) > MOST_SHOWN else "")
