@@ -91,7 +91,9 @@ def test_a_guessed_M_makes_a_conditional_bound_that_enters_nothing_else():
     assert said["lower"]["F_M"] | {"rests_on": {"M": "guessed"}, "counts": False} == said["lower"]["F_M"]
     assert said["lower"]["F_M"]["if"] == f"sup mu* <= {certificate.assumptions.M:.4g} ({FROM_DENSITY})"
     assert said["lower"]["shifted"]["counts"]
-    assert 0.0 < said["gap"]["conditional"] <= (1.0 + 1e-9) * said["gap"]["simulated"]
+    # It is shown where it says more than what counts (see test_conditional.py).
+    more = said["lower"]["F_M"]["interval"][0] > said["lower"]["shifted"]["interval"][0]
+    assert (said["gap"]["conditional"] is not None) == more
     assert any("a guess: no gap that counts uses it" in warning for warning in said["warnings"])
 
 

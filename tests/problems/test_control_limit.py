@@ -264,7 +264,7 @@ def test_a_limit_for_each_actuator_goes_with_squares_only():
         *((LimitedCost(q, 0.5), dim) for q in (1.2, 1.5, 2.0) for dim in (1, 2)),
         *((BoxLimitedCost(2.0, c), len(c)) for c in ([0.5], [0.5, 0.5], [0.5, 1.1])),
     ],
-    ids=str,
+    ids=lambda value: str(value) if isinstance(value, int) else type(value).__name__,
 )
 def test_taylor_models_hold_the_conjugate_below_across_and_beyond_the_limit(cost, dim):
     """Coordinates of the cells themselves stand for `p`; cells of all sizes, within which random points are tried."""
