@@ -7,9 +7,12 @@ from ocp_torch.problems.problem import Lipschitz, Problem
 from ocp_torch.problems.recorded.dataset import Dataset
 from ocp_torch.problems.simulator.simulator import Simulator
 from ocp_torch.problems.systems.arm import Arm
+from ocp_torch.problems.systems.cart_pole import CartPole
+from ocp_torch.problems.systems.double_integrator import DoubleIntegrator
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.pendulum import Pendulum
+from ocp_torch.problems.systems.phase_locked_loop import PhaseLockedLoop
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.systems.robot import RobotArm
 from ocp_torch.problems.systems.unicycle import Unicycle
@@ -27,6 +30,9 @@ PROBLEMS: dict[str, type[Problem]] = {
     "dubins": Dubins,
     "pendulum": Pendulum,
     "robot": RobotArm,
+    "cart_pole": CartPole,
+    "double_integrator": DoubleIntegrator,
+    "phase_locked_loop": PhaseLockedLoop,
 }
 
 # What `Simulator` was called in files written before.

@@ -1,12 +1,21 @@
-"""Whether the optimal flow gathers mass at a state of rest, by the linear system and the quadratic cost around it."""
+"""The linear system and the quadratic cost around a state of rest: the optimum there, and whether mass gathers."""
 
 import math
 
 import torch
+from scipy.linalg import solve_continuous_are
 from torch import Tensor
 
 # A contraction this close to rho, relative to it, counts as one that reaches it, so that rounding decides nothing.
 ROUNDING = 1e-9
+
+
+def riccati(A: Tensor, B: Tensor, Q: Tensor, rho: float = 0.0) -> Tensor:
+    r"""The stabilising `P` ``(d, d)`` of `F'P + PF - PBB'P + Q = 0`, `F = A - rho/2`: from `x` the least of
+    `int e^{-rho t} (x'Qx + |u|^2) / 2 dt` is `x'Px / 2`, by `u = -B'Px`. ``A`` and ``Q`` are ``(d, d)``, ``B`` ``(d, m)``."""
+    F = A - 0.5 * rho * torch.eye(len(A), dtype=A.dtype)
+    P = solve_continuous_are(F.numpy(), B.numpy(), Q.numpy(), torch.eye(B.shape[1]).numpy())
+    return torch.from_numpy(P).to(A)
 
 
 def optimal_contraction(A: Tensor, B: Tensor, Q: Tensor, rho: float) -> float:

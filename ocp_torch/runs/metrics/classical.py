@@ -8,11 +8,15 @@ from torch import Tensor
 from ocp_torch.control.policies import Policy
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.angles import TURN
+from ocp_torch.problems.systems.cart_pole import CartPole
+from ocp_torch.problems.systems.double_integrator import DoubleIntegrator
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
+from ocp_torch.problems.systems.phase_locked_loop import PhaseLockedLoop
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
+from ocp_torch.problems.systems.rest import riccati
 from ocp_torch.problems.systems.unicycle import Unicycle
 
 # Arms: the gain per second, and the damping of the pseudo-inverse relative to the arm's length.
@@ -24,6 +28,12 @@ DESCENT = 2.0
 # Pendulum: the gain of the pump; those of the balance, on angle (1/s^2) and velocity (1/s); and angle in rad and speed in
 # rad/s below which it balances.
 PUMP, BALANCE, CATCH = 0.2, (20.0, 5.0), (0.5, 2.0)
+# Cart and pole: the gain of the pump per J m; those that keep the cart in the middle, on position (1/s^2) and velocity (1/s);
+# and the cost of the linear balance, per unit of time, below which it balances.
+SHAPING, CENTRE, BALANCED = 15.0, (2.0, 2.0), 0.4
+
+# Phase-locked loop: its natural frequency in rad/s, and its damping.
+NATURAL, DAMPED = 1.0, 0.707
 
 
 def classical_policy(problem: Problem) -> Policy | None:
@@ -89,3 +99,34 @@ def energy_pump(problem: Pendulum, x: Tensor) -> Tensor:
     balance = -(BALANCE[0] * angle + BALANCE[1] * velocity) / 3.0
     near = (angle.abs() < CATCH[0]) & (velocity.abs() < CATCH[1])
     return (torch.where(near, balance, pump) / problem.max_torque).clamp(-1.0, 1.0).unsqueeze(-1)
+
+
+@classical_control.register
+def shape_energy(problem: CartPole, x: Tensor) -> Tensor:
+    r"""The cart is accelerated by `k E theta' cos theta - k_1 p - k_2 p'`, `E` the pole's energy on a cart that stands, so that
+    `E` goes to 0; near upright, LQR (Chung and Hauser, 1995; Spong, 1996)."""
+    s = problem.from_torus(x)
+    position, pole, velocity, spin = s.unbind(dim=-1)
+    a, B = problem.dynamics(s)
+    energy = problem.energy(torch.cat([s[:, :2], torch.zeros_like(s[:, :1]), s[:, 3:]], dim=-1))
+    wanted = SHAPING * energy * spin * pole.cos() - CENTRE[0] * position - CENTRE[1] * velocity
+    swing = (wanted - a[:, 2]) / B[:, 2, 0]
+    A, b, Q = (term.to(x) for term in problem.linearised())
+    root = problem.force_weight**0.5
+    P = riccati(A, b / root, Q)
+    balance = -(s @ P @ b).squeeze(-1) / root**2
+    near = 0.5 * torch.einsum("ni,ij,nj->n", s, P, s) < BALANCED
+    return problem.to_controls(torch.where(near, balance, swing).unsqueeze(-1))
+
+
+@classical_control.register
+def linear_quadratic(problem: DoubleIntegrator, x: Tensor) -> Tensor:
+    """The linear controller of the plane: optimal, unless it leaves the box."""
+    return problem.plane.control(problem.from_torus(x))
+
+
+@classical_control.register
+def loop_filter(problem: PhaseLockedLoop, x: Tensor) -> Tensor:
+    """The loop of second order with a sinusoidal detector: `2 zeta w_n sin phi` and `w_n^2 sin phi` (Gardner, chapter 2)."""
+    detected = problem.from_torus(x)[:, 0].sin()
+    return problem.to_controls(torch.stack([2.0 * DAMPED * NATURAL * detected, NATURAL**2 * detected], dim=-1))

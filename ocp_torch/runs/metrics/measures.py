@@ -1,5 +1,6 @@
 """Trajectories at equal times, for numbers and pictures: the certificate has its own; and what is measured on each system."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import singledispatch
@@ -11,16 +12,19 @@ from ocp_torch.control.policies import Policy
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.systems.cart_pole import CartPole
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
+from ocp_torch.problems.systems.phase_locked_loop import PhaseLockedLoop
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.systems.planar import PlanarVehicle
 
 # What counts as reached, relative to the arm's length or the period of the plane; as upright, in rad and rad/s. Definitions
 # of what the numbers say, not tuned.
 REACHED = 0.05
+LOCKED = 0.5 * math.pi  # rad of phase error, beyond which a detector pushes the wrong way
 UPRIGHT = (0.2, 0.5)
 LATE = 0.25  # the part of a trajectory that is its end
 
@@ -134,6 +138,23 @@ def _(problem: System, path: Path) -> dict[str, float]:
     """The part of the starts from which the box is never left."""
     left = path.each(problem.outside).any(dim=0)
     return {"inside": _part(~left)}
+
+
+@measure.register
+def _(problem: CartPole, path: Path) -> dict[str, float]:
+    """Success: within 0.2 rad and 0.5 rad/s of upright at the end, and never off the track nor too fast for the box."""
+    _, angle, _, spin = problem.from_torus(path.states[-1]).unbind(dim=-1)
+    upright = (angle.abs() <= UPRIGHT[0]) & (spin.abs() <= UPRIGHT[1])
+    inside = ~path.each(problem.outside).any(dim=0)
+    return {"success": _part(upright & inside), "upright": _part(upright), "inside": _part(inside)}
+
+
+@measure.register
+def _(problem: PhaseLockedLoop, path: Path) -> dict[str, float]:
+    """Locked: over the last quarter of the time never beyond a quarter turn; and the root mean square error then, in rad."""
+    phase = path.each(lambda x: problem.from_torus(x)[:, 0], late=True)
+    locked = (phase.abs() <= LOCKED).all(dim=0)
+    return {"locked": _part(locked), "phase_error": float(phase.square().mean().sqrt())}
 
 
 def has_metrics(problem: Problem) -> bool:
