@@ -9,11 +9,14 @@ import torch
 from ocp_torch.fields import PeriodicMLP
 from ocp_torch.problems import (
     Arm,
+    CartPole,
     Circle,
+    DoubleIntegrator,
     Dubins,
     Kuramoto,
     Manufactured,
     Pendulum,
+    PhaseLockedLoop,
     PhaseNeurons,
     Problem,
     Torus,
@@ -118,6 +121,11 @@ _NATURAL = {
     "kuramoto entrain": partial(Kuramoto, goal="entrain", graph="ring"),
     "kuramoto desynchronise": partial(Kuramoto, goal="desynchronise", coupling=2.0),
     "phase neurons n=2": PhaseNeurons,
+    "double integrator": DoubleIntegrator,
+    "double integrator, limited": partial(DoubleIntegrator, mass=2.0, velocity_weight=0.5, control_limit=0.5),
+    "cart-pole": CartPole,
+    "cart-pole q=1.5": partial(CartPole, exponent=1.5, control_limit=None, failure_cost=2.0),
+    "phase-locked loop": PhaseLockedLoop,
     "phase neurons n=3 type 1": partial(PhaseNeurons, neurons=3, response="type1"),
 }
 
