@@ -10,6 +10,7 @@ import torch
 from ocp_torch.errors import InputError, require_choice, require_number
 from ocp_torch.maths.seeds import Branch, derive_seed, fixed_generator
 from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import drawn_starts, starts_narrowly
 from ocp_torch.runs.canvas import blank_figure
@@ -45,7 +46,9 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
     ``control_bound`` (default: what the problem knows of `sup |u*|`), within the problem's own limit; one step holds the
     control for ``time_step`` (units of time) with one midpoint step, and the reward is minus the cost of that step. Where
     there is noise it is added as Euler and Maruyama do, from the environment's own generator.
-    Episodes are cut, not ended, after ``horizon``. Raises `InputError` for wrong numbers, and for a data set.
+    Episodes are cut, not ended, after ``horizon``. Of a `System`, ``info`` has the state, and the control of the step, in
+    physical units as well, and ``metadata`` the names and units of both. Raises `InputError` for wrong numbers, and for a
+    data set.
     """
 
     metadata: dict = {"render_modes": ["rgb_array"], "render_fps": 15}
@@ -72,6 +75,12 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
         require_number("control_bound", self.control_bound, above=0.0)
         if render_mode is not None:
             require_choice("render_mode", render_mode, ("rgb_array",))
+        if isinstance(problem, System):
+            names = {
+                "coordinates": [c.label for c in problem.coordinates],
+                "controls": [c.label for c in problem.controls],
+            }
+            self.metadata = {**self.metadata, **names}
         box = require_gymnasium().spaces.Box
         self.observation_space = box(-1.0, 1.0, (2 * problem.dim,), np.float32)
         self.action_space = box(-1.0, 1.0, (problem.control_dim,), np.float32)
@@ -88,7 +97,15 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
         if seed is not None:
             self.generator.manual_seed(derive_seed(seed, Branch.EPISODES))
         self.x, self.elapsed = self._start(), 0.0
-        return observe(self.x), {"state": self.x[0].numpy()}
+        return observe(self.x), self._info()
+
+    def _info(self, u: torch.Tensor | None = None) -> dict:
+        """The state, and that and the control ``u`` ``(1, m)`` that led to it in physical units where there are some."""
+        found = {"state": self.x[0].numpy()}
+        if isinstance(problem := self.problem, System):
+            found["physical_state"] = problem.from_torus(self.x)[0].numpy()
+            found |= {} if u is None else {"physical_control": problem.from_controls(u)[0].numpy()}
+        return found
 
     def _start(self) -> torch.Tensor:
         """A state ``(1, d)`` drawn from `mu0`."""
@@ -110,7 +127,7 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
         self.x = (self.x + h * problem.velocity(middle, u) + self._kick()).remainder(1.0)
         self.elapsed += h
         done = self.elapsed >= self.horizon * (1.0 - 1e-9)
-        return observe(self.x), -self._weight * cost, False, done, {"state": self.x[0].numpy(), "cost": cost}
+        return observe(self.x), -self._weight * cost, False, done, {**self._info(u), "cost": cost}
 
     def _kick(self) -> torch.Tensor | float:
         """`sigma dW` over one step, ``(1, d)``; 0 where there is no noise."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import torch
 from torch import Tensor
 
 from ocp_torch.maths import jets
@@ -37,11 +38,17 @@ class ClosedLoop(Problem):
 
     def drift_divergence(self, x: Tensor) -> Tensor | None:
         """`div g_u = div a + (div B) . u + sum_k (d u_k along column k of B)`: one reverse pass for each of the controls."""
-        div_a, div_B = self.problem.drift_divergence(x), self.problem.control_divergence(x)
+        return self.vector_fields(x)[2]
+
+    def vector_fields(self, x: Tensor, divergences: bool = True) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+        if not divergences:
+            return super().vector_fields(x, divergences=False)
+        a, B, div_a, div_B = self.problem.vector_fields(x)
+        none, no_control = self.control_matrix(x), self.control_divergence(x)
         if div_a is None or div_B is None:
-            return None
-        _, flux = jets.control_flux_divergence(self.policy, x, self.problem.control_matrix(x), div_B)
-        return div_a + flux
+            return self.drift(x), none, None, no_control
+        u, flux = jets.control_flux_divergence(self.policy, x, B, div_B)
+        return a + torch.einsum("ndm,nm->nd", B, u), none, div_a + flux, no_control
 
     def control_matrix(self, x: Tensor) -> Tensor:
         return x.new_zeros(len(x), self.dim, 1)

@@ -16,6 +16,7 @@ from ocp_torch.problems import PROBLEMS, Dataset, Manufactured
 from ocp_torch.runs.record import record
 from support import zoo
 from support.small import session, small
+from support.systems import Cart
 
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
 
@@ -293,3 +294,19 @@ def test_a_saved_pendulum_controller_plays_gymnasiums_untouched(gymnasium, tmp_p
     played = asked(folder, env="Pendulum-v1", episodes=2).run()
     assert (played.lengths == 200).all()
     assert np.isfinite(played.returns).all()
+
+
+def test_a_system_shows_its_state_and_control_in_physical_units(gymnasium):
+    system = Cart(noisy=False)
+    env = ControlEnvironment(system, control_bound=1.0, time_step=0.01)
+    assert env.metadata["coordinates"] == ["trolley [m]", "pole [rad]", "spin [rad/s]"]
+    assert env.metadata["controls"] == ["push [N]", "torque [N m]"]
+    _, info = env.reset(seed=3)
+    before = info["physical_state"]
+    assert np.abs(before[0]) <= 2.0
+    *_, info = env.step(np.array([0.5, -0.25], dtype=np.float32))
+    assert info["physical_control"] == pytest.approx(np.array([0.5, -0.25]) / np.sqrt([0.5, 2.0]))
+    s = torch.from_numpy(before)[None]
+    a, B = system.dynamics(s)
+    moved = s + 0.01 * (a + torch.einsum("ndm,nm->nd", B, torch.from_numpy(info["physical_control"])[None]))
+    assert info["physical_state"] == pytest.approx(moved[0].numpy(), abs=2e-3)
