@@ -31,7 +31,11 @@ def test_a_run_without_simulations_has_no_numbers(tmp_path):
     assert not (tmp_path / METRICS).exists()
 
 
-@pytest.mark.parametrize("problem", ["kuramoto", "phase_neurons", "arm", "unicycle", "dubins", "pendulum", "robot"])
+SYSTEMS = ["kuramoto", "phase_neurons", "arm", "unicycle", "dubins", "pendulum", "robot"]
+SYSTEMS += ["double_integrator", "cart_pole", "phase_locked_loop"]
+
+
+@pytest.mark.parametrize("problem", SYSTEMS)
 def test_files_and_classes_agree_on_the_defaults(problem):
     """What a file says is what the class does without one."""
     built = small(f"problem={problem}").problem

@@ -1,6 +1,7 @@
 r"""Swing up a pole that hangs from a cart by pushing the cart, whose track is short: d = 4, one force."""
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -9,7 +10,7 @@ from ocp_torch.errors import require_number
 from ocp_torch.problems.physical.coordinates import Angle, Interval
 from ocp_torch.problems.physical.start import Start
 from ocp_torch.problems.physical.system import System
-from ocp_torch.problems.systems.rest import occupation_bound_at_rest
+from ocp_torch.problems.systems.rest import occupation_bound_at_rest, riccati
 
 
 class CartPole(System):
@@ -45,7 +46,7 @@ class CartPole(System):
         start: Start = None,
         discount: float = 1.0,
         exponent: float = 2.0,
-        control_limit: float | None = 10.0,
+        control_limit: float | Sequence[float] | None = 10.0,
         force_noise: float = 0.0,
         noise: float | Sequence[float] = 0.0,
     ) -> None:
@@ -60,7 +61,7 @@ class CartPole(System):
         self.spin_weight = weight("spin_weight", spin_weight)
         self.force_weight = positive("force_weight", force_weight)
         self.force_noise = weight("force_noise", force_noise)
-        box = [
+        box: list[Angle | Interval] = [
             Interval("position", -self.track, self.track, "m"),
             Angle("pole"),
             Interval("velocity", -self.max_velocity, self.max_velocity, "m/s"),
@@ -113,6 +114,13 @@ class CartPole(System):
         kinetic = 0.5 * (self.cart_mass + self.pole_mass) * velocity.square() + lever * pole.cos() * velocity * spin
         turning = 2.0 / 3.0 * lever * self.half_length * spin.square()
         return kinetic + turning - 2.0 * lever * self.gravity * (0.5 * pole).sin().square()
+
+    @cached_property
+    def balance(self) -> Tensor:
+        """`P` ``(4, 4)`` of the undiscounted linear-quadratic problem at rest upright, without a limit: `s'Ps / 2` is what is
+        left to pay."""
+        A, B, Q = self.linearised()
+        return riccati(A, B / self._roots, Q)
 
     def linearised(self) -> tuple[Tensor, Tensor, Tensor]:
         """`A` ``(4, 4)`` and `B` ``(4, 1)`` of the dynamics at rest upright, and the Hessian ``(4, 4)`` of the cost."""

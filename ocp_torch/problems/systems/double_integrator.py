@@ -22,7 +22,7 @@ class DoubleIntegrator(System):
     r"""`p'' = F / m`, cost `(position_weight p^2 + velocity_weight p'^2 + force_weight F^2) / 2`; `p` in m, `F` in N.
 
     On the whole plane and without a limit the optimum is ``plane``, a `LinearQuadratic` with value `V`, and ``lqr_optimum``
-    its mean over the start, which is within ``start`` of rest, in m and m/s. In the ``box``, given likewise, and its margins
+    its mean over the start, which is within ``starts`` of rest, in m and m/s. In the ``box``, given likewise, and its margins
     `V` has the Hamilton-Jacobi-Bellman slack `(1 - chi) (V - failure_cost + chi (tr(P D) - R*))`, `chi` the cut-off: at most
     0 if `failure_cost >= V + tr(P D)` up to the seams, as by default. No path crosses a seam: so `lqr_optimum <= OPT`.
 
@@ -36,19 +36,19 @@ class DoubleIntegrator(System):
         self,
         mass: float = 1.0,
         box: Sequence[float] = (1.0, 1.0),
-        start: Sequence[float] = (0.6, 0.6),
+        starts: Sequence[float] = (0.6, 0.6),
         position_weight: float = 4.0,
         velocity_weight: float = 0.0,
         force_weight: float = 1.0,
         failure_cost: float | None = None,
         discount: float = 2.0,
-        control_limit: float | None = None,
+        control_limit: float | Sequence[float] | None = None,
         force_noise: float = 0.0,
         noise: float | Sequence[float] = 0.0,
     ) -> None:
         self.mass = require_number("problem.mass", mass, above=0.0)
         self.box = require_numbers("problem.box", box, 2, above=0.0)
-        half = require_numbers("problem.start", start, 2, above=0.0)
+        self.starts = half = require_numbers("problem.starts", starts, 2, above=0.0)
         self.position_weight = require_number("problem.position_weight", position_weight, above=0.0)
         self.velocity_weight = require_number("problem.velocity_weight", velocity_weight, at_least=0.0)
         self.force_weight = require_number("problem.force_weight", force_weight, above=0.0)
@@ -72,13 +72,12 @@ class DoubleIntegrator(System):
             noise=noise,
             failure_cost=enough if failure_cost is None else failure_cost,
         )
-        self.start = half
         self.state_cost_bound = max(float(self.cost(seams).max()), self._failure)
         bounded = self.diffusion is None and self._failure >= enough
         self.lqr_optimum = self._mean(half) if bounded else None
-        limit = math.inf if self.control_limit is None else self.control_limit
-        ends = [torch.tensor(v, dtype=torch.float64) for v in (half, self.box)]
-        if bounded and not self.noisy and self.plane.stays(*ends, limit):
+        limit = math.inf if self.control_limit is None else float(np.min(self.control_limit))
+        ends = torch.tensor([half, self.box], dtype=torch.float64)
+        if bounded and not self.noisy and self.plane.stays(ends[0], ends[1], limit):
             self.exact_optimum, k = self.lqr_optimum, self.plane.contraction
             most = float(self.initial_density(self.to_torus(torch.zeros(1, 2, dtype=torch.float64))))
             self.occupation_bound = most * rho / (rho - k) if k < rho else math.inf
@@ -87,11 +86,14 @@ class DoubleIntegrator(System):
         """`E[V mu0]`: the coordinates of a start are independent and symmetric, so that only their squares count."""
         z, weight = np.polynomial.legendre.leggauss(NODES)
         inner, edge = 1.0 - 2.0 * EDGE, torch.from_numpy(1.0 + EDGE * (z - 1.0))
-        beyond = float((torch.from_numpy(EDGE * weight) * edge.square() * smooth_step((edge - inner) / (1.0 - inner))).sum())
+        beyond = float(
+            (torch.from_numpy(EDGE * weight) * edge.square() * smooth_step((edge - inner) / (1.0 - inner))).sum()
+        )
         square = (inner**3 / 3.0 + beyond) / (1.0 - EDGE)
-        return 0.5 * self.discount * square * sum(
-            float(p) * h**2 for p, h in zip(self.plane.P.diag(), half, strict=True)
-        ) + self.plane.constant
+        return (
+            0.5 * self.discount * square * sum(float(p) * h**2 for p, h in zip(self.plane.P.diag(), half, strict=True))
+            + self.plane.constant
+        )
 
     def cost(self, s: Tensor) -> Tensor:
         return 0.5 * (self.position_weight * s[:, 0].square() + self.velocity_weight * s[:, 1].square())

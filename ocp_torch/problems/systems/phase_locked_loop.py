@@ -17,7 +17,7 @@ class PhaseLockedLoop(System):
     `u_1`, in rad/s, tunes the oscillator for as long as it lasts, `u_2`, in rad/s^2, for good: the proportional and the
     integral path of the classical loop filter (Gardner, *Phaselock Techniques*, chapter 2), here free functions of the
     state. Noise of frequency that is white, in rad/sqrt(s), and that walks, in rad/s/sqrt(s): the two-state model of clocks
-    (Zucca and Tavella, 2005). Cost: `1 - cos phi + (frequency_weight w^2 + tuning_weight_1 u_1^2 + tuning_weight_2 u_2^2) / 2`.
+    (Zucca and Tavella, 2005). Cost: `1 - cos phi + (frequency_weight w^2 + k_1 u_1^2 + k_2 u_2^2) / 2`, `k` the ``tuning_weight``.
     The box is `|w| <= max_frequency` in rad/s; it starts at any phase within ``pull_in`` of the frequency.
 
     Without noise `mu*` is declared unbounded where the linear loop gathers mass at lock faster than the discount forgets it;
@@ -33,7 +33,7 @@ class PhaseLockedLoop(System):
         failure_cost: float | None = None,
         discount: float = 1.0,
         exponent: float = 2.0,
-        control_limit: float | None = None,
+        control_limit: float | Sequence[float] | None = None,
         phase_noise: float = 0.3,
         frequency_noise: float = 0.3,
         noise: float | Sequence[float] = 0.0,
@@ -44,7 +44,10 @@ class PhaseLockedLoop(System):
         self.tuning_weight = require_numbers("problem.tuning_weight", tuning_weight, 2, above=0.0)
         self.phase_noise = require_number("problem.phase_noise", phase_noise, at_least=0.0)
         self.frequency_noise = require_number("problem.frequency_noise", frequency_noise, at_least=0.0)
-        box = [Angle("phase"), Interval("frequency", -self.max_frequency, self.max_frequency, "rad/s")]
+        box: list[Angle | Interval] = [
+            Angle("phase"),
+            Interval("frequency", -self.max_frequency, self.max_frequency, "rad/s"),
+        ]
         super().__init__(
             box,
             ["proportional [rad/s]", "integral [rad/s^2]"],

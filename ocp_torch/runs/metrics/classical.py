@@ -16,7 +16,6 @@ from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.phase_locked_loop import PhaseLockedLoop
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
-from ocp_torch.problems.systems.rest import riccati
 from ocp_torch.problems.systems.unicycle import Unicycle
 
 # Arms: the gain per second, and the damping of the pseudo-inverse relative to the arm's length.
@@ -29,9 +28,8 @@ DESCENT = 2.0
 # rad/s below which it balances.
 PUMP, BALANCE, CATCH = 0.2, (20.0, 5.0), (0.5, 2.0)
 # Cart and pole: the gain of the pump per J m; those that keep the cart in the middle, on position (1/s^2) and velocity (1/s);
-# and the cost of the linear balance, per unit of time, below which it balances.
+# and what balancing may cost in all where it starts.
 SHAPING, CENTRE, BALANCED = 15.0, (2.0, 2.0), 0.4
-
 # Phase-locked loop: its natural frequency in rad/s, and its damping.
 NATURAL, DAMPED = 1.0, 0.707
 
@@ -103,20 +101,18 @@ def energy_pump(problem: Pendulum, x: Tensor) -> Tensor:
 
 @classical_control.register
 def shape_energy(problem: CartPole, x: Tensor) -> Tensor:
-    r"""The cart is accelerated by `k E theta' cos theta - k_1 p - k_2 p'`, `E` the pole's energy on a cart that stands, so that
-    `E` goes to 0; near upright, LQR (Chung and Hauser, 1995; Spong, 1996)."""
+    r"""The cart is accelerated by `k E theta' cos theta - k_1 p - k_2 p'`, `E` the energy of the pole on a cart that stands,
+    so that `E` goes to 0; near upright, LQR (Chung and Hauser, 1995; Spong, 1996)."""
     s = problem.from_torus(x)
     position, pole, velocity, spin = s.unbind(dim=-1)
     a, B = problem.dynamics(s)
     energy = problem.energy(torch.cat([s[:, :2], torch.zeros_like(s[:, :1]), s[:, 3:]], dim=-1))
     wanted = SHAPING * energy * spin * pole.cos() - CENTRE[0] * position - CENTRE[1] * velocity
     swing = (wanted - a[:, 2]) / B[:, 2, 0]
-    A, b, Q = (term.to(x) for term in problem.linearised())
-    root = problem.force_weight**0.5
-    P = riccati(A, b / root, Q)
-    balance = -(s @ P @ b).squeeze(-1) / root**2
+    P = problem.balance.to(x)
+    push = -torch.einsum("nim,ij,nj->n", problem.dynamics(torch.zeros_like(s))[1], P, s) / problem.force_weight
     near = 0.5 * torch.einsum("ni,ij,nj->n", s, P, s) < BALANCED
-    return problem.to_controls(torch.where(near, balance, swing).unsqueeze(-1))
+    return problem.to_controls(torch.where(near, push, swing).unsqueeze(-1))
 
 
 @classical_control.register

@@ -12,6 +12,7 @@ from torch import Tensor
 from ocp_torch.problems.physical.coordinates import Interval
 from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.systems.cart_pole import CartPole
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
@@ -139,6 +140,30 @@ def draw_pendulums(problem: Pendulum, axes: Any, path: Path, k: int) -> None:
     axes.set_title(f"{path.times[k]:.2f} s")
 
 
+def draw_cart(problem: CartPole, axes: Any, path: Path, k: int) -> None:
+    """One trajectory: cart and pole from light to dark, and the way of the tip; the ends of the track dotted. With noise the
+    poses are those of the mean, and the way of each tip is drawn."""
+    rod = 2.0 * problem.half_length
+    tip = lambda s: torch.stack([s[:, 0] + rod * s[:, 1].sin(), rod * s[:, 1].cos()], dim=-1)
+    for end in (-problem.track, problem.track):
+        axes.axvline(end, color="0.7", linestyle=":")
+    axes.axhline(0.0, color="0.8", linewidth=0.8)
+    *others, (mean, _) = _tracks(path, k)
+    for x, look in others:
+        axes.plot(*tip(problem.from_torus(x)).T, "-", **{**look, "color": "C1"})
+    s = problem.from_torus(mean)
+    tips = tip(s)
+    for j in [*range(0, k + 1, max(1, len(path.times) // GHOSTS)), k]:
+        dark = dict(color="C0", alpha=1.0 if j == k else 0.15 + 0.35 * j / len(path.times))
+        axes.plot([s[j, 0], tips[j, 0]], [0.0, tips[j, 1]], "-", linewidth=3.0 if j == k else 1.5, **dark)
+        axes.plot(s[j, 0], 0.0, "s", markersize=11 if j == k else 5, **dark)
+    axes.plot(*tips.T, "-", color="C1", linewidth=1.0)
+    wide = problem.track + 1.1 * rod
+    axes.set(
+        xlim=(-wide, wide), ylim=(-1.5 * rod, 1.5 * rod), aspect="equal", xlabel="m", title=f"{path.times[k]:.2f} s"
+    )
+
+
 @dataclass(frozen=True)
 class Scene:
     """``draw(problem, axes, path, k)`` shows a path up to its frame ``k`` on Matplotlib's axes of this ``projection``; so
@@ -156,6 +181,7 @@ SCENES = {
     Linkage: Scene(draw_arm, 3, apart=True),
     PlanarVehicle: Scene(draw_vehicles, 6),
     Pendulum: Scene(draw_pendulums, 6),
+    CartPole: Scene(draw_cart, 3, apart=True),
     Kuramoto: Scene(draw_phases, 24),
     PhaseNeurons: Scene(draw_phases, 24),
     System: Scene(draw_system, 6),
