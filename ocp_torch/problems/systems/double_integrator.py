@@ -35,8 +35,8 @@ class DoubleIntegrator(System):
     def __init__(
         self,
         mass: float = 1.0,
-        box: Sequence[float] = (1.0, 1.0),
-        starts: Sequence[float] = (0.6, 0.6),
+        box: Sequence[float] = (1.0, 0.7),
+        starts: Sequence[float] = (0.7, 0.5),
         position_weight: float = 4.0,
         velocity_weight: float = 0.0,
         force_weight: float = 1.0,

@@ -17,7 +17,7 @@ class PhaseLockedLoop(System):
     `u_1`, in rad/s, tunes the oscillator for as long as it lasts, `u_2`, in rad/s^2, for good: the proportional and the
     integral path of the classical loop filter (Gardner, *Phaselock Techniques*, chapter 2), here free functions of the
     state. Noise of frequency that is white, in rad/sqrt(s), and that walks, in rad/s/sqrt(s): the two-state model of clocks
-    (Zucca and Tavella, 2005). Cost: `1 - cos phi + (frequency_weight w^2 + k_1 u_1^2 + k_2 u_2^2) / 2`, `k` the ``tuning_weight``.
+    (Zucca and Tavella, 2005). Cost: `1 - cos phi + (frequency_weight w^2 + k_1 u_1^2 + k_2 u_2^2) / 2`, `k` = ``tuning_weight``.
     The box is `|w| <= max_frequency` in rad/s; it starts at any phase within ``pull_in`` of the frequency.
 
     Without noise `mu*` is declared unbounded where the linear loop gathers mass at lock faster than the discount forgets it;
