@@ -7,6 +7,7 @@ from ocp_torch.problems.problem import Lipschitz, Problem
 from ocp_torch.problems.recorded.dataset import Dataset
 from ocp_torch.problems.simulator.simulator import Simulator
 from ocp_torch.problems.systems.arm import Arm
+from ocp_torch.problems.systems.double_pendulum import Acrobot, Pendubot
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.pendulum import Pendulum
@@ -27,6 +28,8 @@ PROBLEMS: dict[str, type[Problem]] = {
     "dubins": Dubins,
     "pendulum": Pendulum,
     "robot": RobotArm,
+    "acrobot": Acrobot,
+    "pendubot": Pendubot,
 }
 
 # What `Simulator` was called in files written before.
