@@ -20,6 +20,7 @@ from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.starts import initial_points
 from ocp_torch.runs.canvas import Figure, blank_figure
+from ocp_torch.runs.frame import Frame, frame_of, in_units
 
 LINE_POINTS, MAP_POINTS = 400, 80
 # Of the simulated occupation density: bins a coordinate by dimension, starts, steps of a trajectory.
@@ -76,18 +77,17 @@ def interval_figure(certificate: dict) -> Figure:
 
 
 def draw(problem: Problem, fields: Fields, constants: Constants, occupation: str | None) -> dict[str, Figure]:
-    """A figure per quantity; in three and more dimensions a cut along the first two coordinates through 1/2."""
-    if problem.dim == 1:
-        x = torch.linspace(0.0, 1.0, LINE_POINTS, dtype=torch.float64).unsqueeze(-1)
-    else:
-        middles = (torch.arange(MAP_POINTS, dtype=torch.float64) + 0.5) / MAP_POINTS
-        x = torch.full((MAP_POINTS**2, problem.dim), 0.5, dtype=torch.float64)
-        x[:, :2] = torch.cartesian_prod(middles, middles)
+    """A figure per quantity; in three and more dimensions a cut along the first two coordinates through 1/2, or in
+    physical units through the middle of the others."""
+    frame = frame_of(problem)
+    x = frame.line(LINE_POINTS) if problem.dim == 1 else frame.map(MAP_POINTS)
     figures = {}
     for name, functions in quantities(problem, fields, constants, occupation).items():
         values = {label: _columns(function, x) for label, function in functions.items()}
+        unit = frame.control if name.startswith("control") else ""
+        title = f"{TITLES[name]}, {unit}" if unit else TITLES[name]
         known = {label: v for label, v in values.items() if v is not None}
-        figures[name] = (_curve if problem.dim == 1 else _map)(TITLES[name], x, known)
+        figures[name] = (_curve if problem.dim == 1 else _map)(title, x, known, frame)
     return figures
 
 
@@ -102,7 +102,8 @@ def quantities(problem: Problem, fields: Fields, constants: Constants, occupatio
             drawn["slack"] = {"learned": slack_function(problem, fields.value)}
     for kind, policy in policies.items():
         if kind != "value" or problem.knows_control_matrix:
-            drawn[f"control_{kind}"] = {"learned": policy, "exact": problem.exact_control}
+            functions = {"learned": policy, "exact": problem.exact_control}
+            drawn[f"control_{kind}"] = {label: in_units(problem, control) for label, control in functions.items()}
     learned, simulated = None, None
     if occupation is not None and (problem.has_simulator or occupation == NETWORK):
         learned = occupation_density(occupation, problem, fields, constants)
@@ -144,19 +145,20 @@ def _columns(function: Function | None, x: Tensor) -> Tensor | None:
     return values.where(torch.isfinite(values), torch.nan)
 
 
-def _curve(title: str, x: Tensor, values: dict[str, Tensor]) -> Figure:
+def _curve(title: str, x: Tensor, values: dict[str, Tensor], frame: Frame) -> Figure:
     figure = blank_figure(5.2, 4.0)
     axis = figure.subplots()
     for label, form in (("simulated", "C7"), ("learned", "C0"), ("exact", "k:")):
         if label in values:
-            axis.plot(x, values[label], form, label=label)
+            axis.plot(frame.places(x), values[label], form, label=label)
     if len(axis.lines) > 1:
         axis.legend()
-    axis.set(title=title, xlabel="x")
+    axis.set_title(title)
+    axis.set_xlabel(frame.labels[0], parse_math=frame.symbols)
     return figure
 
 
-def _map(title: str, x: Tensor, panels: dict[str, Tensor]) -> Figure:
+def _map(title: str, x: Tensor, panels: dict[str, Tensor], frame: Frame) -> Figure:
     stride = MAP_POINTS // 16
     some = lambda t: t[:, :2].reshape(MAP_POINTS, MAP_POINTS, 2)[::stride, ::stride].transpose(0, 1).unbind(-1)
     # A control of several components is drawn as its size, with arrows for its first two.
@@ -166,10 +168,12 @@ def _map(title: str, x: Tensor, panels: dict[str, Tensor]) -> Figure:
     figure = blank_figure(5.2 * len(panels), 4.0)
     for axis, (label, values) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         grid = sizes[label].reshape(MAP_POINTS, MAP_POINTS).T
-        image = axis.imshow(grid, origin="lower", extent=(0, 1, 0, 1), vmin=low, vmax=high)
+        image = axis.imshow(grid, origin="lower", extent=frame.extent, aspect=frame.aspect, vmin=low, vmax=high)
         if values.shape[1] > 1:
-            axis.quiver(*some(x), *some(values), color="w")
+            axis.quiver(*some(frame.places(x)), *some(values), color="w")
         name = f"|{title}|" if values.shape[1] > 1 else title
-        axis.set(title=name if label == "learned" else f"{name}, {label}", xlabel="$x_1$", ylabel="$x_2$")
+        axis.set(title=name if label == "learned" else f"{name}, {label}")
+        axis.set_xlabel(frame.labels[0], parse_math=frame.symbols)
+        axis.set_ylabel(frame.labels[1], parse_math=frame.symbols)
         figure.colorbar(image, ax=axis)
     return figure

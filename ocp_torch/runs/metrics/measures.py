@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.seeds import fixed_generator
+from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
@@ -126,6 +127,13 @@ def _(problem: Pendulum, path: Path) -> dict[str, float]:
     """Upright: within 0.2 rad and 0.5 rad/s at the end."""
     angle, velocity = problem.from_torus(path.states[-1]).unbind(dim=-1)
     return {"upright": _part((angle.abs() <= UPRIGHT[0]) & (velocity.abs() <= UPRIGHT[1]))}
+
+
+@measure.register
+def _(problem: System, path: Path) -> dict[str, float]:
+    """The part of the starts from which the box is never left."""
+    left = path.each(problem.outside).any(dim=0)
+    return {"inside": _part(~left)}
 
 
 def has_metrics(problem: Problem) -> bool:

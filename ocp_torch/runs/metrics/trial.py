@@ -10,6 +10,7 @@ from torch import Tensor
 from ocp_torch.control.policies import Policy, zero_policy
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.maths.seeds import Branch, derive_seed
+from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import drawn_starts, starts_narrowly
 from ocp_torch.runs.metrics.classical import classical_policy
@@ -57,8 +58,9 @@ def metrics(problem: Problem, policy: Policy, seed: int = 0, starts: int = START
 
 
 def random_starts(problem: Problem, count: int, seed: int) -> Tensor:
-    """``(count, d)`` float64: drawn from `mu0` where that is narrow; else uniform admissible ones, or any if few are."""
-    if starts_narrowly(problem):
+    """``(count, d)`` float64: drawn from `mu0` where it is narrow or in a box; else uniform admissible ones, or any."""
+    boxed = isinstance(problem, System) and type(problem).initial_density is System.initial_density
+    if boxed or starts_narrowly(problem):
         return drawn_starts(problem, count, seed)
     generator = torch.Generator().manual_seed(seed)
     x = torch.rand(CANDIDATES * count, problem.dim, generator=generator, dtype=torch.float64)

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ocp_torch.problems.physical.coordinates import Interval
+from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.linkage import Linkage
@@ -102,23 +104,39 @@ def draw_phases(problem: Kuramoto | PhaseNeurons, axes: Any, path: Path, k: int)
     axes.set(xlim=(0, float(path.times[-1])), ylim=(0, 1.02), xlabel="time", ylabel="order parameter")
 
 
+def draw_system(problem: System, axes: Any, path: Path, k: int) -> None:
+    """The first two coordinates in their units, or the only one in time; and the ends of their box, dotted."""
+    shown = problem.coordinates[:2]
+    alone = len(shown) == 1
+    lines = [axes.axhline] if alone else [axes.axvline, axes.axhline]
+    for line, c in zip(lines, shown, strict=True):
+        for end in (c.low, c.high) if isinstance(c, Interval) else ():
+            line(end, color="0.7", linestyle=":")
+    halves = torch.tensor([0.5 * c.length for c in shown], dtype=torch.float64)
+    for x, look in _tracks(path, k):
+        track = problem.from_torus(x)[:, :2]
+        track = _broken(track / halves, 1.0) * halves  # where it goes around, it is not drawn across
+        drawn = torch.stack([path.times[: k + 1], track[:, 0]], dim=-1) if alone else track
+        axes.plot(*drawn.T, **look)
+        axes.plot(*drawn[-1], "o", color=look["color"], markersize=4)
+    ends = [(c.centre - 0.5 * c.length, c.centre + 0.5 * c.length) for c in shown]
+    time = (0.0, float(path.times[-1]))
+    axes.set(xlim=time if alone else ends[0], ylim=ends[-1], title=f"{path.times[k]:.2f}")
+    axes.set_xlabel("time" if alone else shown[0].label, parse_math=False)
+    axes.set_ylabel(shown[-1].label, parse_math=False)
+
+
 def draw_pendulums(problem: Pendulum, axes: Any, path: Path, k: int) -> None:
-    """The portrait of angle and velocity, with the band in which the model is faithful; the rod at the end in a corner."""
+    """The portrait of angle and velocity; the rod at the end in a corner."""
     from matplotlib.patches import Wedge
 
-    for speed in (-problem.max_speed, problem.max_speed):
-        axes.axhline(speed, color="0.7", linestyle=":")
-    for x, look in _tracks(path, k):
-        track = problem.from_torus(x)
-        axes.plot(*_broken(track, math.pi).T, **look)
-        axes.plot(*track[-1], "o", color=look["color"], markersize=4)
+    draw_system(problem, axes, path, k)
     corner = axes.inset_axes((0.78, 0.76, 0.2, 0.22))
     angle = float(problem.from_torus(path.states[k])[0, 0])
     corner.add_patch(Wedge((0.0, 0.0), 0.08, 0.0, 360.0, color="k"))
     corner.plot([0.0, -math.sin(angle)], [0.0, math.cos(angle)], color="C0", linewidth=4.0)
     corner.set(xlim=(-1.1, 1.1), ylim=(-1.1, 1.1), aspect="equal", xticks=[], yticks=[])
-    limits = {"xlim": (-math.pi, math.pi), "ylim": (-problem.seam, problem.seam)}
-    axes.set(**limits, xlabel="angle from upright, rad", ylabel="rad/s", title=f"{path.times[k]:.2f} s")
+    axes.set_title(f"{path.times[k]:.2f} s")
 
 
 @dataclass(frozen=True)
@@ -140,6 +158,7 @@ SCENES = {
     Pendulum: Scene(draw_pendulums, 6),
     Kuramoto: Scene(draw_phases, 24),
     PhaseNeurons: Scene(draw_phases, 24),
+    System: Scene(draw_system, 6),
 }
 
 
