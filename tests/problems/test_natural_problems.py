@@ -455,14 +455,17 @@ SOME_LIMITED = [
 ]
 
 
+@pytest.mark.parametrize("each", [False, True], ids=["one limit", "a limit for each"])
 @pytest.mark.parametrize("problem", SOME_LIMITED, ids=lambda problem: type(problem).__name__)
-def test_every_system_takes_a_control_limit_and_pays_infinitely_beyond_it(problem):
+def test_every_system_takes_a_control_limit_and_pays_infinitely_beyond_it(problem, each):
+    limit = [0.2] * problem.control_dim if each else 0.2
+    problem = type(problem)(control_limit=limit)
     u = torch.zeros(2, problem.control_dim, dtype=torch.float64)
     u[0, 0], u[1, -1] = 0.199, 0.201
     cost = problem.control_cost.cost(u)
     assert cost.tolist() == [pytest.approx(0.199**2 / 2.0), math.inf]
-    assert problem.parameters["control_limit"] == 0.2
-    assert PROBLEMS[problem_name(problem)](**problem.parameters).control_limit == 0.2
+    assert problem.parameters["control_limit"] == limit
+    assert PROBLEMS[problem_name(problem)](**problem.parameters).control_limit == limit
     free = type(problem)()
     assert free.control_limit is None
     assert problem.occupation_bound == free.occupation_bound
@@ -491,11 +494,13 @@ def test_a_limit_makes_the_optimum_dearer_but_changes_nothing_near_the_state_of_
     assert float(other.interpolate(far)[0]) > 1.05 * float(one.interpolate(far)[0])
 
 
-def test_the_practitioners_numbers_hold_every_law_to_the_limit():
-    pendulum = Pendulum(control_limit=0.3)
-    reckless = lambda x: torch.full_like(x[:, :1], 50.0)
-    at_limit = lambda x: torch.full_like(x[:, :1], 0.3)
-    one, other = (metrics(pendulum, policy, seed=1, starts=8)["controller"] for policy in (reckless, at_limit))
+@pytest.mark.parametrize(
+    ("problem", "most"), [(Pendulum(control_limit=0.3), [0.3]), (Unicycle(control_limit=[0.3, 0.1]), [0.3, 0.1])]
+)
+def test_the_practitioners_numbers_hold_every_law_to_the_limit(problem, most):
+    reckless = lambda x: torch.full_like(x[:, :1], 50.0).expand(-1, len(most))
+    at_limit = lambda x: x.new_tensor(most).expand(len(x), -1)
+    one, other = (metrics(problem, policy, seed=1, starts=8)["controller"] for policy in (reckless, at_limit))
     assert one == other
     assert math.isfinite(one["cost"])
 

@@ -81,6 +81,16 @@ _LIMITED = {
     ),
     "limited 2-d with noise": partial(Manufactured, control_limit=0.5, noise=[0.0, 0.02]),
     "limited 3-d m=2 q=1.2": partial(Manufactured, dim=3, control_dim=2, exponent=1.2, control_limit=0.5),
+    "box-limited 2-d": partial(Manufactured, control_limit=[0.6, 0.3], seed=2),
+    "box-limited 3-d m=2 B(x) with noise": partial(
+        Manufactured,
+        dim=3,
+        control_dim=2,
+        control_limit=[0.3, 0.5],
+        state_dependent_control=True,
+        initial_contrast=0.5,
+        noise=[0.0, 0.02, 0.01],
+    ),
 }
 # Exact truth with noise: isotropic; full and varying; in one coordinate of two; and beside all else.
 _NOISY = {
