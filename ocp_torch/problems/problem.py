@@ -16,12 +16,8 @@ from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.constant_noise import column_matrix, constant_diffusion
-<<<<<<< HEAD
-from ocp_torch.problems.control_limit import control_cost
-from ocp_torch.problems.placed import Placed
-=======
 from ocp_torch.problems.control_limit import Limit, control_cost
->>>>>>> b1
+from ocp_torch.problems.placed import Placed
 from ocp_torch.problems.reproducible import Reproducible
 from ocp_torch.problems.samples import Samples
 
