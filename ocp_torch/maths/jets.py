@@ -153,10 +153,14 @@ def diffusion_divergences(noise: Callable[[Tensor], Any], x: Tensor) -> tuple[Te
     field ``noise``, `sigma`: ``(N, d) -> (N, d, k)``."""
 
     def row_divergence(y: Tensor) -> Tensor:
-        D = lambda z: 0.5 * torch.einsum("nik,njk->nij", noise(z), noise(z)).flatten(1)
-        d = y.shape[1]
-        _, jacobian = value_and_jacobian(D, y)  # (d d, N, d)
-        return torch.einsum("ijnj->ni", jacobian.unflatten(0, (d, d)))
+        # Of sigma_ik sigma_jk / 2 by the product rule: d k reverse passes, where D itself would take d^2.
+        flat, jacobian = value_and_jacobian(lambda z: noise(z).flatten(1), y)
+        sigma, slope = (
+            flat.unflatten(1, (y.shape[1], -1)),
+            jacobian.unflatten(0, (y.shape[1], -1)),
+        )  # slope (i, k, N, j)
+        along = torch.einsum("njk,iknj->ni", sigma, slope)
+        return 0.5 * (along + torch.einsum("nik,jknj->ni", sigma, slope))
 
     div_D, jacobian = value_and_jacobian(row_divergence, x)
     return div_D, torch.einsum("ini->n", jacobian)
