@@ -12,7 +12,9 @@ from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
+from ocp_torch.problems.systems.quadrotor import Quadrotor
 from ocp_torch.problems.systems.robot import RobotArm
+from ocp_torch.problems.systems.satellite import Satellite
 from ocp_torch.problems.systems.unicycle import Unicycle
 
 # `Simulator` is not among them: a file may not name a function to be imported.
@@ -30,6 +32,8 @@ PROBLEMS: dict[str, type[Problem]] = {
     "robot": RobotArm,
     "acrobot": Acrobot,
     "pendubot": Pendubot,
+    "quadrotor": Quadrotor,
+    "satellite": Satellite,
 }
 
 # What `Simulator` was called in files written before.

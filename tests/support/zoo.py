@@ -8,14 +8,18 @@ import torch
 
 from ocp_torch.fields import PeriodicMLP
 from ocp_torch.problems import (
+    Acrobot,
     Arm,
     Circle,
     Dubins,
     Kuramoto,
     Manufactured,
+    Pendubot,
     Pendulum,
     PhaseNeurons,
     Problem,
+    Quadrotor,
+    Satellite,
     Torus,
     Unicycle,
 )
@@ -128,6 +132,11 @@ _NATURAL = {
     "kuramoto entrain": partial(Kuramoto, goal="entrain", graph="ring"),
     "kuramoto desynchronise": partial(Kuramoto, goal="desynchronise", coupling=2.0),
     "phase neurons n=2": PhaseNeurons,
+    "acrobot": Acrobot,
+    "pendubot from hanging": partial(Pendubot, starts="hanging", torque_cost=0.2, control_limit=None),
+    "quadrotor": Quadrotor,
+    "quadrotor without obstacles": partial(Quadrotor, obstacles=[], control_limit=0.5, thrust_cost=2.0),
+    "satellite": Satellite,
     "phase neurons n=3 type 1": partial(PhaseNeurons, neurons=3, response="type1"),
 }
 

@@ -31,7 +31,7 @@ class DoublePendulum(System):
     with the viscous ``damping`` in N m s/rad. ``masses`` in kg, ``lengths`` in m, ``centres`` of mass in m from the joint,
     ``inertias`` in kg m^2 about the joint.
 
-    The box is ``max_speeds``. ``start`` is *anywhere* (any angles, speeds up to 0.3 of those) or *hanging* (at rest, with a
+    The box is ``max_speeds``. ``starts`` is *anywhere* (any angles, speeds up to 0.3 of those) or *hanging* (at rest, with a
     spread of 0.5 rad and 1 rad/s). ``torque_noise`` in N m sqrt(s) enters as the torque does. A2 of the paper fails. Raises
     `InputError` for wrong arguments.
     """
@@ -49,7 +49,7 @@ class DoublePendulum(System):
         max_speeds: Sequence[float] = (15.0, 25.0),
         speed_cost: float = 0.01,
         torque_cost: float = 0.1,
-        start: str = "anywhere",
+        starts: str = "anywhere",
         discount: float = 1.0,
         exponent: float = 2.0,
         control_limit: float | None = 6.0,
@@ -69,11 +69,14 @@ class DoublePendulum(System):
         self.speed_cost = require_number("problem.speed_cost", speed_cost, at_least=0.0)
         self.torque_cost = require_number("problem.torque_cost", torque_cost, above=0.0)
         self.torque_noise = require_number("problem.torque_noise", torque_noise, at_least=0.0)
-        if start not in STARTS:
-            raise InputError(f"problem.start is {start!r}, but must be {' or '.join(STARTS)}{nearest(str(start), STARTS)}.")
+        if starts not in STARTS:
+            raise InputError(
+                f"problem.starts is {starts!r}, but must be {' or '.join(STARTS)}{nearest(str(starts), STARTS)}."
+            )
         names = ("shoulder", "elbow")
         speeds = [Interval(f"{n} speed", -v, v, "rad/s") for n, v in zip(names, self.max_speeds, strict=True)]
         slow = {c.name: (ANYWHERE * c.low, ANYWHERE * c.high) for c in speeds}
+        self.starts = starts
         super().__init__(
             [*(Angle(name) for name in names), *speeds],
             [f"{names[self.joint]} torque [N m]"],
@@ -81,10 +84,9 @@ class DoublePendulum(System):
             exponent,
             control_weight=self.torque_cost,
             control_limit=control_limit,
-            start=slow if start == "anywhere" else Points([HANGING], HANGING_SPREAD),
+            start=slow if starts == "anywhere" else Points([HANGING], HANGING_SPREAD),
             noise=noise,
         )
-        self.start = start
         self._set_constants()
         seams = [0.5 * c.length for c in speeds]
         self.state_cost_bound = 8.0 + self.speed_cost * sum(v**2 for v in seams)

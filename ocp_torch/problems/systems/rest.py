@@ -46,8 +46,8 @@ def occupation_bound_at_rest(A: Tensor, B: Tensor, Q: Tensor, rho: float, expone
 
 
 def linearised(system: System, state: Sequence[float]) -> tuple[Tensor, Tensor, Tensor]:
-    """`A` ``(d, d)``, `B` ``(d, m)`` and `Q` ``(d, d)``, the Hessian of the cost, at a ``state`` of rest: of physical states, and
-    of controls whose price is `|v|^2 / 2`."""
+    """`A` ``(d, d)``, `B` ``(d, m)`` and `Q` ``(d, d)``, the Hessian of the cost, at a ``state`` of rest: of physical states,
+    and of controls whose price is `|v|^2 / 2`."""
     at = torch.tensor(state, dtype=torch.float64)
     A = torch.func.jacrev(lambda s: system.dynamics(s[None])[0][0])(at)
     B = system.from_controls(system.dynamics(at[None])[1][0].detach())

@@ -8,12 +8,16 @@ from torch import Tensor
 from ocp_torch.control.policies import Policy
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.angles import TURN
+from ocp_torch.problems.systems.double_pendulum import DoublePendulum
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
+from ocp_torch.problems.systems.quadrotor import Quadrotor
+from ocp_torch.problems.systems.satellite import Satellite
 from ocp_torch.problems.systems.unicycle import Unicycle
+from ocp_torch.runs.metrics import feedback
 
 # Arms: the gain per second, and the damping of the pseudo-inverse relative to the arm's length.
 REACH, DAMPING = 1.5, 0.1
@@ -89,3 +93,8 @@ def energy_pump(problem: Pendulum, x: Tensor) -> Tensor:
     balance = -(BALANCE[0] * angle + BALANCE[1] * velocity) / 3.0
     near = (angle.abs() < CATCH[0]) & (velocity.abs() < CATCH[1])
     return (torch.where(near, balance, pump) / problem.max_torque).clamp(-1.0, 1.0).unsqueeze(-1)
+
+
+classical_control.register(DoublePendulum, feedback.swing_up)
+classical_control.register(Quadrotor, feedback.hover)
+classical_control.register(Satellite, feedback.point)
