@@ -133,6 +133,7 @@ _NATURAL = {
     "kuramoto desynchronise": partial(Kuramoto, goal="desynchronise", coupling=2.0),
     "phase neurons n=2": PhaseNeurons,
     "acrobot": Acrobot,
+    "pendubot": Pendubot,
     "pendubot from hanging": partial(Pendubot, starts="hanging", torque_cost=0.2, control_limit=None),
     "quadrotor": Quadrotor,
     "quadrotor without obstacles": partial(Quadrotor, obstacles=[], control_limit=0.5, thrust_cost=2.0),
