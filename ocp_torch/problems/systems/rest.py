@@ -49,6 +49,6 @@ def linearised(system: System, state: Sequence[float]) -> tuple[Tensor, Tensor, 
     """`A` ``(d, d)``, `B` ``(d, m)`` and `Q` ``(d, d)``, the Hessian of the cost, at a ``state`` of rest: of physical states,
     and of controls whose price is `|v|^2 / 2`."""
     at = torch.tensor(state, dtype=torch.float64)
-    A = torch.func.jacrev(lambda s: system.dynamics(s[None])[0][0])(at)
+    A = torch.autograd.functional.jacobian(lambda s: system.dynamics(s[None])[0][0], at)
     B = system.from_controls(system.dynamics(at[None])[1][0].detach())
-    return A, B, torch.func.hessian(lambda s: system.cost(s[None])[0])(at)
+    return A, B, torch.autograd.functional.hessian(lambda s: system.cost(s[None])[0], at)
