@@ -4,7 +4,7 @@ from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.problems import PROBLEMS, Circle, Dataset, Manufactured, Problem, Simulator, Torus
 from ocp_torch.problems.control_cost import PowerCost
-from ocp_torch.problems.control_limit import LimitedCost
+from ocp_torch.problems.control_limit import BoxLimitedCost, LimitedCost
 from ocp_torch.problems.physical.coordinates import Angle, Interval
 from ocp_torch.problems.physical.start import Points
 from ocp_torch.problems.physical.system import System
@@ -14,6 +14,7 @@ __version__ = "0.1.0"
 __all__ = [
     "PROBLEMS",
     "Angle",
+    "BoxLimitedCost",
     "Simulator",
     "Circle",
     "Controller",

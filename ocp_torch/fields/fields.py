@@ -108,4 +108,4 @@ def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:
     mean = float(f.mean())
     spread = spread if spread > CONSTANT * max(abs(mean), 1e-300) else max(abs(mean), 1.0)
     control = math.pow(problem.exponent * spread, 1.0 / problem.exponent)
-    return (mean, spread), control if problem.control_limit is None else min(control, problem.control_limit)
+    return (mean, spread), min(control, problem.control_cost.reach)

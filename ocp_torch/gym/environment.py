@@ -43,7 +43,7 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
     """An environment whose discounted return, with factor `e^{-rho dt}`, is `-Perf` up to the time step.
 
     Observations are cosine and sine of each coordinate, actions in `[-1, 1]^m` are controls in units of
-    ``control_bound`` (default: what the problem knows of `sup |u*|`), within the problem's own limit; one step holds the
+    ``control_bound`` (default: what the problem knows of `sup |u*|`), within the problem's own limits; one step holds the
     control for ``time_step`` (units of time) with one midpoint step, and the reward is minus the cost of that step. Where
     there is noise it is added as Euler and Maruyama do, from the environment's own generator.
     Episodes are cut, not ended, after ``horizon``. Of a `System`, ``info`` has the state, and the control of the step, in
@@ -65,14 +65,13 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
         if not problem.has_simulator:
             raise InputError("a data set cannot be simulated, so it is no environment.")
         self.problem, self.render_mode = problem, render_mode
-        self.control_bound = resolve_constants(problem).C_u if control_bound is None else control_bound
-        if problem.control_limit is not None:
-            self.control_bound = min(self.control_bound, problem.control_limit)
+        bound = resolve_constants(problem).C_u if control_bound is None else control_bound
+        # A number, or one for each actuator.
+        self.control_bound = np.minimum(require_number("control_bound", bound, above=0.0), problem.control_cost.sides)
         self.time_step = HELD / problem.discount if time_step is None else time_step
         self.horizon = LENGTH / problem.discount if horizon is None else horizon
         require_number("rl.time_step", self.time_step, above=0.0)
         require_number("rl.horizon", self.horizon, above=0.0)
-        require_number("control_bound", self.control_bound, above=0.0)
         if render_mode is not None:
             require_choice("render_mode", render_mode, ("rgb_array",))
         if isinstance(problem, System):
@@ -121,7 +120,7 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
     def step(self, action):
         problem, h = self.problem, self.time_step
         u = torch.as_tensor(np.asarray(action), dtype=torch.float64).reshape(1, -1).clamp(-1.0, 1.0)
-        u = problem.control_cost.within(self.control_bound * u, torch.ones(1, dtype=torch.float64))
+        u = problem.control_cost.within(torch.as_tensor(self.control_bound) * u, torch.ones(1, dtype=torch.float64))
         middle = self.x + 0.5 * h * problem.velocity(self.x, u)
         cost = float(problem.state_cost(middle) + problem.control_cost.cost(u))
         self.x = (self.x + h * problem.velocity(middle, u) + self._kick()).remainder(1.0)

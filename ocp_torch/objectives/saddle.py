@@ -16,8 +16,8 @@ from ocp_torch.problems.samples import Samples
 class Saddle(Objective):
     r"""`sup_V inf_w Psi`, `Psi = E[V mu0 + grad V . B w / rho + S_M(w, f - V + L^0 V / rho)]`, `S_M` of Lemma 3.
 
-    Convex in `w`, concave in `V`, and needs no divergence of the problem. (With a limit `c` on the control, `S_M` is finite
-    for `|w| <= c M` only, and `w` is shrunk to that ball first.) With ``augmentation`` `k > 0` the value player
+    Convex in `w`, concave in `V`, and needs no divergence of the problem. (With a limit on the control, `S_M` is finite
+    for those `w` only that `M` can carry, and `w` is cut to them first.) With ``augmentation`` `k > 0` the value player
     minimises `-(Psi + k F_M)`, which `V*` does as well.
     """
 

@@ -74,9 +74,9 @@ def resolve_constants(
     chosen: dict[str, float] = {}
     sources: dict[str, str] = {}
     notes: list[str] = []
-    limit, declared_control = problem.control_limit, problem.control_bound
+    reach, declared_control = problem.control_cost.reach, problem.control_bound
     if declared_control is None or not math.isfinite(declared_control):
-        declared_control = limit
+        declared_control = reach
     for name, field, configured, declared, estimate in (
         ("C_V", "method.value_bound", value_bound, problem.value_bound, _estimate_value_bound),
         ("C_u", "method.control_bound", control_bound, declared_control, _estimate_control_bound),
@@ -91,8 +91,7 @@ def resolve_constants(
         else:
             (chosen[name], why), sources[name] = estimate(problem), ESTIMATED
             notes.append(f"{name} is not known: {chosen[name]:.4g} is {why}; {field} sets it.")
-    if limit is not None:
-        chosen["C_u"] = min(chosen["C_u"], limit)
+    chosen["C_u"] = min(chosen["C_u"], reach)
     true = problem.occupation_bound
     if sources["M"] == FROM_CONFIGURATION and true is not None and chosen["M"] < true:
         shown = f"{true:.4g}" if math.isfinite(true) else "infinite"

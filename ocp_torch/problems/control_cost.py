@@ -38,11 +38,24 @@ def norm_power(vectors: Tensor, exponent: float) -> Tensor:
     return power(squares, exponent / 2) * scale**exponent
 
 
+def radial_part(p: Tensor, moved: Tensor) -> Tensor:
+    """The part along ``p`` ``(N, m)`` of each column of ``moved`` ``(N, m, k)``; 0 where `p = 0`."""
+    direction = torch.nn.functional.normalize(p, dim=-1, eps=1e-30).unsqueeze(-1)
+    return direction * (direction * moved).sum(dim=1, keepdim=True)
+
+
 class PowerCost:
     r"""`R(u) = |u|^q / q` with `q` in (1, 2] and the Euclidean norm; `R*(p) = |p|^{q'} / q'`, `1/q + 1/q' = 1`.
 
     Raises `InputError` when the exponent is outside (1, 2].
+
+    What limits there are: ``limit`` as the problem has it, ``reach`` the largest `|u|`, ``sides`` the largest `|u_i|`, a
+    number or one for each `i`.
     """
+
+    limit: float | list[float] | None = None
+    reach: float = math.inf
+    sides: float | list[float] = math.inf
 
     def __init__(self, exponent: float = 2.0) -> None:
         self.q = require_number("exponent", exponent, above=1.0, at_most=2.0)
@@ -66,6 +79,14 @@ class PowerCost:
             return p
         return norm_power(p, self.conjugate_exponent - 2.0).unsqueeze(-1) * p
 
+    def argmax_along(self, p: Tensor, moved: Tensor) -> Tensor:
+        r"""How `argmax` changes at ``p`` ``(N, m)`` along each column of ``moved`` ``(N, m, k)``: with `n = p / |p|`,
+        `|p|^{q'-2} (I + (q'-2) n n^T)` times it."""
+        power = self.conjugate_exponent - 2.0
+        if power == 0.0:
+            return moved
+        return norm_power(p, power)[:, None, None] * (moved + power * radial_part(p, moved))
+
     def perspective(self, w: Tensor, mu: Tensor) -> Tensor:
         """`mu R(w / mu)`, with its closure at `mu = 0`: 0 if `w = 0`, infinity otherwise; ``(N, m), (N,) -> (N,)``."""
         positive = mu > 0
@@ -75,8 +96,12 @@ class PowerCost:
         outside = torch.where((w != 0).any(dim=-1), math.inf, 0.0).to(mu)
         return torch.where(positive, inside, outside)
 
+    def gauge(self, w: Tensor) -> Tensor:
+        """The least `mu` ``(N,)`` that carries ``w`` ``(N, m)`` with controls within the limit; 0 where there is none."""
+        return torch.zeros_like(w[..., 0])
+
     def within(self, w: Tensor, mu: Tensor | float) -> Tensor:
-        """``w`` ``(N, m)``, shortened to what `mu` ``(N,)`` allows; without a limit on `u` as it is."""
+        """``w`` ``(N, m)``, cut to the nearest that `mu` ``(N,)`` allows; without a limit on `u` as it is."""
         return w
 
     def admissible(self, control_density: Field, occupation: Field) -> Field:

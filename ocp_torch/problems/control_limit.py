@@ -1,100 +1,171 @@
-r"""A limit on the size of the control, `|u| <= c`, as a control cost: `R_c(u) = |u|^q / q` within the ball, infinite outside.
+r"""Limits on the control as control costs: `R_K(u) = |u|^q / q` within a convex set `K` of controls, and infinite outside.
 
-The paper's Corollary 1 allows any compact control set. What changes against `PowerCost`: the conjugate is linear beyond
-`|p| = c^{q-1}`, where its maximiser reaches the limit; and since `mu R_c(w / mu)` is finite for `mu >= |w| / c` only, both
-pointwise minimisers over `mu` are clipped from below there (the functions they minimise are convex in `mu`).
+The paper's Corollary 1 allows any compact set. What changes against `PowerCost`: the conjugate is linear where its maximiser
+is at the limit; and since `mu R_K(w / mu)` is finite for `w` in `mu K` only, both pointwise minimisers over `mu` are clipped
+from below there (the functions they minimise are convex in `mu`). Two methods say what `K` is: `gauge`, the least `mu` that
+carries a `w`, and `within`, the point of `mu K` nearest to `w`.
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import require_number
+from ocp_torch.errors import InputError, require_number, require_numbers, shown
 from ocp_torch.maths.jets import Field
-from ocp_torch.problems.control_cost import PowerCost, norm_power
+from ocp_torch.problems.control_cost import PowerCost, norm_power, radial_part
 
+# What a problem may be told: the largest `|u|`, or a list of the largest `|u_i|`; `None` where there is no limit.
+Limit = float | Sequence[float] | None
 # How far, relative to the limit, rounding may carry a control beyond it: in double, and in any other precision.
 ROOM, COARSE_ROOM = 1e-9, 1e-4
 # Limits whose powers up to the second, and one over them, stay far from the ends of single precision.
 SMALLEST, LARGEST = 1e-9, 1e9
 
 
-class LimitedCost(PowerCost):
+class ConstrainedCost(PowerCost):
+    """`R_K` of a class that gives `gauge` and `within`. Within ``bend`` times `K` the conjugate is `R*`; and the maximiser at
+    any other `p` is that of the nearest point there."""
+
+    bend = 1.0
+
+    def cost(self, u: Tensor) -> Tensor:
+        return torch.where(self.gauge(u.detach()) <= 1.0 + _room(u), super().cost(u), math.inf)
+
+    def conjugate(self, p: Tensor) -> Tensor:
+        near = self.within(p, self.bend)  # of a larger p the power would overflow
+        return super().conjugate(near) + (super().argmax(near) * (p - near)).sum(dim=-1)
+
+    def argmax(self, p: Tensor) -> Tensor:
+        u = super().argmax(self.within(p, self.bend))
+        return u if self.q == 2.0 else self.within(u, 1.0)  # the power of what was rounded may be beyond the limit
+
+    def perspective(self, w: Tensor, mu: Tensor) -> Tensor:
+        """`mu R_K(w / mu)`: infinite where `w` is not in `mu K`, beyond rounding, so also where `mu = 0` and `w != 0`."""
+        allowed = self.gauge(w.detach()) <= (1.0 + _room(w)) * mu.detach()
+        # Only what is allowed goes in: an infinite cost would spoil the gradients of the branch that is not taken.
+        inside = super().perspective(torch.where(allowed.unsqueeze(-1), w, 0.0), mu)
+        return torch.where(allowed, inside, math.inf)
+
+    def admissible(self, control_density: Field, occupation: Field) -> Field:
+        """`w` cut to `mu K`, state by state. Everything that is made of `w` is made of this field, its divergence too: `J` is
+        then finite and a bound for whatever two networks say, and its gradients reach both of them."""
+        return lambda x: self.within(control_density(x), occupation(x))
+
+    def primal_occupation(self, w: Tensor, f: Tensor, value_bound: float, residual: Tensor) -> Tensor:
+        """The minimiser of Lemma 2, but at least the gauge of `w`."""
+        return torch.maximum(super().primal_occupation(w, f, value_bound, residual), self.gauge(w))
+
+    def primal_minimum(self, w: Tensor, f: Tensor, value_bound: float, residual: Tensor) -> Tensor:
+        least = self.gauge(w)
+        clipped = super().primal_occupation(w.detach(), f, value_bound, residual.detach()) < least
+        at_limit = least * f + self._at_limit(w) + value_bound * (residual - least).clamp_min(0.0)
+        return torch.where(clipped, at_limit, super().primal_minimum(w, f, value_bound, residual))
+
+    def saddle_occupation(self, w: Tensor, beta: Tensor, occupation_bound: float) -> Tensor:
+        """The minimiser of Lemma 3, but at least the gauge of `w`; `M` where even that is too little for `w`."""
+        least = self.gauge(w).clamp_max(occupation_bound)
+        return torch.maximum(super().saddle_occupation(w, beta, occupation_bound), least)
+
+    def saddle_minimum(self, w: Tensor, beta: Tensor, occupation_bound: float) -> Tensor:
+        """As in Lemma 3 from the gauge of `w` up to `M`, and infinite where that is empty: hand in ``within(w, M)``."""
+        least = self.gauge(w)
+        clipped = super().saddle_occupation(w.detach(), beta.detach(), occupation_bound) < least
+        at_limit = least * beta + self._at_limit(w)
+        found = torch.where(clipped, at_limit, super().saddle_minimum(w, beta, occupation_bound))
+        return torch.where(least > occupation_bound * (1.0 + _room(w)), math.inf, found)
+
+    def _at_limit(self, w: Tensor) -> Tensor:
+        """`mu R(w / mu)` at the least `mu`, ``(N,)``; of `w` in units of its largest entry: squares do not underflow."""
+        size = w.detach().abs().amax(dim=-1)
+        size = torch.where(size > 0.0, size, 1.0)
+        w = w / size.unsqueeze(-1)
+        return size * self.perspective(w, self.gauge(w))
+
+
+class LimitedCost(ConstrainedCost):
     r"""`R_c(u) = |u|^q / q` for `|u| <= c`, else infinity; `R_c*(p) = R*(p)` up to `|p| = c^{q-1}`, then `c |p| - c^q / q`.
 
     ``limit`` is `c > 0`, in units of the control. Raises `InputError` for a limit or an exponent out of range.
     """
 
+    limit: float
+
     def __init__(self, exponent: float, limit: float) -> None:
         super().__init__(exponent)
-        self.limit = require_number("problem.control_limit", limit, above=0.0, at_least=SMALLEST, at_most=LARGEST)
+        self.limit = self.reach = self.sides = _size("problem.control_limit", limit)
+        self.bend = self.limit ** (self.q - 2.0)
         self.knee = self.limit ** (self.q - 1.0)  # where |grad R*(p)| reaches the limit
         self.largest = self.limit**self.q / self.q  # R at the limit
 
-    def cost(self, u: Tensor) -> Tensor:
-        allowed = norm_power(u.detach(), 1.0) <= self.limit * (1.0 + _room(u))
-        return torch.where(allowed, super().cost(u), math.inf)
-
-    def conjugate(self, p: Tensor) -> Tensor:
-        size = norm_power(p, 1.0)
-        inside = size <= self.knee
-        # The power of a large |p| overflows, and would spoil the gradient from the branch that is not taken.
-        near = super().conjugate(torch.where(inside.unsqueeze(-1), p, 0.0))
-        return torch.where(inside, near, self.limit * size - self.largest)
-
-    def argmax(self, p: Tensor) -> Tensor:
-        size = norm_power(p, 1.0).unsqueeze(-1)
-        inside = size <= self.knee
-        near = super().argmax(torch.where(inside, p, 0.0))
-        return torch.where(inside, near, self.limit * p / torch.where(inside, 1.0, size))
-
-    def perspective(self, w: Tensor, mu: Tensor) -> Tensor:
-        """`mu R_c(w / mu)`: infinite where `|w| > c mu`, beyond rounding, so also where `mu = 0` and `w != 0`."""
-        allowed = norm_power(w.detach(), 1.0) <= self.limit * (1.0 + _room(w)) * mu.detach()
-        # Only what is allowed goes in: an infinite cost would spoil the gradients of the branch that is not taken.
-        inside = super().perspective(torch.where(allowed.unsqueeze(-1), w, 0.0), mu)
-        return torch.where(allowed, inside, math.inf)
+    def gauge(self, w: Tensor) -> Tensor:
+        return norm_power(w, 1.0) / self.limit
 
     def within(self, w: Tensor, mu: Tensor | float) -> Tensor:
-        size = norm_power(w, 1.0)
-        room = self.limit * mu
-        scale = torch.where(size > room, room / torch.where(size > 0.0, size, 1.0), 1.0)
+        size, room = norm_power(w, 1.0), self.limit * mu
+        beyond = size > room
+        # The quotient by a tiny size would overflow, and spoil the gradient of the branch that is taken.
+        scale = torch.where(beyond, room / torch.where(beyond, size, 1.0), 1.0)
         return w * scale.unsqueeze(-1)
 
-    def admissible(self, control_density: Field, occupation: Field) -> Field:
-        """`w` shrunk to `|w| <= c mu`, state by state. Everything that is made of `w` is made of this field, its divergence
-        too: `J` is then finite and a bound for whatever two networks say, and its gradients reach both of them."""
-        return lambda x: self.within(control_density(x), occupation(x))
+    def argmax_along(self, p: Tensor, moved: Tensor) -> Tensor:
+        """At the limit `(c / |p|) (I - n n^T)`: only its direction changes."""
+        size = norm_power(p, 1.0)[:, None, None]
+        at_limit = size > self.knee
+        turned = self.limit / torch.where(at_limit, size, 1.0) * (moved - radial_part(p, moved))
+        return torch.where(at_limit, turned, super().argmax_along(p, moved))
 
-    def primal_occupation(self, w: Tensor, f: Tensor, value_bound: float, residual: Tensor) -> Tensor:
-        """The minimiser of Lemma 2, but at least `|w| / c`."""
-        return torch.maximum(super().primal_occupation(w, f, value_bound, residual), norm_power(w, 1.0) / self.limit)
+    def _at_limit(self, w: Tensor) -> Tensor:
+        return self.gauge(w) * self.largest
 
-    def primal_minimum(self, w: Tensor, f: Tensor, value_bound: float, residual: Tensor) -> Tensor:
-        least = norm_power(w, 1.0) / self.limit
-        clipped = super().primal_occupation(w.detach(), f, value_bound, residual.detach()) < least
-        at_limit = least * (f + self.largest) + value_bound * (residual - least).clamp_min(0.0)
-        return torch.where(clipped, at_limit, super().primal_minimum(w, f, value_bound, residual))
 
-    def saddle_occupation(self, w: Tensor, beta: Tensor, occupation_bound: float) -> Tensor:
-        """The minimiser of Lemma 3, but at least `|w| / c`; `M` where even that is too little for `w`."""
-        least = (norm_power(w, 1.0) / self.limit).clamp_max(occupation_bound)
-        return torch.maximum(super().saddle_occupation(w, beta, occupation_bound), least)
+class BoxLimitedCost(ConstrainedCost):
+    r"""`R_c(u) = |u|^2 / 2` for `|u_i| <= c_i`, else infinity: a sum over the actuators, as is its conjugate, of Huber's
+    functions `R_{c_i}*(p_i)`; but the actuators share `mu`, which is at least `max_i |w_i| / c_i`.
 
-    def saddle_minimum(self, w: Tensor, beta: Tensor, occupation_bound: float) -> Tensor:
-        """As in Lemma 3 over `[|w| / c, M]`, and infinite where that is empty: hand in ``within(w, M)``."""
-        least = norm_power(w, 1.0) / self.limit
-        clipped = super().saddle_occupation(w.detach(), beta.detach(), occupation_bound) < least
-        at_limit = least * (beta + self.largest)
-        found = torch.where(clipped, at_limit, super().saddle_minimum(w, beta, occupation_bound))
-        return torch.where(least > occupation_bound * (1.0 + _room(w)), math.inf, found)
+    ``limit`` is the list of the `c_i > 0`, in units of the controls, ``count`` of them where that is known. Raises
+    `InputError` for any other list, and for an exponent other than 2, with which the cost is no sum.
+    """
+
+    limit: list[float]
+
+    def __init__(self, exponent: float, limit: Sequence[float], count: int | None = None) -> None:
+        super().__init__(exponent)
+        if self.q != 2.0:
+            raise InputError(
+                f"problem.control_limit is {shown(limit)}, a limit for each actuator, but problem.exponent is {self.q:g}; "
+                "that goes with problem.exponent=2 alone, and one number limits |u| with any."
+            )
+        names = (f"problem.control_limit[{i}]" for i in range(len(limit)))
+        numbers = require_numbers("problem.control_limit", limit, count)
+        self.limit = self.sides = [_size(name, c) for name, c in zip(names, numbers, strict=True)]
+        self.reach = math.hypot(*self.limit)
+
+    def gauge(self, w: Tensor) -> Tensor:
+        return (w.abs() / w.new_tensor(self.limit)).amax(dim=-1)
+
+    def within(self, w: Tensor, mu: Tensor | float) -> Tensor:
+        room = w.new_tensor(self.limit) * (mu.unsqueeze(-1) if isinstance(mu, Tensor) else mu)
+        return w.clamp(-room, room)
+
+    def argmax_along(self, p: Tensor, moved: Tensor) -> Tensor:
+        """An entry at its limit stays there."""
+        return torch.where((p.abs() > p.new_tensor(self.limit)).unsqueeze(-1), 0.0, moved)
+
+
+def _size(name: str, limit: object) -> float:
+    return require_number(name, limit, above=0.0, at_least=SMALLEST, at_most=LARGEST)
 
 
 def _room(like: Tensor) -> float:
     return ROOM if like.dtype == torch.float64 else COARSE_ROOM
 
 
-def control_cost(exponent: float, limit: float | None = None) -> PowerCost:
-    """`R` of this exponent, within ``limit`` if there is one."""
-    return PowerCost(exponent) if limit is None else LimitedCost(exponent, limit)
+def control_cost(exponent: float, limit: Limit = None, count: int | None = None) -> PowerCost:
+    """`R` of this exponent, within ``limit`` if there is one: a number, or a list of one for each of ``count`` actuators."""
+    if limit is None:
+        return PowerCost(exponent)
+    if isinstance(limit, Sequence) and not isinstance(limit, str):
+        return BoxLimitedCost(exponent, limit, count)
+    return LimitedCost(exponent, limit)

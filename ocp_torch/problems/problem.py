@@ -16,7 +16,7 @@ from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.constant_noise import column_matrix, constant_diffusion
-from ocp_torch.problems.control_limit import control_cost
+from ocp_torch.problems.control_limit import Limit, control_cost
 from ocp_torch.problems.placed import Placed
 from ocp_torch.problems.reproducible import Reproducible
 from ocp_torch.problems.samples import Samples
@@ -52,8 +52,9 @@ class Problem(Reproducible, Placed):
     All methods are batched, take states ``(N, d)``, work in the precision and on the device of their argument, and have
     period 1 in each coordinate. Arguments of `__init__`: ``dim`` is `d`, ``control_dim`` is `m` (default `d`),
     ``discount`` is `rho > 0` (per unit time), ``exponent`` is `q` in (1, 2], ``control_limit`` is `c > 0` where controls
-    must satisfy `|u| <= c` (Euclidean), else `None`; ``noise`` is `nu >= 0`, or one for each coordinate, where Brownian
-    motions spread the state (`D = nu`, torus units squared per unit time). Raises `InputError` outside these ranges.
+    must satisfy `|u| <= c` (Euclidean), a list of `m` numbers where each `|u_i| <= c_i` (for `q = 2`), else `None`;
+    ``noise`` is `nu >= 0`, or one for each coordinate, where Brownian motions spread the state (`D = nu`, torus units
+    squared per unit time). Raises `InputError` outside these ranges.
 
     Attributes a subclass may set, each `None` where unknown: ``state_cost_bound >= sup f``; ``occupation_bound >= sup
     mu*`` (`math.inf` when known to be unbounded); ``control_bound >= sup |u*|``; ``value_bound >= sup V*``;
@@ -74,7 +75,7 @@ class Problem(Reproducible, Placed):
         control_dim: int | None = None,
         discount: float = 2.0,
         exponent: float = 2.0,
-        control_limit: float | None = None,
+        control_limit: Limit = None,
         noise: float | Sequence[float] = 0.0,
     ) -> None:
         self.dim = require_integer("problem.dim", dim, 1, maximum=MOST_COORDINATES)
@@ -83,8 +84,8 @@ class Problem(Reproducible, Placed):
         within = dict(at_least=LEAST_DISCOUNT, at_most=LARGEST_DISCOUNT)
         self.discount = require_number("problem.discount", discount, above=0.0, **within)
         self.exponent = require_number("problem.exponent", exponent, above=1.0, at_most=2.0)
-        self.control_cost = control_cost(self.exponent, control_limit)
-        self.control_limit = None if control_limit is None else float(control_limit)
+        self.control_cost = control_cost(self.exponent, control_limit, self.control_dim)
+        self.control_limit = self.control_cost.limit
         self.state_cost_bound: float | None = None
         self.occupation_bound: float | None = None
         self.control_bound: float | None = None

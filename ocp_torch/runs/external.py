@@ -106,7 +106,7 @@ def policy_of(controller: Callable | Controller, problem: Problem) -> Policy:
     if controller.problem.control_limit != problem.control_limit:  # its own limit it obeys by itself
         x = scrambled_sobol(LIMIT_PROBES, problem.dim, 0, torch.float64)
         with torch.no_grad():
-            require_limit(batched(policy, x), x, problem.control_limit)
+            require_limit(batched(policy, x), x, problem.control_cost)
     return policy
 
 

@@ -101,6 +101,19 @@ def test_actions_beyond_the_limit_are_cut_to_the_ball(gymnasium):
     torch.testing.assert_close(env.x, x)
 
 
+def test_each_action_is_in_units_of_its_actuators_limit():
+    env = ControlEnvironment(Manufactured(control_limit=[0.3, 0.02]), control_bound=0.2)
+    assert env.control_bound.tolist() == [0.2, 0.02]
+    assert env.to_action(np.array([0.1, -0.02])).tolist() == [0.5, -1.0]
+    env.reset(seed=0)
+    x, action = env.x.clone(), np.array([0.5, -5.0], dtype=np.float32)
+    paid = env.step(action)[4]["cost"]
+    u = torch.tensor([[0.1, -0.02]], dtype=torch.float64)
+    middle = x + 0.5 * env.time_step * env.problem.velocity(x, u)
+    assert paid == pytest.approx(float(env.problem.state_cost(middle)) + 0.5 * (0.1**2 + 0.02**2))
+    torch.testing.assert_close(env.x, (x + env.time_step * env.problem.velocity(middle, u)).remainder(1.0))
+
+
 def test_a_data_set_is_no_environment(tmp_path):
     path = tmp_path / "a.npz"
     record(zoo.build("circle rho=2"), 300, path, 0, True, 0.0)

@@ -24,7 +24,8 @@ class OtherUnits(Problem):
 
     def __init__(self, problem: Problem) -> None:
         self.inner, self.control = problem, COST ** (1.0 / problem.exponent)
-        limit = None if problem.control_limit is None else self.control * problem.control_limit
+        limit = problem.control_limit
+        limit = None if limit is None else (self.control * torch.tensor(limit, dtype=torch.float64)).tolist()
         super().__init__(problem.dim, problem.control_dim, problem.discount * TIME, problem.exponent, limit)
 
     @property
@@ -95,6 +96,7 @@ CASES = [
         "manufactured 3-d m=2 B(x) q=1.5",
         "swing",
         "limited 2-d q=1.5 B(x)",
+        "box-limited 2-d",
         "noisy 2-d sigma(x)",
     )
     for kind in KINDS

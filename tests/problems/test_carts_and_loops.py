@@ -11,8 +11,9 @@ from ocp_torch.maths.runge_kutta import discounted_integral
 from ocp_torch.problems import CartPole, DoubleIntegrator, PhaseLockedLoop
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
-from ocp_torch.problems.systems.rest import riccati
+from ocp_torch.problems.systems.rest import linearised, riccati
 from ocp_torch.runs.metrics.classical import classical_policy
+from ocp_torch.runs.metrics.feedback import regulator
 from support import zoo
 
 ROUNDING = dict(rtol=1e-9, atol=1e-9)
@@ -97,15 +98,14 @@ def test_a_mirrored_cart_does_the_mirrored_thing():
 def test_the_balance_near_upright_is_that_of_the_linear_system():
     """By difference quotients; and what balancing costs in all is the quadratic form."""
     cart = CartPole(control_limit=None)
-    A, B, Q = cart.linearised()
+    A, B, Q = linearised(cart, [0.0] * 4)
     h = 1e-5
     steps = h * torch.eye(4, dtype=torch.float64)
     quotients = (cart.dynamics(steps)[0] - cart.dynamics(-steps)[0]) / (2.0 * h)
     torch.testing.assert_close(A.T, quotients, rtol=0.0, atol=1e-7)
     assert Q.diag().tolist() == pytest.approx([0.2, 1.0, 0.02, 0.02])
-    P = cart.balance
-    gain = B.T @ P / cart.force_weight
-    torch.testing.assert_close(A.T @ P + P @ A - gain.T * cart.force_weight @ gain + Q, 0.0 * P, rtol=0.0, atol=1e-9)
+    P, gain = regulator(cart, (0.0,) * 4)
+    torch.testing.assert_close(A.T @ P + P @ A - gain.T @ gain + Q, 0.0 * P, rtol=0.0, atol=1e-9)
     assert float(torch.linalg.eigvals(A - B @ gain).real.max()) < 0.0
     start = 0.01 * torch.tensor([[1.0, 1.0, 0.0, 0.0], [0.0, -1.0, 1.0, 2.0]], dtype=torch.float64)
     policy = classical_policy(cart)

@@ -29,7 +29,7 @@ from ocp_torch.problems import Circle, Manufactured, Torus
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.control_cost import PowerCost
-from ocp_torch.problems.control_limit import LimitedCost
+from ocp_torch.problems.control_limit import BoxLimitedCost, LimitedCost
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.external import certify
@@ -55,6 +55,25 @@ def column(values) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
+def per_actuator(m: int, limits=limits):
+    """Limits of ``m`` actuators."""
+    return st.lists(limits, min_size=m, max_size=m).map(lambda c: BoxLimitedCost(2.0, c))
+
+
+# Costs, with vectors for them to act on: those of a ball need only be tried in the plane.
+ball = st.tuples(st.builds(LimitedCost, exponents, limits), sizes.map(lambda s: two_dimensional(column(s))))
+entries = st.builds(math.copysign, lengths, st.sampled_from([-1.0, 1.0]))
+rows = lambda m: st.lists(st.lists(entries, min_size=m, max_size=m), min_size=1, max_size=20).map(column)
+box = st.integers(1, 3).flatmap(lambda m: st.tuples(per_actuator(m), rows(m)))
+
+
+def least(cost, w) -> torch.Tensor:
+    """The least `mu` that carries ``w``, written out."""
+    if isinstance(cost, LimitedCost):
+        return w.norm(dim=-1) / cost.limit
+    return torch.stack([w[:, i].abs() / c for i, c in enumerate(cost.limit)]).amax(dim=0)
+
+
 @given(sizes, exponents, limits)
 def test_the_conjugate_is_the_supremum_over_the_ball(sizes, q, c):
     """The best control points along `p`, so a search over its length, up to the limit, suffices."""
@@ -68,42 +87,59 @@ def test_the_conjugate_is_the_supremum_over_the_ball(sizes, q, c):
     torch.testing.assert_close(attained, brute, rtol=1e-8, atol=1e-12)
 
 
-@settings(max_examples=30)
-@given(
-    st.lists(st.tuples(lengths, st.floats(0.0, 9.0), st.floats(-4.0, 9.0)), min_size=1, max_size=30), exponents, limits
-)
-def test_the_primal_minimum_is_the_least_value_over_occupations_that_can_carry_the_flux(cases, q, c):
-    size, f, beta = (column(v) for v in zip(*cases, strict=True))
-    cost, w = LimitedCost(q, c), two_dimensional(size)
-    s, cost_, b = (t.unsqueeze(-1) for t in (size, f, beta))
-    running = lambda mu: cost_ * mu + mu * (s / mu) ** q / q + BOUND * torch.relu(b - mu)
-    brute = lowest(lambda mu: torch.where(s <= c * mu * (1.0 + 1e-12), running(mu), math.inf), 1e-14, 1e300)
-    on_the_limit = running(torch.where(s > 0.0, s / c, 1.0)).squeeze(-1)
+@given(st.integers(1, 3).flatmap(lambda m: st.tuples(per_actuator(m), rows(m))))
+def test_the_conjugate_is_the_supremum_over_the_box(case):
+    """Over a grid to the very corners, whose points miss a maximiser within by half a cell at most, and its value by half the
+    square of that."""
+    cost, p = case
+    best = cost.argmax(p)
+    assert (best.abs() <= column(cost.limit)).all()
+    attained = (best * p).sum(dim=-1) - cost.cost(best)
+    torch.testing.assert_close(attained, cost.conjugate(p), rtol=1e-12, atol=1e-12)
+    u = torch.cartesian_prod(*[c * torch.linspace(-1.0, 1.0, 21, dtype=torch.float64) for c in cost.limit])
+    u = u.reshape(-1, len(cost.limit))
+    brute = (p @ u.T - u.square().sum(dim=-1) / 2.0).amax(dim=-1)
+    missed = sum((c / 20.0) ** 2 / 2.0 for c in cost.limit)
+    assert (brute <= attained + 1e-12 * (1.0 + attained)).all()
+    assert (attained <= brute + missed + 1e-12 * (1.0 + attained)).all()
+
+
+@settings(max_examples=60)
+@given(ball | box, st.data())
+def test_the_primal_minimum_is_the_least_value_over_occupations_that_can_carry_the_flux(case, data):
+    cost, w = case
+    numbers = lambda low, high: column(data.draw(st.lists(st.floats(low, high), min_size=len(w), max_size=len(w))))
+    f, beta, size, from_ = numbers(0.0, 9.0), numbers(-4.0, 9.0), w.norm(dim=-1), least(cost, w)
+    s, cost_, b, low = (t.unsqueeze(-1) for t in (size, f, beta, from_))
+    running = lambda mu: cost_ * mu + mu * (s / mu) ** cost.q / cost.q + BOUND * torch.relu(b - mu)
+    brute = lowest(lambda mu: torch.where(low <= mu * (1.0 + 1e-12), running(mu), math.inf), 1e-14, 1e300)
+    on_the_limit = running(torch.where(s > 0.0, low, 1.0)).squeeze(-1)
     at_zero = torch.where(size == 0.0, BOUND * beta.clamp_min(0.0), on_the_limit)
     found = cost.primal_minimum(w, f, BOUND, beta)
     torch.testing.assert_close(found, torch.minimum(brute, at_zero), rtol=1e-7, atol=1e-10)
     mu = cost.primal_occupation(w, f, BOUND, beta)
-    assert (c * mu >= size * (1.0 - 1e-12)).all()
+    assert (mu >= from_ * (1.0 - 1e-12)).all()
     known = torch.isfinite(mu)
     value = f * mu + cost.perspective(w, mu) + BOUND * torch.relu(beta - mu)
     torch.testing.assert_close(value[known], found[known], rtol=1e-9, atol=1e-12)
 
 
-@settings(max_examples=30)
-@given(st.lists(st.tuples(lengths, st.floats(-5.0, 9.0)), min_size=1, max_size=30), exponents, limits)
-def test_the_saddle_minimum_is_the_least_value_up_to_the_bound(cases, q, c):
-    size, beta = (column(v) for v in zip(*cases, strict=True))
-    cost, w = LimitedCost(q, c), two_dimensional(size)
-    s, b = size.unsqueeze(-1), beta.unsqueeze(-1)
-    running = lambda mu: b * mu + mu * (s / mu) ** q / q
-    brute = lowest(lambda mu: torch.where(s <= c * mu * (1.0 + 1e-12), running(mu), INFINITE), 1e-14, BOUND)
-    on_the_limit = running(torch.where(s > 0.0, s / c, 1.0)).squeeze(-1)
-    at_zero = torch.where(size == 0.0, 0.0, torch.where(size / c <= BOUND, on_the_limit, INFINITE))
+@settings(max_examples=60)
+@given(ball | box, st.data())
+def test_the_saddle_minimum_is_the_least_value_up_to_the_bound(case, data):
+    cost, w = case
+    beta = column(data.draw(st.lists(st.floats(-5.0, 9.0), min_size=len(w), max_size=len(w))))
+    size, from_ = w.norm(dim=-1), least(cost, w)
+    s, b, low = (t.unsqueeze(-1) for t in (size, beta, from_))
+    running = lambda mu: b * mu + mu * (s / mu) ** cost.q / cost.q
+    brute = lowest(lambda mu: torch.where(low <= mu * (1.0 + 1e-12), running(mu), INFINITE), 1e-14, BOUND)
+    on_the_limit = running(torch.where(s > 0.0, low, 1.0)).squeeze(-1)
+    at_zero = torch.where(size == 0.0, 0.0, torch.where(from_ <= BOUND, on_the_limit, INFINITE))
     expected = torch.minimum(brute, at_zero)
     found = cost.saddle_minimum(w, beta, BOUND)
-    clear = (size / c / BOUND - 1.0).abs() > 1e-6
+    clear = (from_ / BOUND - 1.0).abs() > 1e-6
     assert torch.equal(torch.isinf(found)[clear], (expected >= INFINITE)[clear])
-    feasible = size <= c * BOUND * (1.0 - 1e-6)
+    feasible = from_ <= BOUND * (1.0 - 1e-6)
     torch.testing.assert_close(found[feasible], expected[feasible], rtol=1e-7, atol=1e-10)
     mu = cost.saddle_occupation(w, beta, BOUND)
     value = beta * mu + cost.perspective(w, mu)
@@ -112,21 +148,25 @@ def test_the_saddle_minimum_is_the_least_value_up_to_the_bound(cases, q, c):
     assert torch.isfinite(cost.saddle_minimum(cost.within(w, BOUND), beta, BOUND)).all()
 
 
-@pytest.mark.parametrize("q", [1.05, 1.5, 2.0])
-@pytest.mark.parametrize("name", ["conjugate", "perspective", "primal", "saddle", "within"])
-def test_gradients_are_those_of_finite_differences(q, name):
-    cost = LimitedCost(q, 0.4)
+SOME = [*(LimitedCost(q, 0.4) for q in (1.05, 1.5, 2.0)), BoxLimitedCost(2.0, [0.4, 0.3])]
+each_cost = pytest.mark.parametrize("cost", SOME, ids=lambda cost: f"q={cost.q:g} {cost.limit}")
+
+
+@each_cost
+@pytest.mark.parametrize("name", ["conjugate", "perspective", "primal", "saddle", "within", "argmax"])
+def test_gradients_are_those_of_finite_differences(cost, name):
     generator = torch.Generator().manual_seed(1)
     draw = lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64)
-    # All of them shorter than c M = 1.2, beyond which the minimum of Lemma 3 is infinite.
+    # All of them within c M, beyond which the minimum of Lemma 3 is infinite.
     w, positive, signed, f = 1.6 * draw(400, 2) - 0.8, 0.1 + draw(400), 3.0 * draw(400) - 1.0, 2.0 * BOUND * draw(400)
-    inside = 0.35 * positive.unsqueeze(-1) * w / w.norm(dim=-1, keepdim=True)
+    inside = 0.9 * (positive / least(cost, w)).unsqueeze(-1) * w
     function, inputs = {
         "conjugate": (cost.conjugate, (w,)),
         "perspective": (cost.perspective, (inside, positive)),
         "primal": (lambda w, beta: cost.primal_minimum(w, f, BOUND, beta), (w, signed)),
         "saddle": (lambda w, beta: cost.saddle_minimum(w, beta, BOUND), (w, signed)),
         "within": (lambda w, mu: cost.within(w, mu) @ column([0.3, -0.7]), (w, positive)),
+        "argmax": (lambda p: cost.argmax(p) @ column([0.3, -0.7]), (w,)),
     }[name]
     found = value_and_gradients(function, *inputs)
     assert all(torch.isfinite(t).all() for t in found)
@@ -134,17 +174,59 @@ def test_gradients_are_those_of_finite_differences(q, name):
         torch.testing.assert_close(exact, differenced, rtol=1e-5, atol=1e-6)
 
 
-def test_the_gradient_of_the_conjugate_is_the_argmax_also_far_beyond_the_limit_in_single_precision():
-    for q in (1.05, 1.5, 2.0):
-        cost = LimitedCost(q, 0.3)
-        p = (column([0.0, 1e-20, 0.1, 1.0, 1e3, 1e6]).unsqueeze(-1) * column([0.6, -0.8])).float()
-        _, slope = value_and_gradients(cost.conjugate, p)
-        torch.testing.assert_close(slope, cost.argmax(p), rtol=1e-5, atol=1e-12)
+@each_cost
+def test_how_the_argmax_changes_is_what_autograd_finds(cost):
+    draw = lambda *shape: torch.randn(*shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    p, moved = 0.5 * draw(300, 2), draw(300, 2, 4)
+    along = lambda k: torch.func.jvp(cost.argmax, (p,), (moved[..., k],))[1]
+    torch.testing.assert_close(cost.argmax_along(p, moved), torch.stack([along(k) for k in range(4)], dim=-1))
 
 
-@given(exponents, st.floats(0.05, 20.0))
-def test_a_limit_nobody_reaches_changes_nothing(q, c):
-    free, limited = PowerCost(q), LimitedCost(q, c)
+@each_cost
+def test_the_gradient_of_the_conjugate_is_the_argmax_also_far_beyond_the_limit_in_single_precision(cost):
+    p = (column([0.0, 1e-20, 0.1, 1.0, 1e3, 1e6]).unsqueeze(-1) * column([0.6, -0.8])).float()
+    _, slope = value_and_gradients(cost.conjugate, p)
+    torch.testing.assert_close(slope, cost.argmax(p), rtol=1e-5, atol=1e-12)
+
+
+@each_cost
+def test_nothing_is_lost_or_not_a_number_at_tiny_arguments_in_single_precision(cost):
+    size, beta = columns((0.0, 1e-30, 1e-20, 1e-6), (-1.0, -1e-25, 0.0, 1e-25, 1e-3, 2.0))
+    w = (size.unsqueeze(-1) * column([0.6, -0.8])).float()
+    one = torch.ones(len(w))
+    functions = {
+        "conjugate": lambda w, beta: cost.conjugate(w),
+        "within": lambda w, beta: cost.within(w, beta.relu()).sum(dim=-1),
+        "primal": lambda w, beta: cost.primal_minimum(w, beta.detach().relu(), BOUND, one - beta),
+        "saddle": lambda w, beta: cost.saddle_minimum(w, beta, BOUND),
+    }
+    for name, function in functions.items():
+        found, truth = (value_and_gradients(function, w.to(t), beta.float().to(t)) for t in (one.dtype, beta.dtype))
+        for single, double in zip(found, truth, strict=True):
+            assert torch.isfinite(single).all(), name
+            torch.testing.assert_close(single.double(), double, rtol=1e-4, atol=1e-9, msg=name)
+
+
+@given(limits, st.lists(st.tuples(entries, entries, lengths), min_size=1, max_size=20))
+def test_for_one_actuator_a_list_of_one_limit_is_that_limit(c, cases):
+    """To rounding, in all that a cost says."""
+    p, beta, f = (column(v) for v in zip(*cases, strict=True))
+    said = []
+    for cost in (LimitedCost(2.0, c), BoxLimitedCost(2.0, [c])):
+        w = p.unsqueeze(-1)
+        u = cost.argmax(w)
+        of_p = cost.gauge(w), cost.conjugate(w), u, cost.within(w, f), cost.cost(u), cost.argmax_along(w, w[..., None])
+        minima = cost.primal_minimum(w, f, BOUND, beta), cost.saddle_minimum(cost.within(w, BOUND), beta, BOUND)
+        minimisers = cost.primal_occupation(w, f, BOUND, beta), cost.saddle_occupation(w, beta, BOUND)
+        said.append([*of_p, *minima, *minimisers, cost.perspective(cost.within(w, f), f)])
+    for one, other in zip(*said, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-13, atol=1e-300)
+
+
+@given(exponents, st.floats(0.05, 20.0), st.booleans())
+def test_a_limit_nobody_reaches_changes_nothing(q, c, boxed):
+    q = 2.0 if boxed else q
+    free, limited = PowerCost(q), BoxLimitedCost(q, [c, 2.0 * c]) if boxed else LimitedCost(q, c)
     size, f, beta = columns((0.0, 0.01, 0.5), (0.2, 2.0, 7.0), (-1.0, 0.5, 4.0))
     w, p = two_dimensional(0.01 * c * size), two_dimensional(0.5 * c ** (q - 1.0) * size)
     assert torch.equal(free.conjugate(p), limited.conjugate(p))
@@ -154,24 +236,39 @@ def test_a_limit_nobody_reaches_changes_nothing(q, c):
     assert torch.equal(w, limited.within(w, mu))
 
 
-def test_perspective_is_infinite_beyond_the_limit_and_closed_at_zero():
-    cost = LimitedCost(1.5, 2.0)
+@pytest.mark.parametrize("cost", [LimitedCost(1.5, 2.0), BoxLimitedCost(2.0, [2.0, 0.1])])
+def test_perspective_is_infinite_beyond_the_limit_and_closed_at_zero(cost):
     w, mu = column([[0.0, 0.0], [0.0, 1e-30], [2.0, 0.0], [2.001, 0.0]]), column([0.0, 0.0, 1.0, 1.0])
-    assert cost.perspective(w, mu).tolist() == [0.0, math.inf, pytest.approx(2.0**1.5 / 1.5), math.inf]
-    assert cost.cost(w).tolist()[2:] == [pytest.approx(2.0**1.5 / 1.5), math.inf]
+    at_limit = pytest.approx(2.0**cost.q / cost.q)
+    assert cost.perspective(w, mu).tolist() == [0.0, math.inf, at_limit, math.inf]
+    assert cost.cost(w).tolist()[2:] == [at_limit, math.inf]
 
 
-@pytest.mark.parametrize("limit", [0.0, -1.0, math.inf, math.nan, "1", True])
+LISTS = [[1.0], [1.0, 2.0, 3.0], [], [1.0, 0.0], [-1.0, 1.0], [1.0, math.nan], [1.0, "a"], [[1.0, 2.0]], [1.0, None]]
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0, math.inf, math.nan, "1", True, {"u": 1.0}, *LISTS], ids=str)
 def test_limits_that_are_none_are_refused(limit):
-    with pytest.raises(InputError, match="control_limit"):
+    with pytest.raises(InputError, match=r"^problem\.control_limit(\[.\])? is .* must be .*[^.]\.$"):
         Manufactured(control_limit=limit)
 
 
-@pytest.mark.parametrize("q", [1.2, 1.5, 2.0])
-@pytest.mark.parametrize("dim", [1, 2])
-def test_taylor_models_hold_the_conjugate_below_across_and_beyond_the_limit(q, dim):
+def test_a_limit_for_each_actuator_goes_with_squares_only():
+    with pytest.raises(InputError, match=r"control_limit is \[1.0, 2.0\].*problem.exponent is 1.5.*exponent=2"):
+        Manufactured(exponent=1.5, control_limit=[1.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("cost", "dim"),
+    [
+        *((LimitedCost(q, 0.5), dim) for q in (1.2, 1.5, 2.0) for dim in (1, 2)),
+        *((BoxLimitedCost(2.0, c), len(c)) for c in ([0.5], [0.5, 0.5], [0.5, 1.1])),
+    ],
+    ids=str,
+)
+def test_taylor_models_hold_the_conjugate_below_across_and_beyond_the_limit(cost, dim):
     """Coordinates of the cells themselves stand for `p`; cells of all sizes, within which random points are tried."""
-    cost, generator = LimitedCost(q, 0.5), torch.Generator().manual_seed(0)
+    q, generator = cost.q, torch.Generator().manual_seed(0)
     for half in (0.2, 0.02, 1e-3):
         centre = 2.0 * torch.rand(300, dim, generator=generator, dtype=torch.float64)
         box = Box(centre, torch.full_like(centre, half), 4)
@@ -197,8 +294,9 @@ def test_the_exact_truth_solves_its_equations_with_the_limit_reached(problem):
     x = zoo.states(problem, 4000, seed=1)
     torch.testing.assert_close(exact_slack(problem, x), torch.zeros(len(x), dtype=x.dtype), **ROUNDING)
     u = problem.exact_control(x)
-    reached = (u.norm(dim=-1) >= problem.control_limit * (1.0 - 1e-9)).double().mean()
-    assert 0.001 < float(reached) < 0.98
+    size = least(problem.control_cost, u)
+    assert 0.001 < float((size >= 1.0 - 1e-9).double().mean()) < 0.98
+    assert float(size.max()) <= 1.0 + 1e-12
     assert float(u.norm(dim=-1).max()) <= problem.control_bound * (1.0 + 1e-12)
     nu = torch.tensor(problem.diffusion or (0.0,) * problem.dim, dtype=x.dtype)
     spread = lambda y: nu * jets.jet(problem.exact_occupation, y).gradient
@@ -252,12 +350,12 @@ def test_random_networks_obey_weak_duality_and_the_limit(name, seed, size):
     x = zoo.states(problem, 200, seed=seed)
     for kind in (NETWORK, SADDLE):
         for policy in trained_policies(kind, problem, fields, constants).values():
-            assert float(policy(x).norm(dim=-1).max()) <= problem.control_limit * (1.0 + 1e-9)
+            assert float(least(problem.control_cost, policy(x)).max()) <= 1.0 + 1e-9
     assert all(torch.isfinite(loss) for loss in Saddle(problem).losses(fields, sets[0], phase).values())
 
 
 @settings(max_examples=10)
-@given(st.integers(0, 10**6), st.sampled_from([0.1, 1.0, 5.0]), st.sampled_from([0.02, 0.1, 0.3]))
+@given(st.integers(0, 10**6), st.sampled_from([0.1, 1.0, 5.0]), st.sampled_from([0.02, 0.1, 0.3, [0.02, 0.3]]))
 def test_without_drift_the_closed_occupation_carries_any_flux(seed, size, limit):
     problem = Torus(control_limit=limit, seed=1)
     fields, constants = random_fields(problem, seed, size), resolve_constants(problem)
@@ -309,11 +407,19 @@ def test_the_kernel_methods_refuse_a_limit():
         DualRule(problem, resolve_constants(problem))
 
 
-@pytest.mark.parametrize("problem", [Manufactured(dim=1, control_limit=0.5, exponent=1.5), Circle(control_limit=0.1)])
-def test_the_grid_knows_the_limit(problem):
+@pytest.mark.parametrize(
+    ("problem", "side"),
+    [
+        (Manufactured(dim=1, control_limit=0.5, exponent=1.5), 128),
+        (Circle(control_limit=0.1), 128),
+        (Manufactured(control_limit=[0.6, 0.3], seed=2), 48),
+    ],
+)
+def test_the_grid_knows_the_limit(problem, side):
     """Against exact truth, or against an upper and a lower bound that are easy to have."""
-    reference = solve_reference(problem, side=128)
-    assert float(reference.control.norm(dim=-1).max()) <= problem.control_limit * (1.0 + 1e-9)
+    reference = solve_reference(problem, side=side)
+    for u in (reference.control, reference.interpolate(zoo.states(problem, 200))[1]):
+        assert float(least(problem.control_cost, u.reshape(-1, problem.control_dim)).max()) <= 1.0 + 1e-9
     if problem.exact_optimum is not None:
         assert abs(reference.optimum - problem.exact_optimum) <= max(reference.error, 1e-6)
     else:
@@ -321,13 +427,15 @@ def test_the_grid_knows_the_limit(problem):
         assert free + 1e-4 < reference.optimum < 1.0 / 12.0  # doing nothing costs the mean of f
 
 
-def test_a_given_controller_that_breaks_the_limit_is_refused_with_its_state_and_size():
-    problem = Manufactured(control_limit=0.5)
+@pytest.mark.parametrize(("limit", "shown"), [(0.5, r"0\.5;"), ([0.65, 0.5], r"\[0\.65, 0\.5\];")], ids=str)
+def test_a_given_controller_that_breaks_the_limit_is_refused_with_its_state_and_size(limit, shown):
+    problem = Manufactured(control_limit=limit)
     too_much = lambda x: 0.6 * torch.ones(len(x), 2)
-    with pytest.raises(InputError, match=r"size 0\.848528 at x = \[.*control_limit is 0\.5"):
+    with pytest.raises(InputError, match=rf"u = \[0\.6, 0\.6\] of size 0\.848528 at x = \[.*control_limit is {shown}"):
         BlackBox(too_much, problem)(zoo.states(problem, 3))
-    rounded = BlackBox(lambda x: torch.full((len(x), 2), 0.5 / math.sqrt(2.0) * (1.0 + 1e-6)), problem)
-    assert float(rounded(zoo.states(problem, 5)).norm(dim=-1).max()) <= 0.5 * (1.0 + 1e-12)
+    x, share = zoo.states(problem, 5), float(least(problem.control_cost, too_much(zoo.states(problem, 1)).double()))
+    rounded = BlackBox(lambda x: too_much(x) / share * (1.0 + 1e-6), problem)
+    assert float(least(problem.control_cost, rounded(x)).max()) <= 1.0 + 1e-12
     settings = CertificateSettings(points=64, replicates=2, trajectories=2, stage=StageSettings(steps=0))
     with pytest.raises(InputError, match="control_limit"):
         certify(problem, too_much, settings=settings, train_steps=0)
@@ -340,19 +448,22 @@ def test_one_trained_under_another_limit_is_held_against_this_one():
     for parameter in free.fields.parameters():
         parameter.data.mul_(3.0)
     settings = CertificateSettings(points=64, replicates=2, trajectories=2, stage=StageSettings(steps=0))
-    with pytest.raises(InputError, match=r"control_limit is 0\.0001"):
-        certify(Manufactured(control_limit=1e-4), free, settings=settings, train_steps=0)
+    for limit, shown in ((1e-4, r"0\.0001"), ([9.0, 1e-4], r"\[9\.0, 0\.0001\]")):
+        with pytest.raises(InputError, match=f"control_limit is {shown}"):
+            certify(Manufactured(control_limit=limit), free, settings=settings, train_steps=0)
 
 
 @pytest.mark.nightly
+@pytest.mark.parametrize("limit", [0.02, [0.02, 0.05]], ids=str)
 @pytest.mark.parametrize("overrides", [("method=primal",), ("method=pd",), ("method=pd", "method.augmentation=0")])
-def test_every_method_trains_with_a_limit_and_hands_out_a_controller_that_obeys(overrides, tmp_path):
+def test_every_method_trains_with_a_limit_and_hands_out_a_controller_that_obeys(overrides, limit, tmp_path):
     quick = ("certificate.points=256", "certificate.trajectories=4", "certificate.ascents=2", "trainer.figures=false")
-    trainer = small("problem=manufactured", "problem.dim=1", "problem.control_limit=0.02", *quick, *overrides)
+    limited = (f"problem.dim={2 if isinstance(limit, list) else 1}", f"problem.control_limit={limit}")
+    trainer = small("problem=manufactured", *limited, *quick, *overrides)
     certificate = session(trainer, tmp_path)
     u = load_controller(tmp_path / "controller.safetensors")
-    assert u.problem.control_limit == 0.02
-    assert float(u(torch.rand(500, 1)).norm(dim=-1).max()) <= 0.02 * (1.0 + 1e-5)
+    assert u.problem.control_limit == limit
+    assert float(least(u.problem.control_cost, u(torch.rand(500, u.problem.dim)).double()).max()) <= 1.0 + 1e-5
     exact = certificate.exact
     for low in certificate.lower.values():
         assert low is None or low.interval(0.99999)[0] <= exact

@@ -17,7 +17,14 @@ from ocp_torch.studies.kernel.rules import Datum
 from support import zoo
 
 STEP, TOLERANCE = 1e-5, dict(rtol=1e-5, atol=1e-5)
-MIXED = ("circle rho=2", "torus 2-d chain", "manufactured 3-d m=2 B(x) q=1.5", "limited 2-d q=1.5 B(x)", "swing")
+MIXED = (
+    "circle rho=2",
+    "torus 2-d chain",
+    "manufactured 3-d m=2 B(x) q=1.5",
+    "limited 2-d q=1.5 B(x)",
+    "box-limited 2-d",
+    "swing",
+)
 
 
 def differences(field, x):

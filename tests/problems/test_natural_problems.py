@@ -8,24 +8,28 @@ import pytest
 import torch
 from scipy.linalg import solve_continuous_are
 
+from ocp_torch import System
 from ocp_torch.control.controller import problem_name
 from ocp_torch.errors import InputError
 from ocp_torch.maths.runge_kutta import discounted_integral
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems import (
     PROBLEMS,
+    Acrobot,
     Arm,
     CartPole,
     DoubleIntegrator,
     Dubins,
     Kuramoto,
+    Pendubot,
     Pendulum,
     PhaseLockedLoop,
     PhaseNeurons,
+    Quadrotor,
     RobotArm,
+    Satellite,
     Unicycle,
 )
-from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.systems.rest import occupation_bound_at_rest, optimal_contraction
 from ocp_torch.runs.metrics.trial import metrics
@@ -40,9 +44,9 @@ def physical(problem, count: int, seed: int = 0):
     """Physical states in the units of the problem, far beyond one turn where they are angles."""
     draws = torch.rand(count, len(problem.from_torus(torch.zeros(1, problem.dim))[0]), generator=generator(seed)) - 0.5
     states = 40.0 * draws.double()
-    if isinstance(problem, System):  # an interval ends at its seams
-        boxed = problem.chart.boxed
-        states[:, boxed] = (problem.chart.centre + problem.chart.length * draws.double())[:, boxed]
+    if isinstance(problem, System):
+        chart = problem.chart
+        states[:, chart.boxed] = (chart.centre + chart.length * draws)[:, chart.boxed]
     return states
 
 
@@ -438,6 +442,20 @@ BAD = [
     (DoubleIntegrator, dict(starts=[0.5, 1.5]), "start has velocity from -1.5 to 1.5 m/s, which is not inside the box"),
     (PhaseLockedLoop, dict(tuning_weight=[0.2]), "problem.tuning_weight is .* a list of 2 numbers"),
     (PhaseLockedLoop, dict(exponent=1.5, tuning_weight=[0.1, 0.2]), "must be the same for all controls"),
+    (Acrobot, dict(masses=[1.0]), "problem.masses"),
+    (Acrobot, dict(lengths=[0.2, -0.3]), r"problem.lengths\[1\] is -0.3"),
+    (Acrobot, dict(inertias=[0.001, 0.001]), "problem.inertias are .* about the joints"),
+    (Pendubot, dict(starts="hang"), "problem.starts is 'hang'.*did you mean 'hanging'"),
+    (Quadrotor, dict(max_speeds=[3.0, 3.0]), "problem.max_speeds"),
+    (Quadrotor, dict(obstacles=[[0.1, 0.2]]), r"problem.obstacles\[0\]"),
+    (Quadrotor, dict(thrust_noise=-1.0), "problem.thrust_noise"),
+    (Satellite, dict(inertia=[[1.0, 0.0, 0.0]]), "problem.inertia is .* three rows"),
+    (
+        Satellite,
+        dict(inertia=[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 3.0]]),
+        "problem.inertia is .* principal moments",
+    ),
+    (Satellite, dict(inertia=[[2.0, 1.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]), "problem.inertia is .* symmetric"),
     (Kuramoto, dict(oscillators=1), "problem.oscillators"),
     (Kuramoto, dict(goal="sync"), "problem.goal is 'sync'.*did you mean|problem.goal is 'sync'"),
     (Kuramoto, dict(graph="rings"), "problem.graph is 'rings'.*did you mean 'ring'"),
@@ -475,14 +493,17 @@ SOME_LIMITED = [
 ]
 
 
+@pytest.mark.parametrize("each", [False, True], ids=["one limit", "a limit for each"])
 @pytest.mark.parametrize("problem", SOME_LIMITED, ids=lambda problem: type(problem).__name__)
-def test_every_system_takes_a_control_limit_and_pays_infinitely_beyond_it(problem):
+def test_every_system_takes_a_control_limit_and_pays_infinitely_beyond_it(problem, each):
+    limit = [0.2] * problem.control_dim if each else 0.2
+    problem = type(problem)(control_limit=limit)
     u = torch.zeros(2, problem.control_dim, dtype=torch.float64)
     u[0, 0], u[1, -1] = 0.199, 0.201
     cost = problem.control_cost.cost(u)
     assert cost.tolist() == [pytest.approx(0.199**2 / 2.0), math.inf]
-    assert problem.parameters["control_limit"] == 0.2
-    assert PROBLEMS[problem_name(problem)](**problem.parameters).control_limit == 0.2
+    assert problem.parameters["control_limit"] == limit
+    assert PROBLEMS[problem_name(problem)](**problem.parameters).control_limit == limit
     free = type(problem)()
     assert free.control_limit is None
     assert problem.occupation_bound == free.occupation_bound
@@ -511,11 +532,13 @@ def test_a_limit_makes_the_optimum_dearer_but_changes_nothing_near_the_state_of_
     assert float(other.interpolate(far)[0]) > 1.05 * float(one.interpolate(far)[0])
 
 
-def test_the_practitioners_numbers_hold_every_law_to_the_limit():
-    pendulum = Pendulum(control_limit=0.3)
-    reckless = lambda x: torch.full_like(x[:, :1], 50.0)
-    at_limit = lambda x: torch.full_like(x[:, :1], 0.3)
-    one, other = (metrics(pendulum, policy, seed=1, starts=8)["controller"] for policy in (reckless, at_limit))
+@pytest.mark.parametrize(
+    ("problem", "most"), [(Pendulum(control_limit=0.3), [0.3]), (Unicycle(control_limit=[0.3, 0.1]), [0.3, 0.1])]
+)
+def test_the_practitioners_numbers_hold_every_law_to_the_limit(problem, most):
+    reckless = lambda x: torch.full_like(x[:, :1], 50.0).expand(-1, len(most))
+    at_limit = lambda x: x.new_tensor(most).expand(len(x), -1)
+    one, other = (metrics(problem, policy, seed=1, starts=8)["controller"] for policy in (reckless, at_limit))
     assert one == other
     assert math.isfinite(one["cost"])
 

@@ -67,6 +67,20 @@ def test_what_is_read_is_what_was_written(tmp_path, suffix, contrast):
     assert found.notes == ()
 
 
+@pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
+def test_a_limit_for_each_control_is_recorded_and_one_for_fewer_or_more_refused(tmp_path, suffix):
+    problem = zoo.build("box-limited 2-d")
+    path = record(tmp_path, problem, 300, f"a{suffix}")
+    data = Dataset(str(path))
+    assert data.control_limit == problem.control_limit
+    assert Dataset(**data.parameters).control_limit == problem.control_limit
+    samples = Samples.of(problem, zoo.states(problem, 300))
+    for wrong in ([0.1, 0.2, 0.3], [[0.1], [0.2]], [0.1, np.nan]):
+        recording.write(path, samples, {"discount": 2.0, "control_limit": wrong})
+        with pytest.raises(InputError, match=r"control_limit has shape \(.*must be one finite number, or one for each"):
+            recording.read(path)
+
+
 def arrays_of(path) -> dict[str, np.ndarray]:
     with np.load(path) as file:
         return {name: file[name] for name in file.files}
@@ -257,7 +271,7 @@ def test_importance_weights_make_any_law_serve(tmp_path):
     assert float(values.mean()) == pytest.approx(0.35, abs=0.03)  # half the contrast, without the weights
 
 
-@pytest.mark.parametrize("name", ["manufactured 2-d mu0", "manufactured 3-d m=2", "limited 2-d"])
+@pytest.mark.parametrize("name", ["manufactured 2-d mu0", "manufactured 3-d m=2", "limited 2-d", "box-limited 2-d"])
 def test_closed_loops_from_samples_are_those_of_the_problem(tmp_path, name):
     problem = zoo.build(name)
     data = Dataset(str(record(tmp_path, problem, 400)))

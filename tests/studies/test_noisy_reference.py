@@ -43,6 +43,7 @@ SLOW = {
     "1-d": (partial(Manufactured, dim=1, noise=0.02), 128, 1e-3),
     "2-d": (partial(Manufactured, noise=0.02), 48, 1e-2),
     "2-d degenerate": (partial(Manufactured, noise=[0.0, 0.05], control_limit=0.5), 48, 1e-2),
+    "2-d degenerate, a limit for each": (partial(Manufactured, noise=[0.0, 0.05], control_limit=[0.6, 0.3]), 48, 1e-2),
     "3-d": (partial(Manufactured, dim=3, noise=0.02), 27, 1e-2),
     "3-d sigma(x)": (partial(Manufactured, dim=3, noise=0.02, state_dependent_noise=True, seed=2), 27, 1e-2),
     "3-d degenerate": (partial(Manufactured, dim=3, noise=[0.0, 0.05, 0.0], control_dim=2), 27, 1e-2),

@@ -8,6 +8,7 @@ import torch
 
 from ocp_torch.fields import PeriodicMLP
 from ocp_torch.problems import (
+    Acrobot,
     Arm,
     CartPole,
     Circle,
@@ -15,10 +16,13 @@ from ocp_torch.problems import (
     Dubins,
     Kuramoto,
     Manufactured,
+    Pendubot,
     Pendulum,
     PhaseLockedLoop,
     PhaseNeurons,
     Problem,
+    Quadrotor,
+    Satellite,
     Torus,
     Unicycle,
 )
@@ -84,6 +88,16 @@ _LIMITED = {
     ),
     "limited 2-d with noise": partial(Manufactured, control_limit=0.5, noise=[0.0, 0.02]),
     "limited 3-d m=2 q=1.2": partial(Manufactured, dim=3, control_dim=2, exponent=1.2, control_limit=0.5),
+    "box-limited 2-d": partial(Manufactured, control_limit=[0.6, 0.3], seed=2),
+    "box-limited 3-d m=2 B(x) with noise": partial(
+        Manufactured,
+        dim=3,
+        control_dim=2,
+        control_limit=[0.3, 0.5],
+        state_dependent_control=True,
+        initial_contrast=0.5,
+        noise=[0.0, 0.02, 0.01],
+    ),
 }
 # Exact truth with noise: isotropic; full and varying; in one coordinate of two; and beside all else.
 _NOISY = {
@@ -126,6 +140,12 @@ _NATURAL = {
     "cart-pole": CartPole,
     "cart-pole q=1.5": partial(CartPole, exponent=1.5, control_limit=None, failure_cost=2.0),
     "phase-locked loop": PhaseLockedLoop,
+    "acrobot": Acrobot,
+    "pendubot": Pendubot,
+    "pendubot from hanging": partial(Pendubot, starts="hanging", torque_cost=0.2, control_limit=None),
+    "quadrotor": Quadrotor,
+    "quadrotor without obstacles": partial(Quadrotor, obstacles=[], control_limit=0.5, thrust_cost=2.0),
+    "satellite": Satellite,
     "phase neurons n=3 type 1": partial(PhaseNeurons, neurons=3, response="type1"),
 }
 

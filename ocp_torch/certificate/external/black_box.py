@@ -9,6 +9,7 @@ from torch import Tensor
 from ocp_torch.errors import InputError
 from ocp_torch.maths.differences import STEPS, Differenced
 from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.problem import Problem
 
 # States a controller is tried on before anything is computed with it.
@@ -30,7 +31,7 @@ class BlackBox:
         if not callable(function):
             raise InputError(f"controller is {function!r}, but must be a function of states (N, {problem.dim}).")
         self.function, self.control_dim = function, problem.control_dim
-        self.limit, self.cost = problem.control_limit, problem.control_cost
+        self.cost = problem.control_cost
         self._convert, self.precision = self._understood(scrambled_sobol(PROBES, problem.dim, 0, torch.float64))
         self.step = STEPS[self.precision]
 
@@ -48,7 +49,7 @@ class BlackBox:
         if bool(bad.any()):
             raise InputError(f"the controller is not finite at x = {wrapped[bad][0].tolist()}.")
         out = out.to(x)
-        require_limit(out, wrapped, self.limit)
+        require_limit(out, wrapped, self.cost)
         return self.cost.within(out, torch.ones_like(out[:, 0]))
 
     def _ask(self, convert: Callable[[Tensor], object], x: Tensor) -> Tensor:
@@ -102,14 +103,14 @@ def _refusal(error: Exception) -> InputError:
     return InputError(f"the controller raised {type(error).__name__}: {first_line}.")
 
 
-def require_limit(u: Tensor, x: Tensor, limit: float | None) -> None:
-    """Raise `InputError` where a control ``(N, m)`` at one of the states ``x`` is longer than ``limit``, beyond rounding."""
-    if limit is None:
-        return
-    size = u.norm(dim=-1)
-    worst = int(size.argmax())
-    if float(size[worst]) > limit * (1.0 + BEYOND):
+def require_limit(u: Tensor, x: Tensor, cost: PowerCost) -> None:
+    """Raise `InputError` where a control ``(N, m)`` at one of the states ``x`` is beyond the limit of ``cost``, and that by
+    more than rounding."""
+    gauge = cost.gauge(u)
+    worst = int(gauge.argmax())
+    if float(gauge[worst]) > 1.0 + BEYOND:
+        given = ", ".join(f"{c:.6g}" for c in u[worst].tolist())
         raise InputError(
-            f"the controller gives a control of size {float(size[worst]):.6g} at x = {x[worst].tolist()}, "
-            f"but problem.control_limit is {limit:g}; clip it."
+            f"the controller gives u = [{given}] of size {float(u[worst].norm()):.6g} at x = {x[worst].tolist()}, "
+            f"but problem.control_limit is {cost.limit}; clip it."
         )

@@ -22,7 +22,7 @@ from ocp_torch.certificate.proof.waves import (
     square_divergence_model,
 )
 from ocp_torch.problems.control_cost import PowerCost
-from ocp_torch.problems.control_limit import LimitedCost
+from ocp_torch.problems.control_limit import BoxLimitedCost, LimitedCost
 from ocp_torch.problems.exact.manufactured import Manufactured
 from ocp_torch.problems.exact.torus import Torus
 from ocp_torch.problems.problem import Lipschitz, Problem
@@ -92,6 +92,12 @@ def limited_conjugate(cost: LimitedCost, p: TaylorModel) -> TaylorModel:
     knee = cost.knee**2
     inside, outside = high <= (1.0 - FEW_ROUNDINGS) * knee, low >= (1.0 + FEW_ROUNDINGS) * knee
     return near.where(inside, far.where(outside, across))
+
+
+def box_limited_conjugate(cost: BoxLimitedCost, p: TaylorModel) -> TaylorModel:
+    """The sum of those of the actuators, each of which has its own limit."""
+    each = enumerate(LimitedCost(cost.q, c) for c in cost.limit)
+    return TaylorModel.stack([limited_conjugate(own, p[..., i : i + 1]) for i, own in each]).sum()
 
 
 def torus_enclosure(problem: Torus, box: Box) -> Enclosure:
@@ -182,5 +188,7 @@ enclosure = ByClass(
 )
 # conjugate_model(cost, p): `R*(p)` ``(N,)`` for a model `p` ``(N, m)``.
 conjugate_model = ByClass(
-    "conjugate_model", ("conjugate",), known={PowerCost: power_conjugate, LimitedCost: limited_conjugate}
+    "conjugate_model",
+    ("conjugate",),
+    known={PowerCost: power_conjugate, LimitedCost: limited_conjugate, BoxLimitedCost: box_limited_conjugate},
 )

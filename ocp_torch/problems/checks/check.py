@@ -119,7 +119,7 @@ def require_units(problem: Problem) -> None:
     x, f, a, B = problem.probe(SPEED_STATES, SPEED_DESIGN, "x", "f", "a", "B")
     # A control that costs as much as the state cost varies.
     u = (problem.exponent * float(f.std())) ** (1.0 / problem.exponent)
-    u = u if problem.control_limit is None else min(u, problem.control_limit)
+    u = min(u, problem.control_cost.reach)
     drift, push = float(a.norm(dim=-1).mean()), u * float(B.flatten(1).norm(dim=-1).mean())
     turns = (drift + push) / problem.discount
     if turns > MOST_TURNS:

@@ -16,7 +16,7 @@ from torch import Tensor
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.supremum import supremum
-from ocp_torch.problems.control_cost import norm_power
+from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.exact.trigonometric import TrigonometricPolynomial, WavyMatrix, random_polynomial
 from ocp_torch.problems.problem import Problem
 
@@ -34,8 +34,9 @@ class Manufactured(Problem):
     ``initial_contrast`` that of `mu0`; with ``state_dependent_control`` each entry of `B` varies with one coordinate;
     ``noise`` is that of `Problem`, and with ``state_dependent_noise`` `sigma` is a full matrix that varies like `B`, of about
     that size; ``interaction`` is how many coordinates one trigonometric term couples; ``seed`` draws all coefficients. With a
-    ``control_limit`` below ``control_size``, which is then the largest control an unlimited optimum would use, `u*` stays
-    at the limit on a part of the torus, and everything is as exact as before. Raises `InputError` for wrong arguments.
+    ``control_limit``, or one of a list, below ``control_size``, which is then the largest control an unlimited optimum would
+    use, `u*` stays at the limit on a part of the torus, and everything is as exact as before. Raises `InputError` for
+    wrong arguments.
 
     Attributes: trigonometric polynomials ``V0``, ``mu`` (`mu*`), ``mu0``, ``phi`` and ``stream`` (the components of `h`); the
     matrix ``B``; and the number ``c``.
@@ -54,7 +55,7 @@ class Manufactured(Problem):
         state_dependent_control: bool = False,
         interaction: int = 2,
         seed: int = 0,
-        control_limit: float | None = None,
+        control_limit: Limit = None,
         noise: float | Sequence[float] = 0.0,
         state_dependent_noise: bool = False,
     ) -> None:
@@ -79,7 +80,7 @@ class Manufactured(Problem):
     @property
     def limited(self) -> bool:
         """Whether `u*` is at the limit anywhere."""
-        return self.control_limit is not None and self.control_limit < self.control_size
+        return bool((self.control_size > torch.as_tensor(self.control_cost.sides)).any())
 
     def _prescribe(self, generator: torch.Generator) -> None:
         """Draw `V0`, `mu*`, `mu0`, `h` and `B`."""
@@ -123,7 +124,7 @@ class Manufactured(Problem):
         self.c = supremum(lambda x: -self.state_cost(x), points, ASCENTS, ASCENT_STEPS).value
         self.state_cost_bound = supremum(self.state_cost, points, ASCENTS, ASCENT_STEPS).value
         self.value_bound = self.c + float(self.V0.amplitudes.abs().sum())
-        self.control_bound = self.control_limit if self.limited else self.control_size
+        self.control_bound = min(self.control_size, self.control_cost.reach)
         self.occupation_bound = 1.0 + self.contrast
         # Both V0 and mu0 are trigonometric polynomials: their product integrates mode against mode.
         self.exact_optimum = self.c + self.V0.integral_with(self.mu0)
@@ -182,19 +183,8 @@ class Manufactured(Problem):
         jacobian = torch.einsum("nik,nij->nkj", B, self.V0.hessian(x))
         moving = self.B.slopes(x) * self.V0.gradient(x).unsqueeze(-1)
         jacobian = -(jacobian + torch.einsum("nik,ikj->nkj", moving, self.B.directions(x))) / self.discount
-        # D grad R*(p) = |p|^{q'-2} (I + (q'-2) n n^T) with n = p / |p|; at the limit c it is (c / |p|) (I - n n^T).
-        power = self.control_cost.conjugate_exponent - 2.0
-        direction = torch.nn.functional.normalize(p, dim=-1, eps=1e-30)
-        scale = norm_power(p, power) if power > 0.0 else torch.ones_like(p[:, 0])
-        radial = torch.full_like(scale, power)
-        if self.control_limit is not None and self.limited:
-            size = p.norm(dim=-1)
-            at_limit = size > self.control_limit ** (self.exponent - 1.0)
-            scale = torch.where(at_limit, self.control_limit / size.clamp_min(1e-30), scale)
-            radial = torch.where(at_limit, -1.0, radial)
-        along = torch.einsum("nk,nkj->nj", direction, jacobian).unsqueeze(1)
-        bent = jacobian + radial[:, None, None] * direction.unsqueeze(-1) * along
-        return (self.control_divergence(x) * u).sum(dim=-1) + scale * torch.einsum("njk,nkj->n", B, bent)
+        moved = self.control_cost.argmax_along(p, jacobian)
+        return (self.control_divergence(x) * u).sum(dim=-1) + torch.einsum("njk,nkj->n", B, moved)
 
     def control_matrix(self, x: Tensor) -> Tensor:
         return self.B(x)

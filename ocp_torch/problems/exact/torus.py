@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import require_choice, require_integer
+from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.problem import Problem
 
 SHEARS = ("none", "chain", "random")
@@ -36,11 +37,11 @@ class Torus(Problem):
     `mu* = rho/(rho - d k) (1 - (2 max_i |y_i - 1/2|)^{(rho - d k)/k})`, bounded exactly when `rho > d k`.
 
     ``shear`` chooses the integer matrix `A`: none, chain, or random by ``seed``. Where a ``control_limit`` is below
-    `sup |u*| = sqrt(d) alpha / rho`, that optimum is out of reach, and the exact truth is not given. Nor is it with
-    ``noise``; but bounds of `mu*` and `u*` are: along any `e` the second derivative `v` of `V*` in `y` has `v + v^2 /
-    rho^2 <= 2 / d` where it is largest, and the first one is at most that of `f`, by differentiating the
-    Hamilton-Jacobi-Bellman equation. So the flow contracts at rate `k` at most along each coordinate, and `sup mu*` is
-    no larger than without noise.
+    `sup |u*| = sqrt(d) alpha / rho`, or one of a list below `alpha / rho`, that optimum is out of reach, and the exact
+    truth is not given. Nor is it with ``noise``; but bounds of `mu*` and `u*` are: along any `e` the second derivative `v`
+    of `V*` in `y` has `v + v^2 / rho^2 <= 2 / d` where it is largest, and the first one is at most that of `f`, by
+    differentiating the Hamilton-Jacobi-Bellman equation. So the flow contracts at rate `k` at most along each coordinate,
+    and `sup mu*` is no larger than without noise.
     """
 
     def __init__(
@@ -49,7 +50,7 @@ class Torus(Problem):
         shear: str = "chain",
         discount: float = 2.0,
         seed: int = 0,
-        control_limit: float | None = None,
+        control_limit: Limit = None,
         noise: float | Sequence[float] = 0.0,
     ) -> None:
         super().__init__(dim=dim, discount=discount, control_limit=control_limit, noise=noise)
@@ -66,14 +67,15 @@ class Torus(Problem):
         self.control_bound = reach = 1.0 / (math.sqrt(d) * rho) if self.noisy else math.sqrt(d) * self._alpha / rho
         self.occupation_bound = rho / excess if excess > CRITICAL * rho else math.inf
         self.exact_optimum = d * self._alpha / 12.0
-        in_reach = control_limit is None or reach <= control_limit
+        corner = torch.full((1, d), reach / math.sqrt(d), dtype=torch.float64)
+        in_reach = bool(torch.isfinite(self.control_cost.cost(corner)))
         self._exact = in_reach and not self.noisy
         if self.noisy:
             self.exact_optimum = None
         if not in_reach:
             # Another problem: only what bounds every problem with this cost is still known.
             self.value_bound = self.occupation_bound = self.exact_optimum = None
-            self.control_bound = self.control_limit
+            self.control_bound = self.control_cost.reach
 
     def _offset(self, x: Tensor) -> Tensor:
         """`y - 1/2` in `[-1/2, 1/2)`, ``(N, d)``."""

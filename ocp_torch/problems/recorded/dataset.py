@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
 from ocp_torch.maths.seeds import Branch, derive_seed
+from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.problem import MARGIN, Problem
 from ocp_torch.problems.recorded.implied import completed, same_everywhere
 from ocp_torch.problems.recorded.recording import Recording, read
@@ -52,7 +53,7 @@ class Dataset(Problem):
         path: str,
         discount: float | None = None,
         exponent: float | None = None,
-        control_limit: float | None = None,
+        control_limit: Limit = None,
         held_out: float = 0.2,
         seed: int = 0,
         wrap: bool = False,

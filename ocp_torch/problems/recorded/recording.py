@@ -3,13 +3,14 @@
 Arrays: ``x (N, d)`` in `[0, 1)`, ``f (N,)``, ``a (N, d)``, ``B (N, d, m)``; optionally ``div_a (N,)``, ``div_B (N, m)``,
 ``mu0 (N,)``, and ``density (N,)``, that of the distribution ``x`` was drawn from (uniform where it is left out). Where there
 is noise ``noise (N, d, k)``, `sigma`, and optionally ``div_D (N, d)`` and ``div_div_D (N,)`` of `D = sigma sigma^T / 2`; they
-are 0 where `sigma` is the same at all samples. Optionally the numbers ``discount``, ``exponent`` and ``control_limit``.
-Samples must be independent draws.
+are 0 where `sigma` is the same at all samples. Optionally the numbers ``discount``, ``exponent`` and ``control_limit``
+(one, or one for each control). Samples must be independent draws.
 """
 
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,7 +41,7 @@ class Recording:
     user should be told of it."""
 
     samples: Samples
-    numbers: dict[str, float]
+    numbers: dict[str, Any]  # each a float, but a limit for each control is a list
     digest: str
     notes: tuple[str, ...] = ()
 
@@ -63,12 +64,14 @@ def read(path: str | Path, wrap: bool = False) -> Recording:
     for name in arrays:
         if name not in KNOWN:
             raise InputError(f"{path} holds {name!r}, which is no array of a recording{nearest(name, KNOWN)}.")
-    numbers = {}
+    numbers: dict[str, Any] = {}
     for name in (name for name in NUMBERS if name in arrays):
         number = arrays.pop(name)
-        if number.size != 1 or not np.isfinite(number).all():
-            raise InputError(f"{path}: {name} has shape {number.shape}, but must be one finite number.")
-        numbers[name] = float(number.reshape(()))
+        each = name == "control_limit" and number.shape == arrays["B"].shape[2:]
+        if not (each or number.size == 1) or not np.isfinite(number).all():
+            wanted = "one finite number" + (", or one for each control" if name == "control_limit" else "")
+            raise InputError(f"{path}: {name} has shape {number.shape}, but must be {wanted}.")
+        numbers[name] = float(number.reshape(())) if number.size == 1 else number.tolist()
     _require_shapes(path, arrays)
     for name, array in arrays.items():
         bad = ~np.isfinite(array).reshape(len(array), -1).all(axis=1)
@@ -82,7 +85,7 @@ def read(path: str | Path, wrap: bool = False) -> Recording:
     return Recording(samples, numbers, digest.hexdigest(), dependence_notes(path, samples))
 
 
-def write(path: str | Path, samples: Samples, numbers: dict[str, float | None], density: Tensor | None = None) -> None:
+def write(path: str | Path, samples: Samples, numbers: dict[str, Any], density: Tensor | None = None) -> None:
     """Write ``samples`` for `read`; ``density`` ``(N,)`` is that of the distribution of ``x``, uniform if `None`."""
     path = Path(path)
     if path.suffix not in SUFFIXES:

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from ocp_torch.errors import require_flag
 from ocp_torch.maths.differences import SECOND_STEPS, STEPS, Differenced, spread_divergences
+from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.oracle import Oracle
 
@@ -37,7 +38,7 @@ class Simulator(Problem):
         control_dim: int | None = None,
         discount: float = 2.0,
         exponent: float = 2.0,
-        control_limit: float | None = None,
+        control_limit: Limit = None,
         differences: bool = False,
         workers: int = 1,
         noise: float | abc.Sequence[float] = 0.0,

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import require_number, require_numbers
+from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.linkage import Linkage
 
@@ -35,7 +36,7 @@ class Arm(Linkage):
         speed: float = 0.35,
         discount: float = 1.0,
         exponent: float = 2.0,
-        control_limit: float | None = None,
+        control_limit: Limit = None,
         joint_noise: float | Sequence[float] = 0.0,
         noise: float | Sequence[float] = 0.0,
     ) -> None:

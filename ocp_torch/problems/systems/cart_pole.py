@@ -1,7 +1,6 @@
 r"""Swing up a pole that hangs from a cart by pushing the cart, whose track is short: d = 4, one force."""
 
 from collections.abc import Sequence
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -10,7 +9,7 @@ from ocp_torch.errors import require_number
 from ocp_torch.problems.physical.coordinates import Angle, Interval
 from ocp_torch.problems.physical.start import Start
 from ocp_torch.problems.physical.system import System
-from ocp_torch.problems.systems.rest import occupation_bound_at_rest, riccati
+from ocp_torch.problems.systems.rest import linearised, occupation_bound_at_rest
 
 
 class CartPole(System):
@@ -82,9 +81,9 @@ class CartPole(System):
         seams = torch.tensor([[0.5 * c.length if isinstance(c, Interval) else torch.pi for c in box]]).double()
         self.state_cost_bound = max(float(self.cost(seams)), self._failure)
         # Noise shakes it at the state of rest too.
-        A, B, Q = self.linearised()
-        rest = None if self.noisy else occupation_bound_at_rest(A, B / self._roots, Q, self.discount, self.exponent)
-        self.occupation_bound = rest
+        rest = linearised(self, [0.0] * self.dim)
+        at_rest = None if self.noisy else occupation_bound_at_rest(*rest, self.discount, self.exponent)
+        self.occupation_bound = at_rest
 
     def cost(self, s: Tensor) -> Tensor:
         position, pole, velocity, spin = s.unbind(-1)
@@ -114,17 +113,3 @@ class CartPole(System):
         kinetic = 0.5 * (self.cart_mass + self.pole_mass) * velocity.square() + lever * pole.cos() * velocity * spin
         turning = 2.0 / 3.0 * lever * self.half_length * spin.square()
         return kinetic + turning - 2.0 * lever * self.gravity * (0.5 * pole).sin().square()
-
-    @cached_property
-    def balance(self) -> Tensor:
-        """`P` ``(4, 4)`` of the undiscounted linear-quadratic problem at rest upright, without a limit: `s'Ps / 2` is what is
-        left to pay."""
-        A, B, Q = self.linearised()
-        return riccati(A, B / self._roots, Q)
-
-    def linearised(self) -> tuple[Tensor, Tensor, Tensor]:
-        """`A` ``(4, 4)`` and `B` ``(4, 1)`` of the dynamics at rest upright, and the Hessian ``(4, 4)`` of the cost."""
-        rest = torch.zeros(1, self.dim, dtype=torch.float64)
-        A = torch.func.jacrev(lambda s: self.dynamics(s[None])[0][0])(rest[0])
-        Q = torch.func.hessian(lambda s: self.cost(s[None])[0])(rest[0])
-        return A, self.dynamics(rest)[1][0], Q

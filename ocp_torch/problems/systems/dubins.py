@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.planar import PlanarVehicle
 
@@ -38,7 +39,7 @@ class Dubins(PlanarVehicle):
         turn_rate: float = 0.25,
         discount: float = 0.5,
         exponent: float = 2.0,
-        control_limit: float | None = None,
+        control_limit: Limit = None,
         heading_noise: float = 0.0,
         position_noise: float = 0.0,
         noise: float | Sequence[float] = 0.0,

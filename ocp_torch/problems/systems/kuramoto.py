@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
+from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.graphs import GRAPHS, adjacency
 from ocp_torch.problems.systems.oscillators import ENTRAIN, SYNCHRONISE, Oscillators
@@ -48,7 +49,7 @@ class Kuramoto(Oscillators):
         discount: float = 1.0,
         exponent: float = 2.0,
         seed: int = 0,
-        control_limit: float | None = None,
+        control_limit: Limit = None,
         phase_noise: float | Sequence[float] = 0.0,
         noise: float | Sequence[float] = 0.0,
     ) -> None:

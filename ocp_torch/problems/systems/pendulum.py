@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError, require_number
+from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.physical.coordinates import Angle, Interval
 from ocp_torch.problems.physical.prices import scaled_limit
 from ocp_torch.problems.physical.system import System
@@ -48,7 +49,7 @@ class Pendulum(System):
         torque_cost: float = 0.1,
         discount: float = 2.0,
         exponent: float = 2.0,
-        control_limit: float | None = None,
+        control_limit: Limit = None,
         torque_noise: float = 0.0,
         noise: float | Sequence[float] = 0.0,
     ) -> None:

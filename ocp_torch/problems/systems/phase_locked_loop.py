@@ -8,7 +8,7 @@ from torch import Tensor
 from ocp_torch.errors import require_number, require_numbers
 from ocp_torch.problems.physical.coordinates import Angle, Interval
 from ocp_torch.problems.physical.system import System
-from ocp_torch.problems.systems.rest import occupation_bound_at_rest
+from ocp_torch.problems.systems.rest import linearised, occupation_bound_at_rest
 
 
 class PhaseLockedLoop(System):
@@ -17,8 +17,8 @@ class PhaseLockedLoop(System):
     `u_1`, in rad/s, tunes the oscillator for as long as it lasts, `u_2`, in rad/s^2, for good: the proportional and the
     integral path of the classical loop filter (Gardner, *Phaselock Techniques*, chapter 2), here free functions of the
     state. Noise of frequency that is white, in rad/sqrt(s), and that walks, in rad/s/sqrt(s): the two-state model of clocks
-    (Zucca and Tavella, 2005). Cost: `1 - cos phi + (frequency_weight w^2 + k_1 u_1^2 + k_2 u_2^2) / 2`, `k` = ``tuning_weight``.
-    The box is `|w| <= max_frequency` in rad/s; it starts at any phase within ``pull_in`` of the frequency.
+    (Zucca and Tavella, 2005). Cost: `1 - cos phi + (frequency_weight w^2 + k_1 u_1^2 + k_2 u_2^2) / 2`, with the
+    ``tuning_weight`` `k`. The box is `|w| <= max_frequency` in rad/s; it starts at any phase within ``pull_in`` of the frequency.
 
     Without noise `mu*` is declared unbounded where the linear loop gathers mass at lock faster than the discount forgets it;
     with noise nothing is known of it. Raises `InputError` for wrong arguments.
@@ -61,12 +61,10 @@ class PhaseLockedLoop(System):
         )
         fastest = torch.tensor([[torch.pi, 0.5 * box[1].length]], dtype=torch.float64)
         self.state_cost_bound = max(float(self.cost(fastest)), self._failure)
-        A = torch.tensor([[0.0, 1.0], [0.0, 0.0]], dtype=torch.float64)
-        Q = torch.tensor([1.0, self.frequency_weight], dtype=torch.float64).diag()
         # Noise shakes it when locked too.
-        B = -(1.0 / self._roots).diag()
-        rest = None if self.noisy else occupation_bound_at_rest(A, B, Q, self.discount, self.exponent)
-        self.occupation_bound = rest
+        locked = linearised(self, [0.0, 0.0])
+        at_rest = None if self.noisy else occupation_bound_at_rest(*locked, self.discount, self.exponent)
+        self.occupation_bound = at_rest
 
     def cost(self, s: Tensor) -> Tensor:
         phase, frequency = s.unbind(-1)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import require_choice, require_integer, require_number
+from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.oscillators import DESYNCHRONISE, Oscillators
 
@@ -40,7 +41,7 @@ class PhaseNeurons(Oscillators):
         weight: float = 1.0,
         discount: float = 0.7,
         exponent: float = 2.0,
-        control_limit: float | None = None,
+        control_limit: Limit = None,
         phase_noise: float | Sequence[float] = 0.0,
         noise: float | Sequence[float] = 0.0,
     ) -> None:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError, require_number, require_numbers, shown
 from ocp_torch.files.reading import kind, require_file
+from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.linkage import Linkage
 
@@ -58,7 +59,7 @@ class RobotArm(Linkage):
         speed: float = 0.35,
         discount: float = 1.0,
         exponent: float = 2.0,
-        control_limit: float | None = None,
+        control_limit: Limit = None,
         joint_noise: float | Sequence[float] = 0.0,
         noise: float | Sequence[float] = 0.0,
     ) -> None:

@@ -161,7 +161,7 @@ class RLContender:
 
         def policy(x: torch.Tensor) -> torch.Tensor:
             actions, _ = model.predict(np.atleast_2d(observe(x)), deterministic=True)
-            u = self.control_bound * torch.from_numpy(np.asarray(actions)).to(x)
+            u = torch.from_numpy(environment.control_bound * np.asarray(actions)).to(x)
             return self.problem.control_cost.within(u, torch.ones_like(x[:, 0]))
 
         points, spent = [], 0.0

@@ -1,7 +1,6 @@
 """From a resolved configuration to contenders, and all of them run one after the other."""
 
 import logging
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,8 +44,7 @@ def contender(name: str, config: dict, problem: Problem, constants: Constants):
     options = dict(config["rl"])
     steps = options.pop("steps").get(name)
     bound = problem.control_bound if problem.control_bound is not None else constants.C_u
-    reach = min(1.2 * bound, problem.control_limit or math.inf)
-    return call(RLContender, "rl", options, name=name, problem=problem, control_bound=reach, steps=steps)
+    return call(RLContender, "rl", options, name=name, problem=problem, control_bound=1.2 * bound, steps=steps)
 
 
 class Contest:

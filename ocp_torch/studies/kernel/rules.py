@@ -53,7 +53,7 @@ class Rule(ABC):
     def __init__(self, problem: Problem, constants: Constants) -> None:
         if problem.control_limit is not None:
             raise InputError(
-                f"problem.control_limit is {problem.control_limit:g}, but the kernel methods know no limit; use networks."
+                f"problem.control_limit is {problem.control_limit}, but the kernel methods know no limit; use networks."
             )
         if problem.noisy and not self.takes_noise:
             raise InputError("problem.noise is above 0, but of the kernel methods only dual knows noise; use networks.")

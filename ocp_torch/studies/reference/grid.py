@@ -147,7 +147,7 @@ def require_solvable(problem: Problem, grid: Grid) -> None:
                 raise InputError(f"{name} does not have period 1 in x_{k + 1}, but all of a problem on the torus must.")
     u = 3.0 * torch.randn(CONTROLS, m, generator=fixed_generator(1), dtype=torch.float64)
     if problem.control_limit is not None:
-        u = problem.control_limit * u / (1.0 + u.norm(dim=-1, keepdim=True))
+        u = problem.control_cost.within(u, torch.rand(CONTROLS, generator=fixed_generator(2), dtype=torch.float64))
     own, power = problem.control_cost.cost(u), u.norm(dim=-1) ** problem.exponent / problem.exponent
     if not torch.allclose(own, power, rtol=1e-8, atol=1e-12):
         raise InputError(f"{type(problem).__name__} has a control cost of its own, but the grid knows only |u|^q / q.")

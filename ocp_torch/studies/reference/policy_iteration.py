@@ -2,8 +2,8 @@
 
 For the semi-Lagrangian scheme the minimum over `u` is taken over finitely many candidates, each judged by the whole right
 side of the scheme: the control now held; the closed-form minimiser `u = |s|^{q'-2} s`, `s = -B^T grad V / rho` (cut to the
-limit on the control, if there is one: mixtures of controls within a ball stay in it), at the midpoint of its path; and the
-same from the controls of neighbouring nodes, which carries a better branch across a kink.
+limit on the control, if there is one: it is convex, so mixtures of controls within stay there), at the midpoint of its path;
+and the same from the controls of neighbouring nodes, which carries a better branch across a kink.
 """
 
 import math

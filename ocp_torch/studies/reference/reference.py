@@ -1,6 +1,5 @@
 """A reference for `V*` and `OPT` in one to three dimensions, from grids alone: no network, no objective, no certificate."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -128,7 +127,7 @@ def _speed(problem: Problem, coarsest: int) -> tuple[GridSolution, float]:
     scheme = SemiLagrangian(problem, grid, longest)
     # Without drift the equation itself gives |u|^q / q' = R*(s) = f - V <= osc f.
     q = problem.exponent
-    thrust = min((q / (q - 1.0) * scheme.scale) ** (1.0 / q), problem.control_limit or math.inf)
+    thrust = min((q / (q - 1.0) * scheme.scale) ** (1.0 / q), problem.control_cost.reach)
     fastest = float(scheme.a.abs().max()) + float(scheme.B.flatten(1).norm(dim=-1).max()) * thrust
     step = min(longest, CELLS * grid.spacing / max(fastest, 1e-300))
     value, control = scheme.f.clone(), scheme.f.new_zeros(grid.count, problem.control_dim)

@@ -12,11 +12,14 @@ monotone, so that it converges to the viscosity solution; what is clipped stays 
 proportional to `h` the error is `O(tau^2)`.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from ocp_torch.maths.supremum import batched
+from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.problem import Problem
 from ocp_torch.studies.reference.grid import PIECE, Grid
 
@@ -32,8 +35,12 @@ def running_cost(u: Tensor, q: float) -> Tensor:
     return u.norm(dim=-1) ** q / q
 
 
-def minimiser(s: Tensor, q: float, limit: float | None = None) -> Tensor:
-    """The `u` that maximises `s . u - |u|^q / q`: along `s`, of size `|s|^{q'-1}`, at most ``limit``; ``(N, m)``."""
+def minimiser(s: Tensor, q: float, limit: Limit = None) -> Tensor:
+    """The `u` that maximises `s . u - |u|^q / q`, ``(N, m)``: along `s`, of size `|s|^{q'-1}`, at most ``limit``; or, where
+    that is a list, entry by entry (`q = 2`)."""
+    if isinstance(limit, Sequence):
+        most = s.new_tensor(limit)
+        return s.minimum(most).maximum(-most)
     size = s.norm(dim=-1, keepdim=True)
     u = size ** ((2.0 - q) / (q - 1.0)) * s
     if limit is None:
