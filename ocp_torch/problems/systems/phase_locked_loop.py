@@ -18,7 +18,8 @@ class PhaseLockedLoop(System):
     integral path of the classical loop filter (Gardner, *Phaselock Techniques*, chapter 2), here free functions of the
     state. Noise of frequency that is white, in rad/sqrt(s), and that walks, in rad/s/sqrt(s): the two-state model of clocks
     (Zucca and Tavella, 2005). Cost: `1 - cos phi + (frequency_weight w^2 + k_1 u_1^2 + k_2 u_2^2) / 2`, with the
-    ``tuning_weight`` `k`. The box is `|w| <= max_frequency` in rad/s; it starts at any phase within ``pull_in`` of the frequency.
+    ``tuning_weight`` `k`. The box is `|w| <= max_frequency` in rad/s; it starts within ``pull_in``,
+    at any phase.
 
     Without noise `mu*` is declared unbounded where the linear loop gathers mass at lock faster than the discount forgets it;
     with noise nothing is known of it. Raises `InputError` for wrong arguments.

@@ -142,10 +142,7 @@ def _(problem: Pendulum, path: Path) -> dict[str, float]:
 def _(problem: DoublePendulum, path: Path) -> dict[str, float]:
     """Success: both links within 0.2 rad of upright, joints within 0.5 rad/s at the end, and never out of the box."""
     s = problem.from_torus(path.states[-1])
-    tilts = torch.stack([s[:, 0], s[:, 0] + s[:, 1]], dim=-1)
-    upright = (tilts.cos() >= math.cos(UPRIGHT[0])).all(dim=-1) & (s[:, 2:].abs() <= UPRIGHT[1]).all(dim=-1)
-    left = path.each(problem.outside).any(dim=0)
-    return {"success": _part(upright & ~left), "upright": _part(upright), "left": _part(left)}
+    return _swung_up(problem, path, torch.stack([s[:, 0], s[:, 0] + s[:, 1]], dim=-1), s[:, 2:])
 
 
 @measure.register
@@ -175,11 +172,9 @@ def _(problem: System, path: Path) -> dict[str, float]:
 
 @measure.register
 def _(problem: CartPole, path: Path) -> dict[str, float]:
-    """Success: within 0.2 rad and 0.5 rad/s of upright at the end, and never off the track nor too fast for the box."""
-    _, angle, _, spin = problem.from_torus(path.states[-1]).unbind(dim=-1)
-    upright = (angle.abs() <= UPRIGHT[0]) & (spin.abs() <= UPRIGHT[1])
-    left = path.each(problem.outside).any(dim=0)
-    return {"success": _part(upright & ~left), "upright": _part(upright), "left": _part(left)}
+    """Success: the pole within 0.2 rad and 0.5 rad/s of upright at the end, and never off the track nor too fast for the box."""
+    s = problem.from_torus(path.states[-1])
+    return _swung_up(problem, path, s[:, 1:2], s[:, 3:])
 
 
 @measure.register
@@ -193,6 +188,13 @@ def _(problem: PhaseLockedLoop, path: Path) -> dict[str, float]:
 def has_metrics(problem: Problem) -> bool:
     """Whether ``problem`` has numbers of its own."""
     return measure.dispatch(type(problem)) is not measure.dispatch(Problem)
+
+
+def _swung_up(problem: System, path: Path, tilts: Tensor, speeds: Tensor) -> dict[str, float]:
+    """Whether all ``tilts`` and ``speeds`` ``(N, k)`` at the end are those of a body upright, and the box was never left."""
+    upright = (tilts.cos() >= math.cos(UPRIGHT[0])).all(dim=-1) & (speeds.abs() <= UPRIGHT[1]).all(dim=-1)
+    left = path.each(problem.outside).any(dim=0)
+    return {"success": _part(upright & ~left), "upright": _part(upright), "left": _part(left)}
 
 
 def _part(flags: Tensor) -> float:
