@@ -21,7 +21,7 @@ SWINGS = (13.0, 2.0, 4.0, 1.5), (14.0, 9.0, 31.0, 2.5)
 PUMPED = 5.0
 # Satellite: the frequency of the critically damped loop, in rad/s.
 STIFFNESS = 0.1
-# Cart and pole: the gain of the energy, per J m, and those on position (1/s^2) and velocity (1/s) of the cart; and the cost of
+# Cart and pole: the gain of the energy, per J m, those on position (1/s^2) and velocity (1/s) of the cart, and the cost of
 # the linear balance, per unit of time, below which it balances.
 SHAPING, CENTRE, BALANCED = 15.0, (2.0, 2.0), 0.4
 # Phase-locked loop: its natural frequency in rad/s, and its damping.

@@ -172,7 +172,7 @@ def _(problem: System, path: Path) -> dict[str, float]:
 
 @measure.register
 def _(problem: CartPole, path: Path) -> dict[str, float]:
-    """Success: the pole within 0.2 rad and 0.5 rad/s of upright at the end, and never off the track nor too fast for the box."""
+    """Success: the pole within 0.2 rad and 0.5 rad/s of upright at the end, and never off the track or out of the box."""
     s = problem.from_torus(path.states[-1])
     return _swung_up(problem, path, s[:, 1:2], s[:, 3:])
 
