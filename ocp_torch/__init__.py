@@ -13,8 +13,8 @@ from ocp_torch.runs.external import certify
 __version__ = "0.1.0"
 __all__ = [
     "PROBLEMS",
-    "BoxLimitedCost",
     "Angle",
+    "BoxLimitedCost",
     "Simulator",
     "Circle",
     "Controller",

@@ -7,11 +7,17 @@ from ocp_torch.problems.problem import Lipschitz, Problem
 from ocp_torch.problems.recorded.dataset import Dataset
 from ocp_torch.problems.simulator.simulator import Simulator
 from ocp_torch.problems.systems.arm import Arm
+from ocp_torch.problems.systems.cart_pole import CartPole
+from ocp_torch.problems.systems.double_integrator import DoubleIntegrator
+from ocp_torch.problems.systems.double_pendulum import Acrobot, Pendubot
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.pendulum import Pendulum
+from ocp_torch.problems.systems.phase_locked_loop import PhaseLockedLoop
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
+from ocp_torch.problems.systems.quadrotor import Quadrotor
 from ocp_torch.problems.systems.robot import RobotArm
+from ocp_torch.problems.systems.satellite import Satellite
 from ocp_torch.problems.systems.unicycle import Unicycle
 
 # `Simulator` is not among them: a file may not name a function to be imported.
@@ -27,6 +33,13 @@ PROBLEMS: dict[str, type[Problem]] = {
     "dubins": Dubins,
     "pendulum": Pendulum,
     "robot": RobotArm,
+    "cart_pole": CartPole,
+    "double_integrator": DoubleIntegrator,
+    "phase_locked_loop": PhaseLockedLoop,
+    "acrobot": Acrobot,
+    "pendubot": Pendubot,
+    "quadrotor": Quadrotor,
+    "satellite": Satellite,
 }
 
 # What `Simulator` was called in files written before.

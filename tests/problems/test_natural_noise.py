@@ -7,7 +7,20 @@ import torch
 
 from ocp_torch.maths.brownian import Grid, increments, path_integral
 from ocp_torch.maths.jets import diffusion_divergences
-from ocp_torch.problems import Arm, Dubins, Kuramoto, Pendulum, PhaseNeurons, RobotArm, Unicycle
+from ocp_torch.problems import (
+    Acrobot,
+    Arm,
+    CartPole,
+    Dubins,
+    Kuramoto,
+    Pendubot,
+    Pendulum,
+    PhaseNeurons,
+    Quadrotor,
+    RobotArm,
+    Satellite,
+    Unicycle,
+)
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
@@ -28,6 +41,11 @@ NOISY = {
     "neurons": PhaseNeurons(phase_noise=[0.3, 0.0]),
     "pendulum": Pendulum(torque_noise=0.4),
     "pendulum, both": Pendulum(torque_noise=0.4, noise=[0.001, 0.002]),
+    "cart-pole": CartPole(force_noise=0.5),
+    "acrobot": Acrobot(torque_noise=0.1),
+    "pendubot, both": Pendubot(torque_noise=0.2, noise=0.001),
+    "quadrotor": Quadrotor(thrust_noise=0.05),
+    "satellite": Satellite(torque_noise=1.0),
     "arm, both": Arm(joint_noise=0.2, noise=0.001),
 }
 

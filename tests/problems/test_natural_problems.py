@@ -8,11 +8,28 @@ import pytest
 import torch
 from scipy.linalg import solve_continuous_are
 
+from ocp_torch import System
 from ocp_torch.control.controller import problem_name
 from ocp_torch.errors import InputError
 from ocp_torch.maths.runge_kutta import discounted_integral
 from ocp_torch.maths.supremum import supremum
-from ocp_torch.problems import PROBLEMS, Arm, Dubins, Kuramoto, Pendulum, PhaseNeurons, RobotArm, Unicycle
+from ocp_torch.problems import (
+    PROBLEMS,
+    Acrobot,
+    Arm,
+    CartPole,
+    DoubleIntegrator,
+    Dubins,
+    Kuramoto,
+    Pendubot,
+    Pendulum,
+    PhaseLockedLoop,
+    PhaseNeurons,
+    Quadrotor,
+    RobotArm,
+    Satellite,
+    Unicycle,
+)
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.systems.rest import occupation_bound_at_rest, optimal_contraction
 from ocp_torch.runs.metrics.trial import metrics
@@ -28,8 +45,9 @@ def physical(problem, count: int, seed: int = 0):
     """Physical states in the units of the problem, far beyond one turn where they are angles."""
     draws = torch.rand(count, len(problem.from_torus(torch.zeros(1, problem.dim))[0]), generator=generator(seed)) - 0.5
     states = 40.0 * draws.double()
-    if isinstance(problem, Pendulum):
-        states[:, 1] = 2.0 * problem.seam * draws[:, 1]
+    if isinstance(problem, System):
+        chart = problem.chart
+        states[:, chart.boxed] = (chart.centre + chart.length * draws)[:, chart.boxed]
     return states
 
 
@@ -419,6 +437,26 @@ BAD = [
     (Dubins, dict(turn_rate="fast"), "problem.turn_rate"),
     (Pendulum, dict(seam=8.0), "problem.seam is 8, but must be above problem.max_speed"),
     (Pendulum, dict(mass=0), "problem.mass"),
+    (CartPole, dict(pole_mass=0.0), "problem.pole_mass is 0, but must be above 0"),
+    (CartPole, dict(start={"angle": [0, 1]}), "start names 'angle', but must name coordinates: position, pole"),
+    (DoubleIntegrator, dict(box=1.0), "problem.box is 1.0, but must be a list of 2 numbers"),
+    (DoubleIntegrator, dict(starts=[0.5, 1.5]), "start has velocity from -1.5 to 1.5 m/s, which is not inside the box"),
+    (PhaseLockedLoop, dict(tuning_weight=[0.2]), "problem.tuning_weight is .* a list of 2 numbers"),
+    (PhaseLockedLoop, dict(exponent=1.5, tuning_weight=[0.1, 0.2]), "must be the same for all controls"),
+    (Acrobot, dict(masses=[1.0]), "problem.masses"),
+    (Acrobot, dict(lengths=[0.2, -0.3]), r"problem.lengths\[1\] is -0.3"),
+    (Acrobot, dict(inertias=[0.001, 0.001]), "problem.inertias are .* about the joints"),
+    (Pendubot, dict(starts="hang"), "problem.starts is 'hang'.*did you mean 'hanging'"),
+    (Quadrotor, dict(max_speeds=[3.0, 3.0]), "problem.max_speeds"),
+    (Quadrotor, dict(obstacles=[[0.1, 0.2]]), r"problem.obstacles\[0\]"),
+    (Quadrotor, dict(thrust_noise=-1.0), "problem.thrust_noise"),
+    (Satellite, dict(inertia=[[1.0, 0.0, 0.0]]), "problem.inertia is .* three rows"),
+    (
+        Satellite,
+        dict(inertia=[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 3.0]]),
+        "problem.inertia is .* principal moments",
+    ),
+    (Satellite, dict(inertia=[[2.0, 1.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]), "problem.inertia is .* symmetric"),
     (Kuramoto, dict(oscillators=1), "problem.oscillators"),
     (Kuramoto, dict(goal="sync"), "problem.goal is 'sync'.*did you mean|problem.goal is 'sync'"),
     (Kuramoto, dict(graph="rings"), "problem.graph is 'rings'.*did you mean 'ring'"),

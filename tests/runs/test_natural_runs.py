@@ -11,6 +11,7 @@ from ocp_torch.runs.loading import policy_of
 from ocp_torch.runs.metrics.trial import METRICS, metrics
 from support.small import session, small
 
+NEW = ["acrobot", "pendubot", "quadrotor", "satellite", "cart_pole", "double_integrator", "phase_locked_loop"]
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
 
 
@@ -31,7 +32,9 @@ def test_a_run_without_simulations_has_no_numbers(tmp_path):
     assert not (tmp_path / METRICS).exists()
 
 
-@pytest.mark.parametrize("problem", ["kuramoto", "phase_neurons", "arm", "unicycle", "dubins", "pendulum", "robot"])
+@pytest.mark.parametrize(
+    "problem", ["kuramoto", "phase_neurons", "arm", "unicycle", "dubins", "pendulum", "robot", *NEW]
+)
 def test_files_and_classes_agree_on_the_defaults(problem):
     """What a file says is what the class does without one."""
     built = small(f"problem={problem}").problem

@@ -21,9 +21,16 @@ BETTER = {
     "unicycle": ("success", True),
     "dubins": ("distance", False),
     "pendulum": ("upright", True),
+    "acrobot": ("success", True),
+    "pendubot": ("success", True),
+    "quadrotor": ("success", True),
+    "satellite": ("pointed", True),
     "kuramoto n=3": ("order_after", True),
     "kuramoto desynchronise": ("order_after", False),
     "phase neurons n=2": ("order_after", False),
+    "double integrator": ("inside", True),
+    "cart-pole": ("success", True),
+    "phase-locked loop": ("locked", True),
 }
 
 
@@ -93,7 +100,7 @@ def test_a_path_through_an_obstacle_is_no_success_although_it_reaches_the_target
 
 
 @pytest.mark.nightly
-@zoo.on(["arm n=2", "unicycle", "kuramoto n=3", "pendulum"])
+@zoo.on(["arm n=2", "unicycle", "kuramoto n=3", "pendulum", "cart-pole"])
 def test_every_system_has_a_picture_that_is_drawn(problem, tmp_path):
     figure = motion(problem, classical_policy(problem))
     figure.savefig(tmp_path / "motion.png", dpi=40)

@@ -8,14 +8,21 @@ import torch
 
 from ocp_torch.fields import PeriodicMLP
 from ocp_torch.problems import (
+    Acrobot,
     Arm,
+    CartPole,
     Circle,
+    DoubleIntegrator,
     Dubins,
     Kuramoto,
     Manufactured,
+    Pendubot,
     Pendulum,
+    PhaseLockedLoop,
     PhaseNeurons,
     Problem,
+    Quadrotor,
+    Satellite,
     Torus,
     Unicycle,
 )
@@ -128,6 +135,17 @@ _NATURAL = {
     "kuramoto entrain": partial(Kuramoto, goal="entrain", graph="ring"),
     "kuramoto desynchronise": partial(Kuramoto, goal="desynchronise", coupling=2.0),
     "phase neurons n=2": PhaseNeurons,
+    "double integrator": DoubleIntegrator,
+    "double integrator, limited": partial(DoubleIntegrator, mass=2.0, velocity_weight=0.5, control_limit=0.5),
+    "cart-pole": CartPole,
+    "cart-pole q=1.5": partial(CartPole, exponent=1.5, control_limit=None, failure_cost=2.0),
+    "phase-locked loop": PhaseLockedLoop,
+    "acrobot": Acrobot,
+    "pendubot": Pendubot,
+    "pendubot from hanging": partial(Pendubot, starts="hanging", torque_cost=0.2, control_limit=None),
+    "quadrotor": Quadrotor,
+    "quadrotor without obstacles": partial(Quadrotor, obstacles=[], control_limit=0.5, thrust_cost=2.0),
+    "satellite": Satellite,
     "phase neurons n=3 type 1": partial(PhaseNeurons, neurons=3, response="type1"),
 }
 

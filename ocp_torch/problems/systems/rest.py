@@ -1,12 +1,24 @@
-"""Whether the optimal flow gathers mass at a state of rest, by the linear system and the quadratic cost around it."""
+"""The linear system and the quadratic cost around a state of rest: the optimum there, and whether mass gathers."""
 
 import math
+from collections.abc import Sequence
 
 import torch
+from scipy.linalg import solve_continuous_are
 from torch import Tensor
+
+from ocp_torch.problems.physical.system import System
 
 # A contraction this close to rho, relative to it, counts as one that reaches it, so that rounding decides nothing.
 ROUNDING = 1e-9
+
+
+def riccati(A: Tensor, B: Tensor, Q: Tensor, rho: float = 0.0) -> Tensor:
+    r"""The stabilising `P` ``(d, d)`` of `F'P + PF - PBB'P + Q = 0`, `F = A - rho/2`: from `x` the least of
+    `int e^{-rho t} (x'Qx + |u|^2) / 2 dt` is `x'Px / 2`, by `u = -B'Px`. ``A`` and ``Q`` are ``(d, d)``, ``B`` ``(d, m)``."""
+    F = A - 0.5 * rho * torch.eye(len(A), dtype=A.dtype)
+    P = solve_continuous_are(F.numpy(), B.numpy(), Q.numpy(), torch.eye(B.shape[1]).numpy())
+    return torch.from_numpy(P).to(A)
 
 
 def optimal_contraction(A: Tensor, B: Tensor, Q: Tensor, rho: float) -> float:
@@ -31,3 +43,12 @@ def occupation_bound_at_rest(A: Tensor, B: Tensor, Q: Tensor, rho: float, expone
     """
     contraction = optimal_contraction(A, B, Q, rho) if exponent == 2.0 else -float(A.trace())
     return math.inf if contraction >= rho * (1.0 - ROUNDING) else None
+
+
+def linearised(system: System, state: Sequence[float]) -> tuple[Tensor, Tensor, Tensor]:
+    """`A` ``(d, d)``, `B` ``(d, m)`` and `Q` ``(d, d)``, the Hessian of the cost, at a ``state`` of rest: of physical states,
+    and of controls whose price is `|v|^2 / 2`."""
+    at = torch.tensor(state, dtype=torch.float64)
+    A = torch.autograd.functional.jacobian(lambda s: system.dynamics(s[None])[0][0], at)
+    B = system.from_controls(system.dynamics(at[None])[1][0].detach())
+    return A, B, torch.autograd.functional.hessian(lambda s: system.cost(s[None])[0], at)

@@ -9,12 +9,19 @@ from torch import Tensor
 from ocp_torch.control.policies import Policy
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.angles import TURN
+from ocp_torch.problems.systems.cart_pole import CartPole
+from ocp_torch.problems.systems.double_integrator import DoubleIntegrator
+from ocp_torch.problems.systems.double_pendulum import DoublePendulum
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
+from ocp_torch.problems.systems.phase_locked_loop import PhaseLockedLoop
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
+from ocp_torch.problems.systems.quadrotor import Quadrotor
+from ocp_torch.problems.systems.satellite import Satellite
 from ocp_torch.problems.systems.unicycle import Unicycle
+from ocp_torch.runs.metrics import feedback
 
 # Arms: the gain per second, and the damping of the pseudo-inverse relative to the arm's length.
 REACH, DAMPING = 1.5, 0.1
@@ -88,4 +95,10 @@ CONTROLS: dict[type[Problem], Callable[..., Tensor]] = {
     Kuramoto: descend,
     PhaseNeurons: descend,
     Pendulum: energy_pump,
+    CartPole: feedback.shape_energy,
+    DoubleIntegrator: feedback.linear_quadratic,
+    DoublePendulum: feedback.swing_up,
+    PhaseLockedLoop: feedback.loop_filter,
+    Quadrotor: feedback.hover,
+    Satellite: feedback.point,
 }

@@ -1,5 +1,6 @@
 """Trajectories at equal times, for numbers and pictures: the certificate has its own; and what is measured on each system."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import singledispatch
@@ -11,16 +12,24 @@ from ocp_torch.control.policies import Policy
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.systems.cart_pole import CartPole
+from ocp_torch.problems.systems.double_pendulum import DoublePendulum
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
+from ocp_torch.problems.systems.phase_locked_loop import PhaseLockedLoop
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.systems.planar import PlanarVehicle
+from ocp_torch.problems.systems.quadrotor import Quadrotor
+from ocp_torch.problems.systems.reaching import Reaching
+from ocp_torch.problems.systems.satellite import Satellite
 
-# What counts as reached, relative to the arm's length or the period of the plane; as upright, in rad and rad/s. Definitions
-# of what the numbers say, not tuned.
+# What counts as reached, relative to the arm's length or the width of the plane; as upright, in rad and rad/s; as pointed, in
+# degrees. Definitions of what the numbers say, not tuned.
 REACHED = 0.05
+LOCKED = 0.5 * math.pi  # rad of phase error, beyond which a detector pushes the wrong way
+POINTED = 1.0
 UPRIGHT = (0.2, 0.5)
 LATE = 0.25  # the part of a trajectory that is its end
 
@@ -86,7 +95,7 @@ def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, step
 
 def admissible(problem: Problem, x: Tensor) -> Tensor:
     """Which states ``(N,)`` are fair starts; all, unless there are obstacles: then those that keep the clearance."""
-    if isinstance(problem, Linkage | PlanarVehicle):
+    if isinstance(problem, Reaching):
         return problem.gap(x) > problem.clearance
     return torch.ones_like(x[:, 0], dtype=torch.bool)
 
@@ -130,15 +139,62 @@ def _(problem: Pendulum, path: Path) -> dict[str, float]:
 
 
 @measure.register
+def _(problem: DoublePendulum, path: Path) -> dict[str, float]:
+    """Success: both links within 0.2 rad of upright, joints within 0.5 rad/s at the end, and never out of the box."""
+    s = problem.from_torus(path.states[-1])
+    return _swung_up(problem, path, torch.stack([s[:, 0], s[:, 0] + s[:, 1]], dim=-1), s[:, 2:])
+
+
+@measure.register
+def _(problem: Quadrotor, path: Path) -> dict[str, float]:
+    """Success: at the end within 5 % of the room's width of the target; and no crash, into an obstacle or out of the box."""
+    reached = problem.distance(path.states[-1]) <= REACHED * 2.0 * problem.width
+    crossed, left = (path.each(problem.gap) < 0.0).any(dim=0), path.each(problem.outside).any(dim=0)
+    safe = ~(crossed | left)
+    return {"success": _part(reached & safe), "safe": _part(safe), "crossed": _part(crossed), "left": _part(left)}
+
+
+@measure.register
+def _(problem: Satellite, path: Path) -> dict[str, float]:
+    """The mean pointing error in degrees, first and late on; the parts within a degree late on, and ever out of the box."""
+    error = lambda x: torch.rad2deg(problem.angle(problem.from_torus(x)))
+    late, left = path.each(error, late=True), path.each(problem.outside).any(dim=0)
+    before, pointed = float(error(path.states[0]).mean()), (late <= POINTED).all(dim=0)
+    return {"error_before": before, "error": float(late.mean()), "pointed": _part(pointed), "left": _part(left)}
+
+
+@measure.register
 def _(problem: System, path: Path) -> dict[str, float]:
     """The part of the starts from which the box is never left."""
     left = path.each(problem.outside).any(dim=0)
     return {"inside": _part(~left)}
 
 
+@measure.register
+def _(problem: CartPole, path: Path) -> dict[str, float]:
+    """Success: the pole within 0.2 rad and 0.5 rad/s of upright at the end, and never off the track or out of the box."""
+    s = problem.from_torus(path.states[-1])
+    return _swung_up(problem, path, s[:, 1:2], s[:, 3:])
+
+
+@measure.register
+def _(problem: PhaseLockedLoop, path: Path) -> dict[str, float]:
+    """Locked: over the last quarter of the time never beyond a quarter turn; and the root mean square error then, in rad."""
+    phase = path.each(lambda x: problem.from_torus(x)[:, 0], late=True)
+    locked = (phase.abs() <= LOCKED).all(dim=0)
+    return {"locked": _part(locked), "phase_error": float(phase.square().mean().sqrt())}
+
+
 def has_metrics(problem: Problem) -> bool:
     """Whether ``problem`` has numbers of its own."""
     return measure.dispatch(type(problem)) is not measure.dispatch(Problem)
+
+
+def _swung_up(problem: System, path: Path, tilts: Tensor, speeds: Tensor) -> dict[str, float]:
+    """Whether all ``tilts`` and ``speeds`` ``(N, k)`` at the end are those of a body upright, and the box was never left."""
+    upright = (tilts.cos() >= math.cos(UPRIGHT[0])).all(dim=-1) & (speeds.abs() <= UPRIGHT[1]).all(dim=-1)
+    left = path.each(problem.outside).any(dim=0)
+    return {"success": _part(upright & ~left), "upright": _part(upright), "left": _part(left)}
 
 
 def _part(flags: Tensor) -> float:

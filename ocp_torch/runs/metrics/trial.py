@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 from pathlib import Path
 
 import torch
@@ -20,10 +21,13 @@ log = logging.getLogger(__name__)
 METRICS = "metrics.json"
 # A part of 512 starts has a standard error of at most 2.2 %; 240 steps for a time of 8 / rho are 30 per 1 / rho.
 STARTS, STEPS = 512, 240
+# Part of a turn of any coordinate that at half of all states a step of the trial takes at most without control: where things
+# move faster there are more steps.
+LONGEST_STEP, PACED = 0.05, 2**10
 # The time of a trial in units of 1 / rho; what the discount still sees after it is e^-8.
 TRIAL = 8.0
-# Uniform states drawn for each start, of which the admissible ones are taken.
-CANDIDATES = 64
+# Uniform states, and states from `mu0`, drawn for each start, of which the admissible ones are taken.
+CANDIDATES, DRAWN = 64, 4
 
 
 def write_metrics(problem: Problem, policy: Policy, seed: int, folder: Path | None) -> None:
@@ -46,13 +50,14 @@ def metrics(problem: Problem, policy: Policy, seed: int = 0, starts: int = START
         return None
     x0 = random_starts(problem, starts, seed)
     duration = TRIAL / problem.discount
+    steps = max(STEPS, math.ceil(duration * _pace(problem) / LONGEST_STEP))
     policies = {"controller": policy, "zero": zero_policy(problem), "classical": classical_policy(problem)}
     found = {}
     # A classical policy knows no limit of the control, and others round.
     within = lambda each: lambda x: problem.control_cost.within(each(x), torch.ones_like(x[:, 0]))
     for name, each in policies.items():
         if each is not None:
-            path = simulate(problem, within(each), x0, duration, STEPS)
+            path = simulate(problem, within(each), x0, duration, steps)
             found[name] = {**(measure(problem, path) or {}), "cost": float(path.cost.mean())}
     return {"starts": starts, "seed": seed, "duration": duration, **found}
 
@@ -61,11 +66,18 @@ def random_starts(problem: Problem, count: int, seed: int) -> Tensor:
     """``(count, d)`` float64: drawn from `mu0` where it is narrow or in a box; else uniform admissible ones, or any."""
     boxed = isinstance(problem, System) and type(problem).initial_density is System.initial_density
     if boxed or starts_narrowly(problem):
-        return drawn_starts(problem, count, seed)
-    generator = torch.Generator().manual_seed(seed)
-    x = torch.rand(CANDIDATES * count, problem.dim, generator=generator, dtype=torch.float64)
+        x = drawn_starts(problem, DRAWN * count, seed)
+    else:
+        generator = torch.Generator().manual_seed(seed)
+        x = torch.rand(CANDIDATES * count, problem.dim, generator=generator, dtype=torch.float64)
     fair = x[admissible(problem, x)]
     return (fair if len(fair) >= count else x)[:count]
+
+
+def _pace(problem: Problem) -> float:
+    """Turns per unit of time of the fastest coordinate without control, the median over states."""
+    (drift,) = problem.probe(PACED, 0, "a")
+    return float(drift.abs().amax(dim=-1).median())
 
 
 def metrics_table(found: dict) -> str:

@@ -5,61 +5,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
 
 from ocp_torch.problems.physical.coordinates import Interval
 from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.systems.cart_pole import CartPole
+from ocp_torch.problems.systems.double_pendulum import DoublePendulum
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
 from ocp_torch.problems.systems.planar import PlanarVehicle
+from ocp_torch.problems.systems.quadrotor import Quadrotor
 from ocp_torch.problems.systems.robot import RobotArm
+from ocp_torch.problems.systems.satellite import Satellite
 from ocp_torch.runs.metrics.measures import Path
-
-# Earlier poses of an arm that stay visible.
-GHOSTS = 12
-
-
-def _obstacles(axes: Any, discs: list, clearance: float, period: float | None = None) -> None:
-    from matplotlib.patches import Circle
-
-    shifts = [0.0] if period is None else [-period, 0.0, period]
-    for x, y, radius in discs:
-        for dx in shifts:
-            for dy in shifts:
-                axes.add_patch(Circle((x + dx, y + dy), radius, color="0.45"))
-                axes.add_patch(Circle((x + dx, y + dy), radius + clearance, fill=False, color="0.7", linestyle=":"))
-
-
-def _balls(axes: Any, balls: list, clearance: float) -> None:
-    """As `_obstacles`, in space."""
-    along, up = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 25), np.linspace(0.0, np.pi, 13))
-    sphere = np.stack([np.cos(along) * np.sin(up), np.sin(along) * np.sin(up), np.cos(up)])
-    for *centre, radius in balls:
-        inner, outer = (np.reshape(centre, (3, 1, 1)) + r * sphere for r in (radius, radius + clearance))
-        axes.plot_surface(*inner, color="0.45", rstride=1, cstride=1, alpha=0.7)
-        axes.plot_wireframe(*outer, color="0.7", rstride=3, cstride=3, linewidth=0.5, linestyle=":")
-
-
-def _broken(track: Tensor, jump: float) -> Tensor:
-    """A track ``(K, c)`` with a gap (NaN) where it goes around the torus."""
-    leap = (track[1:] - track[:-1]).abs().amax(dim=-1) > jump
-    track = track.clone()
-    track[1:][leap] = math.nan
-    return track
-
-
-def _tracks(path: Path, k: int) -> list[tuple[Tensor, dict[str, Any]]]:
-    """The states ``(k + 1, d)`` of each path up to frame ``k``, and how its line looks; with noise the means after them."""
-    several = path.samples > 1
-    looks = dict(linewidth=0.6, alpha=0.5) if several else dict(linewidth=1.2)
-    drawn = [(x[: k + 1], {"color": f"C{i // path.samples}", **looks}) for i, x in enumerate(path.states.unbind(1))]
-    means = path.means.unbind(1) if several else ()
-    return drawn + [(x[: k + 1], {"color": f"C{i}", "linewidth": 2.5}) for i, x in enumerate(means)]
+from ocp_torch.runs.pictures.bodies import GHOSTS, draw_cart, draw_double_pendulum, draw_quadrotors, draw_satellites
+from ocp_torch.runs.pictures.strokes import broken, draw_balls, draw_obstacles, tracks
 
 
 def draw_arm(problem: Linkage, axes: Any, path: Path, k: int) -> None:
@@ -68,9 +31,9 @@ def draw_arm(problem: Linkage, axes: Any, path: Path, k: int) -> None:
     base = [0.0] * len(problem.shoulder)
     reach = 1.08 * max(problem.length, *(math.dist(problem.shoulder, place) for place in (problem.target, base)))
     limits = {f"{name}lim": (at - reach, at + reach) for name, at in zip("xyz", problem.shoulder, strict=False)}
-    obstacles = _obstacles if len(base) == 2 else _balls
+    obstacles = draw_obstacles if len(base) == 2 else draw_balls
     obstacles(axes, problem.obstacles, problem.clearance)
-    *others, (mean, _) = _tracks(path, k)
+    *others, (mean, _) = tracks(path, k)
     poses = problem.joints(mean)
     for x, look in others:
         axes.plot(*problem.joints(x)[:, -1].T, "-", **{**look, "color": "C1"})
@@ -84,11 +47,11 @@ def draw_arm(problem: Linkage, axes: Any, path: Path, k: int) -> None:
 
 def draw_vehicles(problem: PlanarVehicle, axes: Any, path: Path, k: int) -> None:
     """Trajectories in the periodic plane with their headings."""
-    _obstacles(axes, problem.obstacles, problem.clearance, problem.size)
+    draw_obstacles(axes, problem.obstacles, problem.clearance, problem.size)
     some = torch.cat([torch.arange(0, k, max(1, len(path.times) // 16)), torch.tensor([k])])
-    for x, look in _tracks(path, k):
+    for x, look in tracks(path, k):
         track, ahead = problem.from_torus(x)[:, :2], problem.heading(x)
-        axes.plot(*_broken(track, 0.5 * problem.size).T, **look)
+        axes.plot(*broken(track, 0.5 * problem.size).T, **look)
         if "alpha" not in look:
             axes.quiver(*track[some].T, *ahead[some].T, color=look["color"], scale=28, width=0.005, pivot="mid")
     axes.plot(*problem.target, "*", color="k", markersize=14)
@@ -113,9 +76,9 @@ def draw_system(problem: System, axes: Any, path: Path, k: int) -> None:
         for end in (c.low, c.high) if isinstance(c, Interval) else ():
             line(end, color="0.7", linestyle=":")
     halves = torch.tensor([0.5 * c.length for c in shown], dtype=torch.float64)
-    for x, look in _tracks(path, k):
+    for x, look in tracks(path, k):
         track = problem.from_torus(x)[:, :2]
-        track = _broken(track / halves, 1.0) * halves  # where it goes around, it is not drawn across
+        track = broken(track / halves, 1.0) * halves  # where it goes around, it is not drawn across
         drawn = torch.stack([path.times[: k + 1], track[:, 0]], dim=-1) if alone else track
         axes.plot(*drawn.T, **look)
         axes.plot(*drawn[-1], "o", color=look["color"], markersize=4)
@@ -156,8 +119,12 @@ SCENES = {
     Linkage: Scene(draw_arm, 3, apart=True),
     PlanarVehicle: Scene(draw_vehicles, 6),
     Pendulum: Scene(draw_pendulums, 6),
+    CartPole: Scene(draw_cart, 3, apart=True),
     Kuramoto: Scene(draw_phases, 24),
     PhaseNeurons: Scene(draw_phases, 24),
+    DoublePendulum: Scene(draw_double_pendulum, 3, apart=True),
+    Quadrotor: Scene(draw_quadrotors, 6),
+    Satellite: Scene(draw_satellites, 12),
     System: Scene(draw_system, 6),
 }
 
