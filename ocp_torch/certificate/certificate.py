@@ -89,9 +89,11 @@ class Certificate:
     @property
     def gap(self) -> dict:
         """From the best lower bound that counts to the best upper bound, and to the simulated performance, relative to the
-        lower; between the far ends of their intervals. ``conditional``: what bounds that rest on a guess would make of it."""
+        lower; between the far ends of their intervals. ``conditional``: what a lower bound that rests on a guess would make
+        of it, where that is higher than all that count."""
         lower, upper, perf = self.best_lower, self.best_upper, self.best_perf
-        supposed = self._highest(self.conditional)
+        supposed = self._highest(lambda name: self.counts(name) or self.conditional(name))
+        supposed = None if supposed == lower else supposed
         both = [g for g in (relative_gap(supposed, upper), relative_gap(supposed, perf)) if g is not None]
         return {
             "certified": relative_gap(lower, upper),

@@ -33,13 +33,14 @@ ROUNDING = 1e-9
 
 def certify(context: Context) -> Certificate:
     """The certificate of ``context``. Raises `ProblemError` where a function of its problem is not finite."""
-    context.progress("bounds")
     bounds = [bound for bound in BOUNDS if bound.applies(context)]
     evaluated = lambda side: {bound.name: shown(bound, context) for bound in bounds if bound.side == side}
     _ = context.posed  # first of all: functions that are not finite are refused here
-    lower = evaluated(LOWER)
     simulated, zero = context.simulated  # before the upper side, which is of the best of them
     upper, perf_lower = evaluated(UPPER), evaluated(PERFORMANCE)
+    assumptions = context.assumptions  # before the lower side, whose `M` may follow from what is met here
+    context.progress("bounds")
+    lower = evaluated(LOWER)
     outside = context.outside
     sides = {LOWER: lower, UPPER: upper, PERFORMANCE: perf_lower}
     certificate = Certificate(
@@ -49,7 +50,7 @@ def certify(context: Context) -> Certificate:
         upper=upper,
         perf=dict.fromkeys(context.listed) | {name: found.perf for name, found in simulated.items()},
         baseline={"zero": zero},
-        assumptions=context.assumptions,
+        assumptions=assumptions,
         warnings=[
             *context.constants.warnings,
             *context.checked.warnings,

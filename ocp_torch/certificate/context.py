@@ -22,6 +22,7 @@ from ocp_torch.control.policies import Policy
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import Constants
+from ocp_torch.problems.needs import GUESSED
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.scan import odd_states
@@ -146,6 +147,17 @@ class Context:
         return sharpened(judge, self.problem, self.few, self.seed)
 
     @property
+    def densest(self) -> float | None:
+        """The largest density met under the controller that is nearest to the optimal one."""
+        return self.observed.sup_occupation
+
+    @cached_property
+    def informed(self) -> Constants:
+        """The constants by which bounds are computed: an `M` that nobody gave follows from what was met of the density."""
+        guessed = self.constants.basis("M") == GUESSED  # else nobody has to look
+        return self.constants.informed(self.densest) if guessed else self.constants
+
+    @property
     def hidden(self) -> Hidden | None:
         """A divergence that the sampled states do not see."""
         found = (bounds.hidden for bounds in (self.densities, self.fitted) if bounds is not None)
@@ -159,7 +171,7 @@ class Context:
     @cached_property
     def checked(self) -> Assumptions:
         """The assumptions as the checks leave them."""
-        return check_assumptions(self.problem, self.constants, self.posed, self.observed, self.uses)
+        return check_assumptions(self.problem, self.informed, self.posed, self.observed, self.uses)
 
     @cached_property
     def closed_loop(self) -> ClosedLoopBounds | None:

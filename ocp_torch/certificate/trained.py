@@ -135,6 +135,12 @@ class TrainedContext(FieldsContext):
     def fitted(self) -> ClosedLoopBounds | None:
         return self._fit[0]
 
+    @property
+    def densest(self) -> float | None:
+        """Of the fitted density and of what simulation shows of it."""
+        fitted = None if self.fitted is None or self.hidden is not None else self.fitted.sup_occupation
+        return max((d for d in (fitted, self.observed.sup_occupation) if d is not None), default=None)
+
     @cached_property
     def observed(self) -> Observed:
         found = self.simulated[0].get(self.kind)

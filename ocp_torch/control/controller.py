@@ -52,8 +52,9 @@ class Controller:
         self._like = next(self.fields.parameters())
 
     def __call__(self, x: States) -> States:
-        """Controls ``(N, m)`` at states ``(N, d)``: any reals, wrapped to the torus; NumPy in gives NumPy out. Raises
-        `InputError` for another shape."""
+        """Controls ``(N, m)`` at states ``(N, d)``: any reals, wrapped to the torus; NumPy in gives NumPy out.
+
+        Raises `InputError` for another shape."""
         states = self._states("x", x)
         with torch.no_grad():
             # Wrapped before it is rounded, so that states far from the unit cell keep their place in it.

@@ -17,7 +17,8 @@ class PolicyEvaluation(Objective):
     The two players do not interact; there is no hinge and no game. Missing mass (`r > 0`) may cost the bounds more, or
     less, than surplus: ``positive_weight`` is what `r^2` weighs there, where it weighs 1 elsewhere. With noise `r^2` is
     divided by `1 + mu`, as data: a density of high peaks is then worth fitting. Its plain squares are larger than those of
-    `mu = 0`, to which fits collapsed (dubins with heading and position noise: Lagrangian bound 130 % above OPT, so 5 %).
+    `mu = 0`, to which fits collapsed (dubins with heading and position noise: Lagrangian bound 130 % above OPT; divided,
+    5 %).
     """
 
     def __init__(self, problem: ClosedLoop, with_value: bool, positive_weight: float = 1.0) -> None:

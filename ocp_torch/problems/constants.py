@@ -1,7 +1,7 @@
 """The three constants the bounds rest on, `M`, `C_V` and `C_u`, and where each came from."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -23,7 +23,12 @@ PROBED, PROBED_MATRICES, PROBED_STARTS = 2**13, 2**11, 2**8
 # States scanned for a spike of `f`, for each that `Problem.scan_factor` asks for.
 SCANNED = 2**15
 
+# Once a controller is known, bounds take this multiple of the largest density met under it instead: it need not be the
+# optimal one, and a search meets less than the supremum.
+OBSERVED_ROOM = 1.2
+
 FROM_CONFIGURATION, FROM_PROBLEM, ESTIMATED = "configuration", "problem", "estimated"
+FROM_DENSITY = f"{OBSERVED_ROOM:g} times the controller's density"
 
 
 @dataclass(frozen=True)
@@ -52,9 +57,20 @@ class Constants:
 
     def basis(self, name: str) -> str:
         """Where the constant ``name`` comes from, as what rests on it must say (see `ocp_torch.problems.needs`)."""
-        if self.sources[name] != ESTIMATED:
+        if self.sources[name] not in (ESTIMATED, FROM_DENSITY):
             return GIVEN
         return GUESSED if name == "M" else SEARCHED
+
+    def informed(self, density: float | None) -> "Constants":
+        """With an `M` that nobody gave guessed anew from the largest ``density`` met under a controller.
+
+        A density below its own mean of 1 is no density, and one within that factor of `M` may be what training with `M` made
+        of it: both leave the guess as it is, and so does one that is not finite."""
+        if self.basis("M") != GUESSED or density is None or not 1.0 <= density < math.inf:
+            return self
+        if self.M / OBSERVED_ROOM <= density <= self.M * OBSERVED_ROOM:
+            return self
+        return replace(self, M=OBSERVED_ROOM * density, sources=self.sources | {"M": FROM_DENSITY})
 
 
 def resolve_constants(

@@ -110,7 +110,8 @@ class Problem(Reproducible, Placed):
 
     def noise(self, x: Tensor) -> Tensor | None:
         """`sigma`, ``(N, d, k)``, of `k` Brownian motions (Ito); `None` where there is no noise. By default that of the
-        argument ``noise`` and of `add_noise`. An override may be degenerate, and vary with the state."""
+        argument ``noise`` and of `add_noise`. An override may be degenerate, and vary with the state; where such noise was
+        given too, it returns the columns of `super().noise(x)` beside its own."""
         return None if self._sigma is None else self._like(x, "sigma", self._sigma).expand(len(x), -1, -1)
 
     def add_noise(self, columns: Tensor) -> None:

@@ -14,7 +14,7 @@ from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems import Circle, Manufactured
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.constants import ESTIMATED, resolve_constants
+from ocp_torch.problems.constants import ESTIMATED, FROM_DENSITY, resolve_constants
 from ocp_torch.problems.needs import GUESSED, SEARCHED
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_trainer
@@ -89,10 +89,10 @@ def test_a_guessed_M_makes_a_conditional_bound_that_enters_nothing_else():
     assert certificate.hold
     said = certificate.to_dict()
     assert said["lower"]["F_M"] | {"rests_on": {"M": "guessed"}, "counts": False} == said["lower"]["F_M"]
-    assert said["lower"]["F_M"]["if"] == f"sup mu* <= {certificate.assumptions.M:.4g}"
+    assert said["lower"]["F_M"]["if"] == f"sup mu* <= {certificate.assumptions.M:.4g} ({FROM_DENSITY})"
     assert said["lower"]["shifted"]["counts"]
     assert 0.0 < said["gap"]["conditional"] <= (1.0 + 1e-9) * said["gap"]["simulated"]
-    assert any("a guess: no gap uses it" in warning for warning in said["warnings"])
+    assert any("a guess: no gap that counts uses it" in warning for warning in said["warnings"])
 
 
 def test_a_guess_that_the_controller_s_density_refutes_makes_no_bound_at_all():

@@ -5,7 +5,7 @@ import torch
 
 from ocp_torch.fields import PeriodicMLP, SobolevField
 from ocp_torch.fields.mlp import ACTIVATIONS
-from ocp_torch.maths.jets import jet, reverse_jet
+from ocp_torch.maths.jets import chunked_jet, jet, reverse_jet
 
 # Columns of noise: none but one, fewer than coordinates, as many, more.
 SHAPES = ((1, 1), (2, 1), (3, 2), (2, 2), (3, 3), (2, 4))
@@ -76,7 +76,7 @@ def test_noise_that_varies_with_the_state_is_not_differentiated_in_the_curvature
     """`D : hess V`, not `div(D grad V)`, also where `sigma` is a part of the graph of the states."""
     network, (x, _) = made(2, 5), drawn(2, 2)
     x.requires_grad_(True)
-    sigma = torch.stack([x.sin(), x.cos()], dim=-1)
+    sigma = torch.stack([x.sin(), 2.0 + x.cos()], dim=-1)
     for of in (jet, reverse_jet):
         assert_same(of(network, x, sigma), reverse_jet(network, x, sigma.detach()))
     live = lambda of: torch.autograd.grad(of(network, x, sigma).curvature.sum(), x, retain_graph=True)[0]
@@ -98,3 +98,17 @@ def test_transforms_of_functions_have_curvatures_too():
         found, pull = torch.func.vjp(lambda at, field=field: jet(field, at, sigma).curvature, x.detach())
         torch.testing.assert_close(found, curvature, **EXACT)
         torch.testing.assert_close(pull(torch.ones_like(found))[0], expected, rtol=1e-10, atol=1e-10)
+        found, change = torch.func.jvp(
+            lambda at, field=field: jet(field, at, sigma).curvature, (x.detach(),), (x.detach(),)
+        )
+        torch.testing.assert_close(found, curvature, **EXACT)
+        torch.testing.assert_close(change, (expected * x).sum(dim=-1), rtol=1e-10, atol=1e-10)
+
+
+def test_a_jet_of_many_states_is_that_of_its_parts_and_scales_as_a_whole():
+    network, (x, sigma) = made(2, 5), drawn(2, 3, count=23)
+    whole = jet(network, x, sigma)
+    assert_same(chunked_jet(network, x, sigma, chunk=10), whole)
+    tripled = whole.map(lambda part: 3.0 * part)
+    torch.testing.assert_close(tripled.gradient, 3.0 * whole.gradient, **EXACT)
+    torch.testing.assert_close(tripled.curvature, 3.0 * whole.curvature, **EXACT)

@@ -1,5 +1,6 @@
 """What the losses of all methods share: units do not matter, a weight is a number of states, and a penalty is not a mean."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 from ocp_torch.fields import Fields
 from ocp_torch.objectives import METHODS, Phase
 from ocp_torch.objectives.policy_evaluation import PolicyEvaluation
-from ocp_torch.problems import Problem
+from ocp_torch.problems import Problem, Torus
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.problems.samples import Samples
@@ -161,3 +162,19 @@ def test_policy_evaluation_weighs_missing_mass(log_mu, weighs):
     )
     assert even == pytest.approx((1.0 - torch.tensor(log_mu, dtype=torch.float64).exp().item()) ** 2, rel=1e-6)
     assert priced == pytest.approx(weighs * even, rel=1e-9)
+
+
+@pytest.mark.parametrize("log_mu", [-2.0, 1.5])
+def test_policy_evaluation_with_noise_divides_squares_by_a_density_that_is_data(log_mu):
+    """Standing still at `mu = e^l`: `(1 - mu)^2 / (1 + mu)`, whose derivative by `l` is that of the square alone."""
+    problem = Torus(2, noise=0.02)
+    loop, constants = ClosedLoop(problem, lambda x: 0.0 * x), resolve_constants(problem)
+    field = Field(lambda x: 0.0 * x[:, 0] + log_mu).double()
+    samples = Samples.of(loop, zoo.states(problem, 50))
+    loss = PolicyEvaluation(loop, False).losses(Fields({"log_occupation": field}), samples, Phase(constants))[
+        "occupation"
+    ]
+    loss.backward()
+    mu = math.exp(log_mu)
+    assert loss.item() == pytest.approx((1.0 - mu) ** 2 / (1.0 + mu), rel=1e-9)
+    assert field.weight.grad.item() == pytest.approx(-2.0 * (1.0 - mu) * mu / (1.0 + mu), rel=1e-9)

@@ -13,6 +13,7 @@ from ocp_torch.problems.recorded import recording
 from ocp_torch.problems.samples import Samples
 from support import zoo
 from support.recorded import certificate_of, record
+from support.refusals import refused
 
 TURN = 2.0 * math.pi
 SHAPES = ("noisy 1-d", "noisy 2-d sigma(x)", "noisy 3-d m=2 sigma(x) B(x) q=1.5", "noisy swing")
@@ -124,9 +125,8 @@ WRONG = {
 @pytest.mark.parametrize("name", WRONG)
 def test_noise_of_a_simulator_that_is_none_is_named(name):
     oracle, sentence = WRONG[name]
-    with pytest.raises(InputError, match=sentence) as caught:
+    with refused(sentence):
         Simulator(oracle, dim=2, control_dim=1)
-    assert "\n" not in str(caught.value)
 
 
 def test_noise_of_a_simulator_neither_comes_nor_goes():
@@ -216,10 +216,8 @@ def test_recorded_noise_that_is_none_is_refused_in_one_sentence(folder, name):
         value = arrays.pop(column)
         arrays |= {} if change is None else {column: change(value)}
     np.savez(folder / "bad.npz", **arrays)
-    with pytest.raises(InputError, match=sentence) as caught:
+    with refused(sentence):
         recording.read(folder / "bad.npz")
-    assert str(caught.value).endswith(".")
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["noisy 1-d", "noisy 2-d sigma(x)"])

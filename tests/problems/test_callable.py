@@ -22,6 +22,7 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import problem_class
 from ocp_torch.runs.resume import OWN_TARGETS
 from support import zoo
+from support.refusals import refused
 from support.small import outcome, session, small
 
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
@@ -166,9 +167,8 @@ HOSTILE = {
 @pytest.mark.parametrize("name", HOSTILE)
 def test_what_goes_wrong_is_named_with_the_state(name):
     oracle, sentence = HOSTILE[name]
-    with pytest.raises(InputError, match=sentence) as caught:
+    with refused(sentence):
         Simulator(oracle, dim=2, control_dim=1)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_drift_that_is_zero_at_the_seam_does_not_jump_there():

@@ -35,6 +35,7 @@ from ocp_torch.problems.systems.rest import occupation_bound_at_rest, optimal_co
 from ocp_torch.runs.metrics.trial import metrics
 from ocp_torch.studies.reference.reference import solve_reference
 from support import zoo
+from support.refusals import refused
 
 ROUNDING = dict(rtol=1e-9, atol=1e-9)
 TURN = 2.0 * math.pi
@@ -475,10 +476,8 @@ BAD = [
 
 @pytest.mark.parametrize(("cls", "arguments", "message"), BAD)
 def test_wrong_arguments_are_refused_in_one_sentence(cls, arguments, message):
-    with pytest.raises(InputError, match=message) as caught:
+    with refused(message):
         cls(**arguments)
-    assert str(caught.value).endswith(".")
-    assert "\n" not in str(caught.value)
 
 
 # Control limits.

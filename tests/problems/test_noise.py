@@ -51,7 +51,8 @@ def test_the_generator_is_that_of_differences(problem):
 
 @zoo.on(("noisy 1-d", "noisy 2-d sigma(x)", "noisy swing"))
 def test_generator_and_residual_are_adjoint(problem):
-    """`E[-V mu + (L^0 V mu + grad V . B w) / rho] = E[V (r - mu0)]` for random fields: integration by parts."""
+    """`E[-V mu + (L^0 V mu + grad V . B w) / rho] = E[V (r - mu0)]` for random fields: integration by parts; and the flux has
+    the divergence that is carried away."""
     samples = Samples.of(problem, grid(problem.dim, 128))
     L = Generator.of(problem, samples)
     V, log_mu = (zoo.rough_network(problem.dim, seed, size=0.3) for seed in (5, 6))
@@ -59,8 +60,11 @@ def test_generator_and_residual_are_adjoint(problem):
     (_, inflow), (mu, outflow) = L.control_inflow(w), L.occupation_outflow(log_mu)
     charged = L.multiplier_term(L.jet(V), mu, w(samples.x)).mean()
     torch.testing.assert_close(charged, (V(samples.x) * (inflow - outflow - samples.mu0)).mean(), rtol=1e-6, atol=1e-6)
-    same, carried, _ = L.drift_flux(lambda y: log_mu(y).exp())
+    same, carried, flux = L.drift_flux(lambda y: log_mu(y).exp())
     torch.testing.assert_close(same + carried / problem.discount, outflow)
+    torch.testing.assert_close(L.occupation_flux(log_mu)[2], flux)
+    along = (flux * L.jet(V).gradient).sum(dim=-1).mean()
+    torch.testing.assert_close(-along, (V(samples.x) * carried).mean(), rtol=1e-6, atol=1e-6)
 
 
 @zoo.on(zoo.NOISY)

@@ -10,15 +10,14 @@ from ocp_torch.problems.checks.mass import sampled_mass
 from ocp_torch.runs.build import build_problem
 from support import hostile_problems
 from support.hostile_problems import LEGAL, REFUSED, Good, with_
+from support.refusals import refused
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_slip_is_one_sentence_that_says_where(name):
     make, words = REFUSED[name]
-    with pytest.raises(InputError, match=words) as caught:
+    with refused(words):
         check_once(make())
-    assert "\n" not in str(caught.value)
-    assert str(caught.value).endswith(".")
 
 
 @pytest.mark.parametrize("name", LEGAL)
@@ -73,6 +72,5 @@ def test_a_module_that_cannot_be_imported_is_told_with_the_line(kind, tmp_path, 
     text, words = MODULES[kind]
     (tmp_path / f"broken_{kind}.py").write_text(text)
     monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(InputError, match=words) as caught:
+    with refused(words):
         build_problem({"_target_": f"broken_{kind}.Mine"})
-    assert "\n" not in str(caught.value)

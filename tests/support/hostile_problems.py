@@ -160,6 +160,34 @@ class NoiseBeside(Good):
         return torch.cat([super().noise(x), column()(self, x)], dim=-1)
 
 
+class NoiseInstead(NoiseBeside):
+    """Of a method alone, which forgets the number."""
+
+    def noise(self, x):
+        return column()(self, x)
+
+
+class NoNoiseInstead(NoiseBeside):
+    def noise(self, x):
+        return None
+
+
+class NoiseScaled(NoiseBeside):
+    """More of the same: nothing of the number is lost."""
+
+    def noise(self, x):
+        return super().noise(x) * (1.5 + 0.5 * torch.sin(TURN * x[:, :1, None]))
+
+
+class NoiseColumnsForgotten(Good):
+    def __init__(self) -> None:
+        super().__init__()
+        self.add_noise(torch.tensor([[0.1], [0.2]]))
+
+    def noise(self, x):
+        return 0.5 * super().noise(x)
+
+
 class MoodyNoise(Good):
     calls = 0
 
@@ -252,6 +280,9 @@ REFUSED = {
                            r"noise .* gave shape \(7, 2, 7\) .* as many at all states"),
     "noise a number": (lambda: with_(noise=lambda self, x: 0.1), "noise of .* gave a float"),
     "noise an attribute": (NoiseNumber, r"NoiseNumber sets noise to 0.1, but .* super\(\).__init__\(noise=..\)"),
+    "noise instead of the number": (NoiseInstead, r"noise\(x\) of .*NoiseInstead leaves out .* super\(\).noise\(x\)"),
+    "no noise instead of the number": (NoNoiseInstead, r"noise\(x\) of .* leaves out the noise"),
+    "less than the columns": (NoiseColumnsForgotten, r"noise\(x\) of .* leaves out .* add_noise"),
     "noise in few batches": (lambda: with_(noise=lambda self, x: None if len(x) < 9 else column()(self, x)),
                              "noise .* gave a NoneType"),
     "noise in many batches": (lambda: with_(noise=lambda self, x: None if len(x) < 30 else column()(self, x)),
@@ -294,6 +325,7 @@ LEGAL = {
     "no divergences": lambda: with_(drift_divergence=lambda self, x: None, control_divergence=lambda self, x: None),
     "noise": lambda: with_(noise=column()),
     "noise beside a number": NoiseBeside,
+    "more noise than the number": NoiseScaled,
     "noise of 0": lambda: with_(noise=column(0.0)),
     "noise of five motions": lambda: with_(noise=sigma(lambda s, x: s * torch.linspace(0.1, 1.0, 5, dtype=x.dtype))),
     "noise that jumps": lambda: with_(noise=sigma(lambda s, x: s * steps_of(None, x)[:, :, None])),

@@ -67,7 +67,7 @@ def test_after_the_last_step_one_is_told_why_and_what_is_being_made(override, wh
     assert why in stopped
     assert "the certificate is next" in stopped
     told = [line for line in caplog.messages if line.endswith(" ...")]
-    stages = ["bounds", "simulation", "closed-loop fit", "assumptions"]
+    stages = ["simulation", "closed-loop fit", "assumptions", "bounds"]
     assert told == [*(f"certifying: {stage} ..." for stage in stages), "figures ..."]
     assert caplog.messages.index(stopped) < caplog.messages.index(told[0])
 

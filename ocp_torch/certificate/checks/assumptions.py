@@ -7,7 +7,7 @@ import torch
 
 from ocp_torch.certificate.checks.observed import Observed
 from ocp_torch.certificate.checks.wellposed import WellPosed
-from ocp_torch.problems.constants import FROM_PROBLEM, Constants
+from ocp_torch.problems.constants import FROM_DENSITY, FROM_PROBLEM, Constants
 from ocp_torch.problems.needs import GIVEN, GUESSED, SEARCHED, Need
 from ocp_torch.problems.problem import Problem
 
@@ -46,6 +46,7 @@ class Assumptions:
     smallest_state_cost: float | None = None
     initial_mass: float | None = None
     basis: dict[str, str] = field(default_factory=dict)  # of M and C_V (`ocp_torch.problems.needs`); given if absent
+    M_is: str = ""  # how `M` was guessed, where there is more to say of it
     warnings: list[str] = field(default_factory=list)
 
     @property
@@ -57,7 +58,8 @@ class Assumptions:
     @property
     def M_is_large(self) -> Need:
         """`M >= sup mu*`."""
-        return Need("M", self.basis.get("M", GIVEN), f"sup mu* <= {_number(self.M)}", self.occupation_holds)
+        condition = f"sup mu* <= {_number(self.M)}" + (f" ({self.M_is})" if self.M_is else "")
+        return Need("M", self.basis.get("M", GIVEN), condition, self.occupation_holds)
 
     @property
     def C_V_is_large(self) -> Need:
@@ -80,7 +82,9 @@ class Assumptions:
 
     def to_dict(self) -> dict:
         """JSON form of the numbers; a supremum that grew beyond all numbers is null."""
-        numbers = {k: v for k, v in vars(self).items() if not k.endswith("_holds") and k not in ("basis", "warnings")}
+        numbers = {
+            k: v for k, v in vars(self).items() if not k.endswith("_holds") and k not in ("basis", "M_is", "warnings")
+        }
         finite = {k: v if v is None or math.isfinite(v) else None for k, v in numbers.items()}
         return {**finite, "hold": self.hold}
 
@@ -102,13 +106,17 @@ def check_assumptions(
     ``uses`` says whether the certificate has a lower side, which rests on `M`, and an upper one that rests on `C_V`.
     """
     uses_M, uses_C_V = uses
+    M_is = FROM_DENSITY if constants.sources["M"] == FROM_DENSITY else ""
     jump, reached = observed.jump, observed.largest_value
     warnings = list(posed.warnings)
     M_holds, why = occupation_holds(problem, constants, observed.sup_occupation, posed.mass)
     if uses_M and not M_holds:
         warnings.append(f"F_M is not used: {why}.")
     elif uses_M and constants.basis("M") == GUESSED:
-        warnings.append(f"F_M is a bound only if sup mu* <= {constants.M:.4g}, a guess: no gap uses it.")
+        how = f", {M_is}," if M_is else ","
+        warnings.append(
+            f"F_M is a bound only if sup mu* <= {constants.M:.4g}{how} a guess: no gap that counts uses it."
+        )
     value_holds = reached is None or reached <= constants.C_V * (1.0 + ROUGH)
     if uses_C_V and not value_holds:
         warnings.append(
@@ -142,6 +150,7 @@ def check_assumptions(
         smallest_state_cost=posed.smallest_cost,
         initial_mass=posed.mass,
         basis={"M": constants.basis("M"), "C_V": constants.basis("C_V")},
+        M_is=M_is,
         warnings=warnings,
     )
 

@@ -1,7 +1,7 @@
 r"""A lower bound that needs no `M`: `E[W mu0] - sup Q_W <= OPT` for any smooth `W`, here for `W = theta V`.
 
 A constant `c` added to `W` adds `c` to its slack, so `W - sup Q_W` is a subsolution of the HJB equation. For `V` scaled by
-`theta` the slack `Q_{theta V} = theta (V - grad V . a / rho) - f + R*(-theta B^T grad V / rho)` is convex in `theta` at
+`theta` the slack `Q_{theta V} = theta (V - L^0 V / rho) - f + R*(-theta B^T grad V / rho)` is convex in `theta` at
 every state, so the bound is concave in `theta`: its maximum is found by a search on a line. (Scaling `V - c` instead of `V`
 changes nothing.) Where `V` has large slack, at kinks for instance, a `theta` below 1 trades a little of `E[V mu0]` for it.
 """

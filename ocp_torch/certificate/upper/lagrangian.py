@@ -1,7 +1,8 @@
 r"""Upper bounds on `Perf(u)` for one given controller, from any `V` and any `mu >= 0`, without simulation.
 
 Write `Q_u` for the Bellman slack of `V` and `r = mu0 - mu - div(mu g_u) / rho` for the Liouville residual of `mu`, and let
-`mu^u` be the true occupation density, so that `Perf(u) = E_{mu^u}[f + R(u)]`.
+`mu^u` be the true occupation density, so that `Perf(u) = E_{mu^u}[f + R(u)]`. With noise `r` has `div div(D mu) / rho` beside
+that, and what is said along trajectories holds in the mean over paths (Ito's formula).
 
 1. Along the closed loop `d/dt (e^{-rho t} V(x_t)) = -rho e^{-rho t} (Q_u + f + R(u))(x_t)`. Integrated from 0 to infinity:
    `V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt`, hence `V - eps_lo <= V^u <= V + eps_hi` with
@@ -54,6 +55,7 @@ class ClosedLoopBounds:
     sandwich: tuple[Estimate, Estimate]  # E[V mu0] - eps_lo <= Perf(u) <= E[V mu0] + eps_hi, by 1. alone
     hidden: Hidden | None  # a divergence that the residual does not see: only the sandwich stands then
     contributions: list[list[Tensor]]  # of `lagrangian` and `J`, parts of each
+    sup_occupation: float  # the largest `mu` met
 
 
 def closed_loop_bounds(
@@ -69,13 +71,15 @@ def closed_loop_bounds(
     """All bounds on ``sets`` of samples of ``loop``; suprema are climbed from the worst of them and of the states ``odd``
     ``(K, d)``. ``initial``, if given, is `E[V mu0]` per set from more states: it carries nearly all of the variance."""
     found = [terms_on(Generator.of(loop, samples), value, log_occupation) for samples in sets]
-    terms, slacks, _, fluxes = zip(*found, strict=True)
+    terms, slacks, densities, fluxes = zip(*found, strict=True)
     states, slack_of = torch.cat([samples.x for samples in sets]), slack_function(loop, value)
-    values, slack = torch.cat([t.v for t in terms]), torch.cat(slacks)
+    values, slack, mu = torch.cat([t.v for t in terms]), torch.cat(slacks), torch.cat(densities)
+    occupation = lambda x: log_occupation(x).exp()
     if odd is not None and len(odd):
         states = torch.cat([states, odd])
         values = torch.cat([values, batched(value, odd)])
         slack = torch.cat([slack, batched(slack_of, odd)])
+        mu = torch.cat([mu, batched(occupation, odd)])
     suprema = [(value, values), (slack_of, slack), (lambda x: -slack_of(x), -slack)]
     climbed = (climbed_from(function, met, states, ascents) for function, met in suprema)
     top, eps_lo, eps_hi = (replace(e, value=max(e.value, 0.0)) for e in climbed)
@@ -98,7 +102,8 @@ def closed_loop_bounds(
     pairs = (lagrangian, of_lagrangian), (J, of_J)
     contributions = [[v / (abs(estimate.value) or 1.0) for v in weighted] for estimate, weighted in pairs]
     lagrangian = replace(lagrangian, controller=controller)
-    return ClosedLoopBounds(lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions)
+    densest = climbed_from(occupation, mu, states, ascents).value
+    return ClosedLoopBounds(lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions, densest)
 
 
 class Lagrangian(Bound):

@@ -92,8 +92,9 @@ def fit_closed_loop(
 
 
 class Pool:
-    """``count`` samples of a closed loop that are drawn from again and again, and grow when more are wanted. The loop is
-    evaluated in float64 if ``double``; samples are kept in the precision and on the device of ``like``."""
+    """``count`` samples of a closed loop that are drawn from again and again, and grow when more are wanted.
+
+    The loop is evaluated in float64 if ``double``; samples are kept in the precision and on the device of ``like``."""
 
     def __init__(self, loop: ClosedLoop, seed: int, like: torch.Tensor, count: int, double: bool = False) -> None:
         self.loop, self.like, self.drawn = loop, like, 0

@@ -21,7 +21,7 @@ from ocp_torch.problems.checks.sameness import (
     require_purity,
     require_still,
 )
-from ocp_torch.problems.checks.values import require_divergences, require_finite, require_signs
+from ocp_torch.problems.checks.values import require_divergences, require_finite, require_kept_noise, require_signs
 from ocp_torch.problems.control_limit import control_cost
 from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import MOST_COORDINATES, Problem
@@ -57,7 +57,14 @@ def check_once(problem: Problem) -> None:
 
 def _check(functions: Functions) -> None:
     first = _require_functions(functions)
-    for require in (require_finite, require_period, require_signs, require_divergences, require_mass):
+    for require in (
+        require_finite,
+        require_period,
+        require_signs,
+        require_kept_noise,
+        require_divergences,
+        require_mass,
+    ):
         require(functions)
     require_still(functions, first)
 

@@ -1,4 +1,5 @@
-"""Values: finite everywhere, `f >= 0` and `mu0 >= 0`, `f` within its declared bound, and divergences that are some."""
+"""Values: finite everywhere, `f >= 0` and `mu0 >= 0`, `f` within its declared bound, noise that holds what the constructor
+was given, and divergences that are some."""
 
 from functools import partial
 
@@ -8,6 +9,7 @@ from torch import Tensor
 from ocp_torch.errors import ProblemError
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.checks.functions import DIV_D, DIV_DIV_D, NOISE, Functions
+from ocp_torch.problems.problem import Problem
 
 # A part of the largest value that rounding may take a function below 0, or above its bound, by.
 ROUNDING = 1e-6
@@ -18,7 +20,7 @@ FACES = 32
 # The lowest states from which a search goes on downhill, and its steps.
 DESCENTS, STEPS = 16, 40
 # Designs of the states (see `functions.FIRST_DESIGN`).
-SPREAD, FACE, SIGN, DIVERGENCE = 3, 4, 6, 7
+SPREAD, FACE, SIGN, DIVERGENCE, KEPT = 3, 4, 6, 7, 8
 # What a divergence is one of, and the states at which it is compared with differences of it.
 D = "D = noise noise^T / 2"
 SOURCES = {"drift_divergence": "drift", "control_divergence": "control_matrix", DIV_D: D, DIV_DIV_D: DIV_D}
@@ -85,6 +87,24 @@ def _require_sign(functions: Functions, name: str, x: Tensor, hint: str) -> tupl
             f"{name} of {functions.name} is {least:.6g} at {functions.place(found.x)}, but must be at least 0{hint}"
         )
     return largest, x[int(values.argmax())]
+
+
+def require_kept_noise(functions: Functions) -> None:
+    """`sigma sigma^T` of an override of `noise` is at least that of the numbers and columns given to `Problem`."""
+    problem, x = functions.problem, functions.states(COMPARED, KEPT)
+    owner = next(kind for kind in type(problem).__mro__ if "noise" in vars(kind))
+    given = Problem.noise(problem, x)
+    if given is None or owner.__module__.startswith("ocp_torch."):
+        return
+    square = given @ given.mT
+    own = functions.ask(NOISE, x) if functions.noisy else torch.zeros_like(given)
+    least = torch.linalg.eigvalsh(own @ own.mT - square)[:, 0]
+    if float(least.min()) < -ROUNDING * float(square.abs().max()):
+        raise ProblemError(
+            f"noise(x) of {functions.name} leaves out the noise that its __init__ gives to super().__init__(noise=..) or "
+            f"add_noise, at {functions.place(x[int(least.argmin())])} for one; it must hold the columns of super().noise(x) "
+            "beside its own (torch.cat(.., dim=-1)), or nothing must be given there."
+        )
 
 
 def require_divergences(functions: Functions) -> None:

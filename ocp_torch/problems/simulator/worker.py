@@ -16,9 +16,10 @@ GONE = (EOFError, BrokenPipeError, ConnectionResetError)
 
 
 def end_with_parent(lifeline: int, parent: int, mortal: bool) -> None:
-    """End this process as soon as the other end of the pipe ``lifeline`` closes, whatever it is doing. Where the parent's
-    main thread started this one (``mortal``) Linux itself ends it too, also while somebody's compiled code lets no other
-    thread run; ``parent`` is whose child it was, in case it died before it could be asked for."""
+    """End this process as soon as the other end of the pipe ``lifeline`` closes, whatever it is doing.
+
+    Where the parent's main thread started this one (``mortal``) Linux itself ends it too, also while somebody's compiled
+    code lets no other thread run; ``parent`` is whose child it was, in case it died before it could be asked for."""
 
     def wait_for_the_end() -> None:
         while os.read(lifeline, 1):

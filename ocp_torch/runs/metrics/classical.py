@@ -1,6 +1,7 @@
 """A simple classical controller for each system, as a yardstick: tuned by hand once, not to any seed."""
 
-from functools import partial, singledispatch
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -35,17 +36,10 @@ PUMP, BALANCE, CATCH = 0.2, (20.0, 5.0), (0.5, 2.0)
 
 def classical_policy(problem: Problem) -> Policy | None:
     """The classical controller of ``problem``, or `None` where nobody has named one."""
-    control = classical_control.dispatch(type(problem))
-    return None if control is classical_control.dispatch(Problem) else partial(control, problem)
+    found = (control for kind, control in CONTROLS.items() if isinstance(problem, kind))
+    return next((partial(control, problem) for control in found), None)
 
 
-@singledispatch
-def classical_control(problem: Problem, x: Tensor) -> Tensor:
-    """The control ``(N, m)`` of the classical controller of ``problem`` at states ``(N, d)``."""
-    raise NotImplementedError
-
-
-@classical_control.register
 def resolved_rate(problem: Linkage, x: Tensor) -> Tensor:
     r"""`dtheta/dt = k J^+ (target - p)`, `J^+` the damped pseudo-inverse (Whitney, 1969; Nakamura and Hanafusa, 1986)."""
     damping = (DAMPING * problem.length) ** 2 or 1.0  # a tip on the last of its joints does not move: J = 0
@@ -61,7 +55,6 @@ def _bearing(problem: Unicycle | Dubins, x: Tensor) -> tuple[Tensor, Tensor]:
     return (way * ahead).sum(dim=-1), ahead[:, 0] * way[:, 1] - ahead[:, 1] * way[:, 0]
 
 
-@classical_control.register
 def go_to_goal(problem: Unicycle, x: Tensor) -> Tensor:
     """Speed in proportion to the way ahead, turn rate to the bearing of the nearer end, front or back."""
     along, across = _bearing(problem, x)
@@ -69,15 +62,12 @@ def go_to_goal(problem: Unicycle, x: Tensor) -> Tensor:
     return torch.stack([DRIVE * along / problem.speed, STEER * bearing / (TURN * problem.turn_rate)], dim=-1)
 
 
-@classical_control.register
 def pursue(problem: Dubins, x: Tensor) -> Tensor:
     """Turn rate in proportion to the bearing of the target."""
     along, across = _bearing(problem, x)
     return (STEER * torch.atan2(across, along) / (TURN * problem.turn_rate)).unsqueeze(-1)
 
 
-@classical_control.register(Kuramoto)
-@classical_control.register(PhaseNeurons)
 def descend(problem: Problem, x: Tensor) -> Tensor:
     r"""`u = -k B' grad f`: proportional feedback on how the stimulus changes the synchrony (for Kuramoto, the mean field)."""
     with torch.enable_grad():
@@ -86,7 +76,6 @@ def descend(problem: Problem, x: Tensor) -> Tensor:
     return -DESCENT / problem.discount * torch.einsum("ndm,nd->nm", problem.control_matrix(x), slope)
 
 
-@classical_control.register
 def energy_pump(problem: Pendulum, x: Tensor) -> Tensor:
     """Pump energy, then balance by proportional and derivative feedback (Astrom and Furuta, 2000); `|u| <= 1`."""
     angle, velocity = problem.from_torus(x).unbind(dim=-1)
@@ -98,9 +87,18 @@ def energy_pump(problem: Pendulum, x: Tensor) -> Tensor:
     return (torch.where(near, balance, pump) / problem.max_torque).clamp(-1.0, 1.0).unsqueeze(-1)
 
 
-classical_control.register(DoublePendulum, feedback.swing_up)
-classical_control.register(Quadrotor, feedback.hover)
-classical_control.register(Satellite, feedback.point)
-classical_control.register(CartPole, feedback.shape_energy)
-classical_control.register(DoubleIntegrator, feedback.linear_quadratic)
-classical_control.register(PhaseLockedLoop, feedback.loop_filter)
+# The control ``(N, m)`` at states ``(N, d)``, for each kind of problem that has one.
+CONTROLS: dict[type[Problem], Callable[..., Tensor]] = {
+    Linkage: resolved_rate,
+    Unicycle: go_to_goal,
+    Dubins: pursue,
+    Kuramoto: descend,
+    PhaseNeurons: descend,
+    Pendulum: energy_pump,
+    DoublePendulum: feedback.swing_up,
+    Quadrotor: feedback.hover,
+    Satellite: feedback.point,
+    CartPole: feedback.shape_energy,
+    DoubleIntegrator: feedback.linear_quadratic,
+    PhaseLockedLoop: feedback.loop_filter,
+}

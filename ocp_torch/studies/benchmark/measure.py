@@ -99,7 +99,7 @@ class Measured(TrainedContext):
     )
     run: Run = Run("measured", "measured")
 
-    odd = None
+    odd = densest = None
 
     @property
     def wide(self) -> list[Samples]:
