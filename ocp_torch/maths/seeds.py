@@ -40,6 +40,7 @@ class Branch(IntEnum):
     REFERENCE = 23  # states between the nodes of a reference grid, the same in every run
     BROWNIAN = 24  # paths of the noise; below, the rows they are for and how often their steps are halved
     POOL = 28  # states that are scored to see where training states count
+    START_MASS = 29  # states for the mass of a start; below, the replicate
     AUDIT = 1000  # which trajectories are simulated again with finer steps
 
 

@@ -49,7 +49,7 @@ def test_what_is_simulated_beside_a_control_variate_has_its_curvature():
     curvature = float((problem.exact_occupation(x) * bent).mean().detach()) / problem.discount
     initial = [float((value(x) * problem.initial_density(x)).mean())] * 4
     found = simulate_performance(
-        problem, problem.exact_control, 128, 4, 0, value=value, initial=initial, tolerance=3e-2
+        problem, problem.exact_control, 1024, 4, 0, value=value, initial=initial, tolerance=3e-2
     )
     low, high = found.perf.interval(0.999)
     assert low <= problem.exact_optimum <= high

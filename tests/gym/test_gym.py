@@ -101,7 +101,7 @@ def test_actions_beyond_the_limit_are_cut_to_the_ball(gymnasium):
     torch.testing.assert_close(env.x, x)
 
 
-def test_each_action_is_in_units_of_its_actuators_limit():
+def test_each_action_is_in_units_of_its_actuators_limit(gymnasium):
     env = ControlEnvironment(Manufactured(control_limit=[0.3, 0.02]), control_bound=0.2)
     assert env.control_bound.tolist() == [0.2, 0.02]
     assert env.to_action(np.array([0.1, -0.02])).tolist() == [0.5, -1.0]

@@ -166,7 +166,7 @@ def _mass(chart: Chart, density: Density) -> tuple[float, float]:
     """The integral of ``density`` over the torus, and how uncertain that is: from states drawn where it is large."""
     found = lambda x: chart.volume * density(chart.from_torus(x))
     fit = fitted_mixture(found, len(chart.coordinates))
-    draws = (fit.draw(STATES, r, derive_seed(0, Branch.MASS, r)) for r in range(REPLICATES))
+    draws = (fit.draw(STATES, r, derive_seed(0, Branch.START_MASS, r)) for r in range(REPLICATES))
     means = torch.stack([(weight * found(x)).mean() for x, weight in draws])
     return float(means.mean()), QUANTILE * float(means.std()) / REPLICATES**0.5
 
