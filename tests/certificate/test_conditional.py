@@ -124,7 +124,7 @@ def test_a_density_that_is_far_too_small_enters_nothing_that_counts(solved, monk
 
 
 @zoo.on(("circle rho=2", "noisy 2-d sigma(x)"))
-@pytest.mark.parametrize("M", [1.0, 1.7, 30.0, 1e9])
+@pytest.mark.parametrize("M", [1.7, 1e9])
 def test_the_best_multiple_and_constant_are_found_and_leave_a_bound(problem, M):
     """Against other multiples and constants, the shifted bound and, where `M` is large enough, the optimum."""
     network = zoo.rough_network(problem.dim, seed=3, size=0.05)

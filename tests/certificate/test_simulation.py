@@ -133,19 +133,18 @@ def test_with_noise_the_occupation_density_is_the_mean_over_paths(problem):
 @zoo.on(("noisy 1-d", pytest.param("noisy 2-d degenerate", marks=pytest.mark.nightly)))
 @pytest.mark.parametrize("horizon", ["truncated", pytest.param("random", marks=pytest.mark.nightly)])
 def test_any_control_variate_gives_the_performance_with_noise(problem, horizon):
-    """`Perf = E[V mu0] - E int rho e^{-rho t} Q_u` for a rough `V`, by Ito's formula; of 12 intervals 3 may miss, 1 is
-    expected."""
+    """`Perf = E[V mu0] - E int rho e^{-rho t} Q_u` for a rough `V`, by Ito's formula; of 6 intervals 2 may miss."""
     value, missed = zoo.rough_network(problem.dim, seed=1, size=0.05), 0
     x = zoo.states(problem, 2**16, seed=5)
     initial = [float((value(x) * problem.initial_density(x)).mean())] * 4
-    for seed in range(12):
+    for seed in range(6):
         found = simulate_performance(
-            problem, problem.exact_control, 32, 4, seed, value=value, initial=initial, horizon=horizon, tolerance=1e-3
+            problem, problem.exact_control, 32, 4, seed, value=value, initial=initial, horizon=horizon, tolerance=1e-2
         ).perf
         low, high = found.interval(0.95)
         missed += not low <= problem.exact_optimum <= high
         assert high - low < (0.2 if horizon == "truncated" else 0.6) * problem.exact_optimum
-    assert missed <= 3
+    assert missed <= 2
 
 
 @zoo.on(zoo.QUIET)

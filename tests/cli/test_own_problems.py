@@ -161,7 +161,7 @@ def test_a_run_goes_on_with_the_arguments_it_has(finished, module):
 @pytest.mark.parametrize(
     ("how", "words", "stopped"),
     [
-        ("always", r"state_cost of own.*Ageing raised RuntimeError: licence expired ask your admin (own", "failed"),
+        ("always", r"state_cost of own.*Ageing raised RuntimeError: licence expired ask your admin", "failed"),
         ("somewhere", "raised ValueError: no such state at x = [0.9", "failed"),
         (
             "holes",
@@ -177,7 +177,7 @@ def test_a_problem_that_fails_late_leaves_a_sentence_and_the_best_look(how, word
     ended = train(*SMALL, *mine, "trainer.steps=400", "trainer.evaluate_every=20", cwd=folder)
     assert ended.status == 2
     for word in words.split("own.*"):
-        assert word.replace("(own", "(own_") in ended.sentence
+        assert word in ended.sentence
     assert "Training stopped at step" in ended.sentence
     certificate = json.loads((run / "certificate.json").read_text())
     assert certificate["stopped"] == stopped

@@ -148,7 +148,7 @@ def test_a_given_controller_costs_what_it_costs_and_no_less_than_the_optimum():
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("method", [("dual",), ("primal",), ("pd",), ("pd", "method.augmentation=0")])
+@pytest.mark.parametrize("method", [("dual",), ("pd",)])
 def test_a_short_training_brackets_the_sum_of_the_optima(method, tmp_path):
     name, *more = method
     typed = ("problem=torus", "problem.shear=none", f"problem.control_limit={BOTH}", f"method={name}", *more)

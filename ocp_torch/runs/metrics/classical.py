@@ -1,4 +1,4 @@
-"""A simple classical controller for each system, as a yardstick: tuned by hand once, the double pendulum's by random search."""
+"""A simple classical controller for each system, as a yardstick: tuned once, by hand or by random search."""
 
 from collections.abc import Callable
 from functools import partial
