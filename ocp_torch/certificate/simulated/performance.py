@@ -28,8 +28,6 @@ GRADING = 2.0
 # The first steps, before any is halved: so many at least, in each of which no more than that part of a discount time passes,
 # and no trajectory moves farther than that part of a turn. Coarser ones are halved more often, finer ones cost more at once.
 FEWEST_STEPS, DISCOUNTED, MOVED = 8, 0.4, 0.2
-# But no more of them than this where a few trajectories whirl: only those that need it are halved again.
-MOST_STEPS = 256
 # Simulation sets come after those of the bounds in the stream of evaluation points.
 SIMULATION_REPLICATE = 1000
 # What is left of the discount when simulation stops, times the rate's supremum, relative to the answer; which is taken to be
@@ -122,8 +120,7 @@ def simulate_performance(
         )
     sliding = None if value is None or problem.noisy else Sliding(integrate, len(x0), tolerance * size)
     speed = float(velocity.norm(dim=-1).max())
-    wanted = 2 * math.ceil(0.5 * longest * max(rho / DISCOUNTED, speed / MOVED))
-    steps = min(max(FEWEST_STEPS, wanted), MOST_STEPS)
+    steps = max(FEWEST_STEPS, 2 * math.ceil(0.5 * longest * max(rho / DISCOUNTED, speed / MOVED)))
     means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
     if problem.noisy:
         grid = Grid(times, steps, 1.0) if random else Grid(torch.full_like(mass, longest), steps, GRADING)
