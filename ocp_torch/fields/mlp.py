@@ -1,6 +1,5 @@
 """Smooth multilayer perceptrons on a periodic embedding."""
 
-import copy
 from math import inf
 
 import torch
@@ -127,31 +126,12 @@ class PeriodicMLP(nn.Module):
 
     def _swept(self, x: Tensor, along: Along) -> Sweep:
         """The field ``(N,)``, its derivatives ``(p, N)`` and its curvature ``(N,)``."""
-        out = self._swept_body(x, along).linear(self.head)
-        part = lambda t: (self.scale * t).squeeze(-1)
-        return Sweep(self.shift + part(out.value), part(out.slopes), part(out.curvature))
-
-    def _swept_body(self, x: Tensor, along: Along) -> Sweep:
-        """What the last layer combines, before it is in the units of the field."""
         h = Sweep.embedded(self.embedding, x, along)
         for layer in self.body:
             if isinstance(layer, Gated):
                 h = layer.swept(h, along)
             else:
                 h = h.linear(layer) if isinstance(layer, nn.Linear) else h.activated(layer, along)
-        return h
-
-    def features(self, x: Tensor) -> Tensor:
-        """What the last layer combines, ``(N, width)``, in the units of the field: `shifted_by` adds multiples of them."""
-        return self.scale * self.body(self.embedding(x))
-
-    def feature_curvature(self, x: Tensor, sigma: Tensor) -> Tensor:
-        """`D : hess` of each of the features, ``(N, width)``, for noise ``sigma`` ``(N, d, k)``."""
-        return self.scale * self._swept_body(x, Along.of(sigma)).curvature
-
-    def shifted_by(self, weights: Tensor) -> "PeriodicMLP":
-        """A copy whose one output has ``weights`` ``(width,)`` times the features added."""
-        other = copy.deepcopy(self)
-        with torch.no_grad():
-            other.head.weight += weights.to(other.head.weight)
-        return other
+        out = h.linear(self.head)
+        part = lambda t: (self.scale * t).squeeze(-1)
+        return Sweep(self.shift + part(out.value), part(out.slopes), part(out.curvature))

@@ -25,7 +25,6 @@ class Branch(IntEnum):
     RECORDING = 8  # states of a recording that is made
     VISITS = 9  # training states that follow the closed loop
     SCAN = 10  # states scanned for narrow features of the data
-    RECOMBINATION = 11  # states on which the last layer of V is chosen anew
     MIXTURE_POINTS = 12  # points of a mixture; below, the component
     EPISODES = 13  # starts of Gymnasium episodes
     GLOBAL_GENERATORS = 14  # the process's own generators, for problems that draw from them
@@ -41,6 +40,7 @@ class Branch(IntEnum):
     BROWNIAN = 24  # paths of the noise; below, the rows they are for and how often their steps are halved
     POOL = 28  # states that are scored to see where training states count
     START_MASS = 29  # states for the mass of a start; below, the replicate
+    TIGHTENING = 30  # states on which V is trained on for the shifted bound
     AUDIT = 1000  # which trajectories are simulated again with finer steps
 
 

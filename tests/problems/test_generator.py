@@ -5,7 +5,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.lower.recombined import Program
 from ocp_torch.certificate.lower.shifted import SlackParts, slack_function
 from ocp_torch.certificate.proof.cover import cell_models
 from ocp_torch.certificate.proof.models import Box
@@ -116,8 +115,6 @@ def test_all_users_of_the_slack_agree(problem, seed):
     torch.testing.assert_close(shift.slack(1.0), Q)
     torch.testing.assert_close(slack_function(problem, V)(x), Q)
     torch.testing.assert_close(L.hjb_slack(own.map(lambda part: 0.7 * part)), shift.slack(0.7))
-    program = Program(problem, V, x)
-    torch.testing.assert_close(program.slack(torch.zeros(program.basis.shape[1], dtype=torch.float64)), Q)
     cells, _ = cell_models(problem, V, 1.0, Box(x, torch.full_like(x, 2.0**-30), 3))
     torch.testing.assert_close(cells.coefficients[0], Q, rtol=0.0, atol=1e-7)
     datum = Datum(*(c.numpy() for c in (x, samples.f, samples.a, samples.B, samples.mu0, samples.div_B)), None)

@@ -17,6 +17,7 @@ from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.lower.shifted import TOP, Shift, SlackParts
+from ocp_torch.maths.quantiles import upper_quantile
 from ocp_torch.maths.supremum import minimiser
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.needs import Need
@@ -96,13 +97,6 @@ def _best(parts: SlackParts, weights: Tensor, initial: float, M: float) -> tuple
 
     theta = minimiser(loss, 0.0, TOP)
     return theta, level(theta)
-
-
-def upper_quantile(values: Tensor, weights: Tensor, part: float) -> float:
-    """The number above which ``part`` of the ``values`` ``(N,)`` lie, by their ``weights``."""
-    order = values.argsort(descending=True)
-    above = weights[order].cumsum(0) / len(weights)
-    return float(values[order][min(int((above < part).sum()), len(values) - 1)])
 
 
 def _penalised(

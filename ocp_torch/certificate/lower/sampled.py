@@ -6,8 +6,8 @@ from functools import cached_property
 from torch import Tensor
 
 from ocp_torch.certificate.lower.mollified import mollified_shift
-from ocp_torch.certificate.lower.recombined import recombined
 from ocp_torch.certificate.lower.shifted import Shift
+from ocp_torch.certificate.lower.tightened import tightened
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
@@ -18,8 +18,9 @@ class SampledValue:
     """``value`` `V` on ``sets`` of samples of ``problem``; each part is computed when it is first asked for.
 
     Suprema of its slack are climbed from the ``ascents`` worst states, and sought at the states ``odd`` ``(K, d)`` too. With
-    ``search`` the shifted bound is sought among functions made of `V`, which takes many times as long: with its last layer
-    chosen anew (`recombined`, on states of ``seed``), and averages over neighbours of the better of the two (`mollified`).
+    ``search`` the shifted bound is sought among functions made of `V`, which takes many times as long: `V` trained on for
+    that bound (`tightened`, on states of ``seed``), and averages over neighbours of the better of the two (`mollified`).
+    With noise there are no kinks beside which an average would help: on dubins 0.08 % of OPT more, for 6 % of a run's time.
     """
 
     problem: Problem
@@ -47,7 +48,7 @@ class SampledValue:
         """That of `V` itself, or of a function made of it where it is higher."""
         if not self.search:
             return self.own
-        best, other = self.own, recombined(self.problem, self.value, self.seed)
+        best, other = self.own, tightened(self.problem, self.value, self.seed)
         if other is not None:
-            best = max(best, replace(best, value=other, name="V recombined"), key=lambda shift: shift.bound)
-        return mollified_shift(best)
+            best = max(best, replace(best, value=other, name="V tightened"), key=lambda shift: shift.bound)
+        return best if self.problem.noisy else mollified_shift(best)

@@ -1,0 +1,27 @@
+r"""D(M) with the best constant in `V`: what comes closest to the bound without `M`."""
+
+from torch import Tensor
+
+from ocp_torch.fields.fields import VALUE, Fields
+from ocp_torch.maths.quantiles import upper_quantile
+from ocp_torch.objectives.objective import Objective, Phase
+from ocp_torch.problems.samples import Samples
+
+
+class LevelledDual(Objective):
+    r"""Maximise `max_c F_M(V - c) = E[V mu0] - CVaR(Q)`, the CVaR being the mean of the largest slacks, those on the part
+    `1 / M` of the torus (Rockafellar and Uryasev, 2000).
+
+    It is concave in `V` as `F_M` is, does not feel a constant in `V`, and tends to `E[V mu0] - sup Q` as `M` grows.
+    """
+
+    players = {"value": (VALUE,)}
+
+    def losses(self, fields: Fields, samples: Samples, phase: Phase) -> dict[str, Tensor]:
+        generator, M = self.generator(samples), phase.constants.M
+        V = generator.jet(fields.value)
+        slack = generator.hjb_slack(V)
+        # At the best level the loss does not change with it to first order.
+        level = upper_quantile(slack.detach(), samples.weight, 1.0 / M)
+        tail = level + M * samples.mean((slack - level).clamp_min(0.0))
+        return {"value": tail - samples.mean(V.value * samples.mu0)}
