@@ -40,7 +40,8 @@ COMPARED, UNLIKELY, UNSEEN_ROOM = 2**15, 2.5, 2.0
 RATE_ROOM = 2.0
 # Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
 # a controller that another one clearly beats; but so few in all as the second number take hardly longer than a part of them.
-BASELINE_PART, CHEAP = 4, 256
+# Their steps need not be as fine either: the third is by how many times.
+BASELINE_PART, CHEAP, ROUGH = 4, 256, 10.0
 
 
 @dataclass(frozen=True)
@@ -174,15 +175,15 @@ def simulate_candidates(
     """Performance of each of ``candidates``, and of doing nothing. With ``best_only`` one that is clearly worse than another
     on a quarter of the trajectories gets no more of them, where that saves time."""
 
-    def simulate(candidate: Candidate, trajectories: int) -> Simulated:
-        (policy, value, initial), how = candidate, (settings.horizon, settings.tolerance)
+    def simulate(candidate: Candidate, trajectories: int, room: float = 1.0) -> Simulated:
+        (policy, value, initial), how = candidate, (settings.horizon, room * settings.tolerance)
         return simulate_performance(problem, policy, trajectories, settings.replicates, seed, value, initial, *how)
 
     few = max(2, settings.trajectories // BASELINE_PART)
     pays = best_only and len(candidates) > 1 and settings.trajectories * settings.replicates > CHEAP
-    found = {name: simulate(candidate, few) for name, candidate in candidates.items()} if pays else {}
+    found = {name: simulate(candidate, few, ROUGH) for name, candidate in candidates.items()} if pays else {}
     best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
     for name, candidate in candidates.items():
         if name not in found or not found[name].perf.interval(CONFIDENCE)[0] > best:
             found[name] = simulate(candidate, settings.trajectories)
-    return found, simulate(Candidate(zero_policy(problem), None, None), few).perf
+    return found, simulate(Candidate(zero_policy(problem), None, None), few, ROUGH).perf
