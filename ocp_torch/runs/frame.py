@@ -15,14 +15,13 @@ Function = Callable[[Tensor], Any]
 
 @dataclass(frozen=True)
 class Frame:
-    """The unit cell from ``start`` on in each coordinate, through ``middle`` in those that are not drawn. Coordinates have
+    """The unit cell from ``start`` on in each coordinate, through its middle in those that are not drawn. Coordinates have
     ``labels``, which are formulas where they are ``symbols``; a place is `centre + length x`."""
 
     labels: tuple[str, ...]
     centre: Tensor
     length: Tensor
-    start: float = 0.0
-    middle: float = 0.5
+    start: Tensor
     symbols: bool = True
     control: str = ""  # what a single control is called and measured in
 
@@ -32,9 +31,9 @@ class Frame:
 
     def map(self, count: int) -> Tensor:
         """States ``(count^2, d)`` over the first two coordinates."""
-        middles = self.start + (torch.arange(count, dtype=torch.float64) + 0.5) / count
-        x = torch.full((count**2, len(self.labels)), self.middle, dtype=torch.float64)
-        x[:, :2] = torch.cartesian_prod(middles, middles)
+        middles = (torch.arange(count, dtype=torch.float64) + 0.5) / count
+        x = (self.start + 0.5).repeat(count**2, 1)
+        x[:, :2] = self.start[:2] + torch.cartesian_prod(middles, middles)
         return x
 
     def places(self, x: Tensor) -> Tensor:
@@ -58,10 +57,11 @@ def frame_of(problem: Problem) -> Frame:
     if isinstance(problem, System):
         labels = tuple(c.label for c in problem.coordinates)
         control = problem.controls[0].label if problem.control_dim == 1 else ""
-        return Frame(labels, problem.chart.centre, problem.chart.length, -0.5, 0.0, symbols=False, control=control)
+        chart = problem.chart
+        return Frame(labels, chart.centre, chart.length, chart.start, symbols=False, control=control)
     labels = ("x",) if problem.dim == 1 else tuple(f"$x_{i + 1}$" for i in range(problem.dim))
     one = torch.ones(problem.dim, dtype=torch.float64)
-    return Frame(labels, 0.0 * one, one)
+    return Frame(labels, 0.0 * one, one, 0.0 * one)
 
 
 def in_units(problem: Problem, control: Function) -> Function:

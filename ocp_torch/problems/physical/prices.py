@@ -7,6 +7,12 @@ from ocp_torch.errors import InputError, require_number, require_numbers
 from ocp_torch.problems.constant_noise import one_or_each
 
 
+def nominal_sizes(nominal: object, count: int) -> list[float]:
+    """What each control is measured in where its price and its limit are meant, ``nominal``: one number, or one for each."""
+    each = one_or_each("problem.nominal_control", nominal, count)
+    return [require_number("problem.nominal_control", value, above=0.0) for value in each]
+
+
 def weight_roots(weight: object, count: int, exponent: float) -> list[float]:
     """`r_i^{1/q}` of each control."""
     each = one_or_each("problem.control_weight", weight, count)

@@ -11,8 +11,8 @@ from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.physical.coordinates import Angle, Interval
 from ocp_torch.problems.physical.prices import scaled_limit
 from ocp_torch.problems.physical.system import System
+from ocp_torch.problems.physical.units import TURN
 from ocp_torch.problems.problem import Problem
-from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.rest import occupation_bound_at_rest
 
 SPEED_COST = 0.1
@@ -79,6 +79,7 @@ class Pendulum(System):
         self.torque_noise = require_number("problem.torque_noise", torque_noise, at_least=0.0)
         self._pull = 1.5 * self.gravity / self.length
         self._push = 3.0 / (self.mass * self.length**2)
+        self.disturb(torch.tensor([[0.0], [self._push * self.torque_noise]], dtype=torch.float64))
         self._scale = 0.5 / (self.torque_cost * self.max_torque**2)
         self._square_at_seam = float(self._square(torch.tensor(self.seam, dtype=torch.float64)))
         self.state_cost_bound = self._scale * (4.0 + SPEED_COST * self._square_at_seam)
@@ -108,14 +109,11 @@ class Pendulum(System):
 
     def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:
         angle, velocity = s.unbind(-1)
-        return torch.stack([velocity, self._pull * angle.sin()], dim=-1), self._columns(s, self._push)
+        push = s.new_tensor([[0.0], [self._push]]).expand(len(s), 2, 1)
+        return torch.stack([velocity, self._pull * angle.sin()], dim=-1), push
 
-    def disturbance(self, s: Tensor) -> Tensor | None:
-        return self._columns(s, self._push * self.torque_noise) if self.torque_noise else None
-
-    def _columns(self, s: Tensor, acceleration: float) -> Tensor:
-        """A column ``(N, 2, 1)`` that acts on the velocity alone."""
-        return s.new_tensor([[0.0], [acceleration]]).expand(len(s), 2, 1)
+    def divergences(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.zeros_like(s[:, 0]), torch.zeros_like(s[:, :1])
 
     def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
         """The state of Pendulum-v1 that shows `(cos theta, sin theta, theta')`; speeds beyond the seam are taken at it."""

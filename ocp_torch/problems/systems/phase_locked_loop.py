@@ -60,6 +60,7 @@ class PhaseLockedLoop(System):
             noise=noise,
             failure_cost=failure_cost,
         )
+        self.disturb(torch.tensor([self.phase_noise, self.frequency_noise], dtype=torch.float64).diag())
         fastest = torch.tensor([[torch.pi, 0.5 * box[1].length]], dtype=torch.float64)
         self.state_cost_bound = max(float(self.cost(fastest)), self._failure)
         # Noise shakes it when locked too.
@@ -75,6 +76,5 @@ class PhaseLockedLoop(System):
         a = torch.stack([s[:, 1], torch.zeros_like(s[:, 1])], dim=-1)
         return a, -torch.eye(2).to(s).expand(len(s), 2, 2)
 
-    def disturbance(self, s: Tensor) -> Tensor | None:
-        each = [self.phase_noise, self.frequency_noise]
-        return s.new_tensor(each).diag().expand(len(s), 2, 2) if any(each) else None
+    def divergences(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.zeros_like(s[:, 0]), torch.zeros_like(s)

@@ -8,7 +8,6 @@ from torch import Tensor
 from ocp_torch.errors import require_number, require_numbers
 from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.physical.coordinates import Interval
-from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.systems.reaching import Reaching, bump
 from ocp_torch.problems.systems.rest import linearised, occupation_bound_at_rest
 
@@ -17,7 +16,7 @@ INNER, SLOW = 0.7, 0.3
 LIMITS = [1.0, 1.0]  # N
 
 
-class Quadrotor(System, Reaching):
+class Quadrotor(Reaching):
     r"""`x'' = -T sin(pitch) / m`, `z'' = T cos(pitch) / m - g`, `pitch'' = arm (u_2 - u_1) / J`, `T = m g + u_1 + u_2`.
 
     The thrusts of its left and right rotors are `m g / 2 + u_i`: `u = 0` hovers. `d = 6`, `m = 2`; `x`, `z` in m, pitch in
