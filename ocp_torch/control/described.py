@@ -24,7 +24,8 @@ def plain_parameters(parameters: dict) -> dict:
 
 def described(problem: Problem) -> dict:
     """What a file says of ``problem``: its name, the arguments that make it again, and its units where it has some."""
-    units = problem.units if isinstance(problem, System) else {}
+    # A data set asks its file for them, which a saved controller does without.
+    units = problem.measures.plain if isinstance(problem, System) else {}
     return {"name": problem_name(problem), "parameters": plain_parameters(problem.parameters), **units}
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.problems import Problem
-from ocp_torch.problems.physical.system import System
+from ocp_torch.problems.physical.chart import Chart
 
 Function = Callable[[Tensor], Any]
 
@@ -53,11 +53,10 @@ class Frame:
 
 
 def frame_of(problem: Problem) -> Frame:
-    """The frame of ``problem``: that of a system has its middle in the middle, and its names and units."""
-    if isinstance(problem, System):
-        labels = tuple(c.label for c in problem.coordinates)
-        control = problem.controls[0].label if problem.control_dim == 1 else ""
-        chart = problem.chart
+    """The frame of ``problem``: one in physical units begins where its coordinates do, and has their names and units."""
+    if (measures := problem.measures) is not None:
+        labels, chart = tuple(c.label for c in measures.coordinates), Chart(measures.coordinates)
+        control = measures.controls[0].label if problem.control_dim == 1 else ""
         return Frame(labels, chart.centre, chart.length, chart.start, symbols=False, control=control)
     labels = ("x",) if problem.dim == 1 else tuple(f"$x_{i + 1}$" for i in range(problem.dim))
     one = torch.ones(problem.dim, dtype=torch.float64)
@@ -65,8 +64,9 @@ def frame_of(problem: Problem) -> Frame:
 
 
 def in_units(problem: Problem, control: Function) -> Function:
-    """A ``control`` ``(N, m)`` on the torus in the unit of a system's; as it is where there are several, of which a figure
+    """A ``control`` ``(N, m)`` on the torus in its unit where it has one; as it is where there are several, of which a figure
     shows the size, whose square is twice the price."""
-    if not isinstance(problem, System) or problem.control_dim > 1:
+    measures = problem.measures
+    if measures is None or problem.control_dim > 1:
         return control
-    return lambda x: None if (v := control(x)) is None else problem.from_controls(v)
+    return lambda x: None if (v := control(x)) is None else v / measures.scales[0]

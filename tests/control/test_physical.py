@@ -34,7 +34,7 @@ def test_it_is_the_control_on_the_torus_in_physical_units(make, tmp_path):
     torch.testing.assert_close(u, problem.from_controls(v))
     assert u.std() > 1e-4
     # What it costs is the price on the torus: half of sum_i r_i u_i^2.
-    roots = torch.tensor([c["scale"] for c in problem.units["controls"]], dtype=torch.float64)
+    roots = torch.tensor([c["scale"] for c in problem.measures.plain["controls"]], dtype=torch.float64)
     torch.testing.assert_close(0.5 * (roots.square() * u.square()).sum(-1), problem.control_cost.cost(v))
     assert np.array_equal(controller.physical(s.numpy()), u.numpy())
 

@@ -1,7 +1,6 @@
 r"""A problem in physical units: what a user writes in radians, metres and newtons, made a problem on the torus."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from functools import cached_property
 
 import torch
@@ -13,6 +12,7 @@ from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.problems.physical.chart import Chart
 from ocp_torch.problems.physical.coordinates import Control, Coordinate, require_controls, require_coordinates
 from ocp_torch.problems.physical.disturbed import Disturbed
+from ocp_torch.problems.physical.measures import Measures
 from ocp_torch.problems.physical.prices import nominal_sizes, scaled_limit, weight_roots
 from ocp_torch.problems.physical.start import Density, Start, start_density
 
@@ -102,12 +102,9 @@ class System(Disturbed):
         return v / self._like(v, "roots", self._roots)
 
     @property
-    def units(self) -> dict:
-        """What states and controls are measured in, as JSON can hold it: ``scale`` is `v_i / u_i`."""
-        scales = self._roots.tolist()
-        controls = [{**asdict(c), "scale": scale} for c, scale in zip(self.controls, scales, strict=True)]
-        given = [{k: v for k, v in asdict(c).items() if v is not None} for c in self.coordinates]
-        return {"coordinates": given, "controls": controls}
+    def measures(self) -> Measures:
+        """What states and controls are called and measured in, with `v_i / u_i`."""
+        return Measures(self.coordinates, self.controls, tuple(self._roots.tolist()))
 
     def state_cost(self, x: Tensor) -> Tensor:
         s = self._places(x)

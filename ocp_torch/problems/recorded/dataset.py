@@ -10,6 +10,7 @@ from torch import Tensor
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.control_limit import Limit
+from ocp_torch.problems.physical.measures import Measures
 from ocp_torch.problems.problem import MARGIN, Problem
 from ocp_torch.problems.recorded.implied import completed, same_everywhere
 from ocp_torch.problems.recorded.recording import Recording, read
@@ -128,6 +129,10 @@ class Dataset(Problem):
         """What nothing was learned from or chosen by."""
         _ = self.recording
         return self._held_out
+
+    @property
+    def measures(self) -> Measures | None:
+        return self.recording.measures
 
     @property
     def validation_view(self) -> "Dataset":

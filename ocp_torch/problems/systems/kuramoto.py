@@ -61,9 +61,11 @@ class Kuramoto(Oscillators):
         self.controlled = _subset(controlled, n)
         self.strength = require_number("problem.strength", strength, above=0.0)
         last = f" - phase {n - 1}" if self.relative else ""
-        phases, pushes = [Angle(f"phase {i}{last}") for i in range(n)], [f"push {i} [rad/s]" for i in self.controlled]
-        price = dict(control_limit=control_limit, nominal_control=self.strength)
-        super().__init__(phases[: n - self.relative], pushes, discount, exponent, noise=noise, **price)
+        phases = [Angle(f"phase {i}{last}") for i in range(n - self.relative)]
+        pushes = [f"push {i} [rad/s]" for i in self.controlled]
+        super().__init__(
+            phases, pushes, discount, exponent, 1.0, control_limit, noise=noise, nominal_control=self.strength
+        )
         self.aim(goal, weight)
         self.seed = require_integer("problem.seed", seed, 0)
         self.spread = require_number("problem.spread", spread, at_least=0.0)

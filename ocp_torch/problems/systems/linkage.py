@@ -42,8 +42,8 @@ class Linkage(Reaching):
         self.speed, self.joint_noise = require_number("problem.speed", speed, above=0.0), joint_noise
         angles = [Angle(f"joint {i + 1}") for i in range(joints)]
         rates = [f"rate {i + 1} [rad/s]" for i in range(joints)]
-        price = dict(control_limit=control_limit, nominal_control=TURN * self.speed)
-        super().__init__(angles, rates, discount, exponent, noise=noise, **price)
+        nominal = TURN * self.speed
+        super().__init__(angles, rates, discount, exponent, 1.0, control_limit, noise=noise, nominal_control=nominal)
         each = one_or_each("problem.joint_noise", joint_noise, self.dim)
         self.disturb(torch.tensor(each, dtype=torch.float64).diag())
 

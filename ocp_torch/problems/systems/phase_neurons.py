@@ -47,9 +47,10 @@ class PhaseNeurons(Oscillators):
     ) -> None:
         self.neurons = n = require_integer("problem.neurons", neurons, 2, maximum=512)
         self.strength = require_number("problem.strength", strength, above=0.0)
-        phases, price = [Angle(f"phase {i}") for i in range(n)], dict(nominal_control=self.strength)
-        limit = dict(control_limit=control_limit)
-        super().__init__(phases, ["stimulus [rad/s]"], discount, exponent, noise=noise, **price, **limit)
+        phases, stimulus = [Angle(f"phase {i}") for i in range(n)], ["stimulus [rad/s]"]
+        super().__init__(
+            phases, stimulus, discount, exponent, 1.0, control_limit, noise=noise, nominal_control=self.strength
+        )
         self.aim(goal, weight)
         self.response = require_choice("problem.response", response, (TYPE_1, TYPE_2))
         self.frequency = require_number("problem.frequency", frequency)

@@ -48,9 +48,8 @@ class PlanarVehicle(Reaching):
         self.turn_rate = require_number("problem.turn_rate", turn_rate, above=0.0)
         self.walls = require_flag("problem.walls", walls)
         nominal = [self.speed, TURN * self.turn_rate][-len(controls) :]
-        place = lambda name: (Interval if self.walls else Angle)(name, **span)
-        span = {"low": 0.0, "high" if self.walls else "period": self.size, "unit": "m"}
-        box: list[Coordinate] = [place("x"), place("y"), Angle("heading")]
+        side = lambda name: Interval(name, 0, self.size, "m") if self.walls else Angle(name, self.size, "m", 0.0)
+        box: list[Coordinate] = [side("x"), side("y"), Angle("heading")]
         inner = tuple(0.5 * self.size * (1.0 + side * INNER) for side in (-1, 1))
         start = {"x": inner, "y": inner} if self.walls else None
         super().__init__(
