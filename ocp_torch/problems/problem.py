@@ -5,7 +5,6 @@ minimise  rho E int_0^inf e^{-rho t} (f(x_t) + |u_t|^q / q) dt,   dx = (a(x) + B
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,12 +17,10 @@ from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.constant_noise import column_matrix, constant_diffusion
 from ocp_torch.problems.control_limit import Limit, control_cost
+from ocp_torch.problems.physical.measures import Measures
 from ocp_torch.problems.placed import Placed
 from ocp_torch.problems.reproducible import Reproducible
 from ocp_torch.problems.samples import Samples
-
-if TYPE_CHECKING:
-    from ocp_torch.problems.physical.measures import Measures
 
 # With more, `B` alone would take over 8 GB for a batch of a thousand states.
 MOST_COORDINATES = 1024
@@ -72,6 +69,8 @@ class Problem(Reproducible, Placed):
     knows_control_matrix: bool = True
     # Arguments that say where the data come from, not what they are: another run may give others.
     incidental: tuple[str, ...] = ()
+    # What coordinates and controls are called and measured in, where they have names.
+    measures: Measures | None = None
 
     def __init__(
         self,
@@ -196,11 +195,6 @@ class Problem(Reproducible, Placed):
     def gives_divergences(self) -> bool:
         """Whether all of these are to be had."""
         return not self.unknown_divergences
-
-    @property
-    def measures(self) -> "Measures | None":
-        """What coordinates and controls are called and measured in, where they have names."""
-        return None
 
     # Exact truth, where known: `None` otherwise.
     def exact_value(self, x: Tensor) -> Tensor | None:

@@ -48,8 +48,8 @@ class Frame:
 
     @property
     def aspect(self) -> str:
-        """A turn of either coordinate is as long as one of the other."""
-        return "equal" if self.symbols else "auto"
+        """Equal where a turn of either coordinate is as long as one of the other."""
+        return "equal" if len(set(self.length[:2].tolist())) == 1 else "auto"
 
 
 def frame_of(problem: Problem) -> Frame:

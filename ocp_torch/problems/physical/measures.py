@@ -28,6 +28,12 @@ class Measures:
         controls = [{**asdict(c), "scale": scale} for c, scale in zip(self.controls, self.scales, strict=True)]
         return {"coordinates": given, "controls": controls}
 
+    @property
+    def text(self) -> str:
+        """As a line to be read."""
+        coordinates, controls = (", ".join(c.label for c in group) for group in (self.coordinates, self.controls))
+        return f"coordinates: {coordinates}; controls: {controls}"
+
     @classmethod
     def of(cls, plain: dict, dim: int, control_dim: int) -> "Measures":
         """Those that ``plain``, of a stranger's file, describes; `InputError` unless it does so for ``dim`` coordinates and

@@ -67,6 +67,7 @@ class System(Disturbed):
         # A function of the user's own may need what a subclass has yet to set.
         self._density: Density | None = None if callable(start) else start_density(self.chart, start)
         self._roots = torch.tensor(roots, dtype=torch.float64) / torch.tensor(nominal, dtype=torch.float64)
+        self.measures = Measures(self.coordinates, self.controls, tuple(self._roots.tolist()))
         self._factor = 1.0 / (self.chart.length.unsqueeze(-1) * self._roots)
         if failure_cost is not None:
             require_number("problem.failure_cost", failure_cost, at_least=0.0)
@@ -100,11 +101,6 @@ class System(Disturbed):
     def from_controls(self, v: Tensor) -> Tensor:
         """Controls ``(N, m)`` of the torus problem in their units."""
         return v / self._like(v, "roots", self._roots)
-
-    @property
-    def measures(self) -> Measures:
-        """What states and controls are called and measured in, with `v_i / u_i`."""
-        return Measures(self.coordinates, self.controls, tuple(self._roots.tolist()))
 
     def state_cost(self, x: Tensor) -> Tensor:
         s = self._places(x)

@@ -57,7 +57,8 @@ def draw_vehicles(problem: PlanarVehicle, axes: Any, path: Path, k: int) -> None
             axes.quiver(*track[some].T, *ahead[some].T, color=look["color"], scale=28, width=0.005, pivot="mid")
     axes.plot(*problem.target, "*", color="k", markersize=14)
     limits = {"xlim": (0, problem.size), "ylim": (0, problem.size)}
-    axes.set(**limits, aspect="equal", xlabel="m", title=f"{path.times[k]:.2f}")
+    axes.set(**limits, aspect="equal", title=f"{path.times[k]:.2f} s")
+    axes.set(xlabel=problem.coordinates[0].label, ylabel=problem.coordinates[1].label)
 
 
 def draw_phases(problem: Kuramoto | PhaseNeurons, axes: Any, path: Path, k: int) -> None:
