@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, dataclass
 
-from ocp_torch.errors import InputError, require_number, shown
+from ocp_torch.errors import InputError, require_number
 from ocp_torch.problems.physical.coordinates import (
     Angle,
     Control,
@@ -36,26 +36,14 @@ class Measures:
 
     @classmethod
     def of(cls, plain: dict, dim: int, control_dim: int) -> "Measures":
-        """Those that ``plain``, of a stranger's file, describes; `InputError` unless it does so for ``dim`` coordinates and
-        ``control_dim`` controls."""
-        rows, others = (_rows(plain, *size) for size in (("coordinates", dim), ("controls", control_dim)))
-        coordinates = require_coordinates([_coordinate(row) for row in rows])
-        controls = require_controls([Control(row.get("name"), row.get("unit", "")) for row in others])  # type: ignore[arg-type]
-        scales = tuple(require_number("scale", row.get("scale", 1.0), above=0.0) for row in others)
-        return cls(coordinates, controls, scales)
-
-
-def _rows(plain: dict, name: str, count: int) -> list[dict]:
-    rows = plain.get(name)
-    if not isinstance(rows, list) or len(rows) != count or not all(isinstance(row, dict) for row in rows):
-        raise InputError(f"{name} are {shown(rows)}, but must be a list of {count} with a name and a unit each")
-    return rows
-
-
-def _coordinate(row: dict) -> Coordinate:
-    """Its constructor refuses whatever is wrong."""
-    kind, names = (Interval, ("low", "high", "margin")) if "high" in row else (Angle, ("period", "low"))
-    given = {name: row[name] for name in ("unit", *names) if name in row}
-    if kind is Interval:
-        given["low"] = row.get("low")
-    return kind(row.get("name"), **given)  # type: ignore[arg-type]
+        """Those that ``plain``, of a stranger's file, describes; `ValueError`, `KeyError`, `TypeError` or `AttributeError`
+        unless it does so for ``dim`` coordinates and ``control_dim`` controls."""
+        rows, others = plain["coordinates"], plain["controls"]
+        if (len(rows), len(others)) != (dim, control_dim):
+            raise InputError(f"it names {len(rows)} coordinates and {len(others)} controls of {dim} and {control_dim}")
+        # The constructors refuse whatever else is wrong.
+        coordinates = require_coordinates([(Interval if "high" in row else Angle)(**row) for row in rows])
+        controls = require_controls([Control(row["name"], row.get("unit", "")) for row in others])
+        return cls(
+            coordinates, controls, tuple(require_number("scale", r.get("scale", 1.0), above=0.0) for r in others)
+        )

@@ -101,7 +101,7 @@ def _measures(path: Path, units: np.ndarray, dim: int, control_dim: int) -> tupl
         if units.ndim != 1 or units.size > MOST_UNITS or not ((units >= 0) & (units < 256)).all():
             raise NotPlain("it is no text")
         return Measures.of(json_object(units.astype(np.uint8).tobytes().decode()), dim, control_dim), ()
-    except ValueError as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         return None, (
             f"names and units of {path.name} cannot be read ({visible(error, 200).rstrip('.')}), and are left out.",
         )

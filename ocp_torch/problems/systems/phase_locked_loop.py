@@ -8,7 +8,7 @@ from torch import Tensor
 from ocp_torch.errors import require_number, require_numbers
 from ocp_torch.problems.physical.coordinates import Angle, Interval
 from ocp_torch.problems.physical.system import System
-from ocp_torch.problems.systems.rest import linearised, occupation_bound_at_rest
+from ocp_torch.problems.systems.rest import bound_at_rest
 
 
 class PhaseLockedLoop(System):
@@ -63,10 +63,7 @@ class PhaseLockedLoop(System):
         self.disturb(torch.tensor([self.phase_noise, self.frequency_noise], dtype=torch.float64).diag())
         fastest = torch.tensor([[torch.pi, 0.5 * box[1].length]], dtype=torch.float64)
         self.state_cost_bound = max(float(self.cost(fastest)), self._failure)
-        # Noise shakes it when locked too.
-        locked = linearised(self, [0.0, 0.0])
-        at_rest = None if self.noisy else occupation_bound_at_rest(*locked, self.discount, self.exponent)
-        self.occupation_bound = at_rest
+        self.occupation_bound = bound_at_rest(self, [0.0, 0.0])
 
     def cost(self, s: Tensor) -> Tensor:
         phase, frequency = s.unbind(-1)

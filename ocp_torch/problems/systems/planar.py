@@ -96,10 +96,7 @@ class PlanarVehicle(Reaching):
         return self._offsets(self.from_torus(x), balls[:, :2]).norm(dim=-1) - balls[:, 2]
 
     def cost(self, s: Tensor) -> Tensor:
-        target = self._like(s, "target", self._target).unsqueeze(0)
-        cost = self.target_weight * self._square_distances(s, target)[:, 0]
-        if not self.obstacles:
-            return cost
-        discs = self._like(s, "balls", self._balls)
+        target, discs = self._like(s, "target", self._target), self._like(s, "balls", self._balls)
         bumps = bump(self._square_distances(s, discs[:, :2]), discs[:, 2] + self.clearance)
-        return cost + self.obstacle_weight * bumps.sum(dim=-1)
+        away = self._square_distances(s, target.unsqueeze(0))[:, 0]
+        return self.target_weight * away + self.obstacle_weight * bumps.sum(dim=-1)

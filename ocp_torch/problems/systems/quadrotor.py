@@ -9,7 +9,7 @@ from ocp_torch.errors import require_number, require_numbers
 from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.physical.coordinates import Interval
 from ocp_torch.problems.systems.reaching import Reaching, bump
-from ocp_torch.problems.systems.rest import linearised, occupation_bound_at_rest
+from ocp_torch.problems.systems.rest import bound_at_rest
 
 # It starts in the inner part of the room, and slower and more level than the box allows.
 INNER, SLOW = 0.7, 0.3
@@ -86,9 +86,7 @@ class Quadrotor(Reaching):
         far = torch.where((seams[0] - self._goal).abs() > (seams[1] - self._goal).abs(), seams[0], seams[1])
         bumps = self.obstacle_weight * len(self.obstacles)
         self.state_cost_bound = max(float(self._smooth(far[None])) + bumps, self._failure)
-        at_rest = occupation_bound_at_rest(*linearised(self, self._goal.tolist()), self.discount, self.exponent)
-        # Noise shakes it at the state of rest too.
-        self.occupation_bound = None if self.noisy else at_rest
+        self.occupation_bound = bound_at_rest(self, self._goal.tolist())
 
     @property
     def _goal(self) -> Tensor:
@@ -103,8 +101,6 @@ class Quadrotor(Reaching):
         return self.target_weight * way + self.pitch_cost * tilt + self.speed_cost * speed
 
     def cost(self, s: Tensor) -> Tensor:
-        if not self.obstacles:
-            return self._smooth(s)
         balls = self._like(s, "balls", self._balls)
         square = (s[:, None, :2] - balls[:, :2]).square().sum(dim=-1)
         return self._smooth(s) + self.obstacle_weight * bump(square, balls[:, 2] + self.clearance).sum(dim=-1)
