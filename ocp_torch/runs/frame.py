@@ -41,10 +41,14 @@ class Frame:
         return self.centre + self.length * x
 
     @property
+    def ends(self) -> Tensor:
+        """Where each axis begins and ends, ``(d, 2)``."""
+        return torch.stack([self.places(at) for at in (self.start, self.start + 1.0)], dim=-1)
+
+    @property
     def extent(self) -> tuple[float, ...]:
         """Left, right, bottom and top of a map."""
-        ends = torch.stack([self.centre + self.length * at for at in (self.start, self.start + 1.0)], dim=-1)
-        return tuple(ends[:2].flatten().tolist())
+        return tuple(self.ends[:2].flatten().tolist())
 
     @property
     def aspect(self) -> str:

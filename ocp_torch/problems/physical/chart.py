@@ -26,9 +26,10 @@ class Chart(Placed):
 
     def __init__(self, coordinates: tuple[Coordinate, ...]) -> None:
         self.coordinates = coordinates
-        column = lambda name: torch.tensor([getattr(c, name) for c in coordinates], dtype=torch.float64)
+        column = lambda name: torch.tensor([getattr(c, name) or 0.0 for c in coordinates], dtype=torch.float64)
         self.centre, self.length = column("centre"), column("length")
-        self.start = (column("left") - self.centre) / self.length
+        halves = [isinstance(c, Interval) or c.low is None for c in coordinates]
+        self.start = torch.where(torch.tensor(halves), -0.5, column("low") / self.length)
         boxed = [(i, c) for i, c in enumerate(coordinates) if isinstance(c, Interval)]
         self.boxed = [i for i, _ in boxed]
         self.volume = float(self.length.prod())

@@ -47,11 +47,6 @@ class Angle:
         assert self.period is not None
         return self.period
 
-    @property
-    def left(self) -> float:
-        """The least value that is shown."""
-        return -0.5 * self.length if self.low is None else self.low
-
 
 @dataclass(frozen=True)
 class Interval:
@@ -92,11 +87,6 @@ class Interval:
     def length(self) -> float:
         """Interval and margins: what a turn of the torus coordinate is, in ``unit``."""
         return (self.high - self.low) + 2.0 * self.seam
-
-    @property
-    def left(self) -> float:
-        """The seam on its low side."""
-        return self.low - self.seam
 
 
 Coordinate = Angle | Interval

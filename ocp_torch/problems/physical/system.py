@@ -13,7 +13,7 @@ from ocp_torch.problems.physical.chart import Chart
 from ocp_torch.problems.physical.coordinates import Control, Coordinate, require_controls, require_coordinates
 from ocp_torch.problems.physical.disturbed import Disturbed
 from ocp_torch.problems.physical.measures import Measures
-from ocp_torch.problems.physical.prices import nominal_sizes, scaled_limit, weight_roots
+from ocp_torch.problems.physical.prices import positive_each, scaled_limit, weight_roots
 from ocp_torch.problems.physical.start import Density, Start, start_density
 
 # States at which the largest cost in the box is sought.
@@ -43,6 +43,8 @@ class System(Disturbed):
 
     # The attribute of that name is a limit of `v`, not what was given.
     not_arguments = ("control_limit",)
+    # Whether neither `a` nor a column of `B` has a divergence, in physical units.
+    divergence_free = False
 
     def __init__(
         self,
@@ -60,7 +62,8 @@ class System(Disturbed):
         self.coordinates, self.controls = require_coordinates(coordinates), require_controls(controls)
         q = require_number("problem.exponent", exponent, above=1.0, at_most=2.0)
         roots = weight_roots(control_weight, len(self.controls), q)
-        limit, nominal = scaled_limit(control_limit, roots), nominal_sizes(nominal_control, len(roots))
+        nominal = positive_each("problem.nominal_control", nominal_control, len(roots))
+        limit = scaled_limit(control_limit, roots)
         super().__init__(len(self.coordinates), len(self.controls), discount, q, limit, noise)
         self.chart = Chart(self.coordinates)
         self.start = start
@@ -84,7 +87,7 @@ class System(Disturbed):
     def divergences(self, s: Tensor) -> tuple[Tensor, Tensor] | None:
         """`div a` ``(N,)`` and that of each column of `B` ``(N, m)``, of `dynamics`; `None` leaves them to autograd. For
         those that know them, which is faster."""
-        return None
+        return (torch.zeros_like(s[:, 0]), s.new_zeros(len(s), self.control_dim)) if self.divergence_free else None
 
     def to_torus(self, s: Tensor) -> Tensor:
         """Physical states ``(N, d)`` as states of the torus; raises `InputError` for one beyond a seam."""

@@ -25,7 +25,7 @@ class Linkage(Reaching):
     calls `__init__`, `pursue` and `stretch`.
     """
 
-    driftless = True
+    driftless = divergence_free = True
     points_per_link = 8
 
     def __init__(
@@ -92,6 +92,3 @@ class Linkage(Reaching):
 
     def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:
         return torch.zeros_like(s), torch.eye(self.dim, dtype=s.dtype, device=s.device).expand(len(s), -1, -1)
-
-    def divergences(self, s: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.zeros_like(s[:, 0]), torch.zeros_like(s)

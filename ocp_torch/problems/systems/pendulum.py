@@ -36,6 +36,7 @@ class Pendulum(System):
     """
 
     initial_density = Problem.initial_density
+    divergence_free = True
 
     def __init__(
         self,
@@ -107,9 +108,6 @@ class Pendulum(System):
         angle, velocity = s.unbind(-1)
         push = s.new_tensor([[0.0], [self._push]]).expand(len(s), 2, 1)
         return torch.stack([velocity, self._pull * angle.sin()], dim=-1), push
-
-    def divergences(self, s: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.zeros_like(s[:, 0]), torch.zeros_like(s[:, :1])
 
     def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
         """The state of Pendulum-v1 that shows `(cos theta, sin theta, theta')`; speeds beyond the seam are taken at it."""

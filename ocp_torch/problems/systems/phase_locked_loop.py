@@ -25,6 +25,8 @@ class PhaseLockedLoop(System):
     with noise nothing is known of it. Raises `InputError` for wrong arguments.
     """
 
+    divergence_free = True
+
     def __init__(
         self,
         max_frequency: float = 4.0,
@@ -72,6 +74,3 @@ class PhaseLockedLoop(System):
     def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:
         a = torch.stack([s[:, 1], torch.zeros_like(s[:, 1])], dim=-1)
         return a, -torch.eye(2).to(s).expand(len(s), 2, 2)
-
-    def divergences(self, s: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.zeros_like(s[:, 0]), torch.zeros_like(s)

@@ -26,6 +26,9 @@ class PlanarVehicle(Reaching):
     a failure that costs ``failure_cost`` for ever, by default the largest cost in it.
     """
 
+    # The direction ahead does not depend on the position, nor the turn on the heading.
+    divergence_free = True
+
     def __init__(
         self,
         controls: Sequence[str],
@@ -48,8 +51,8 @@ class PlanarVehicle(Reaching):
         self.turn_rate = require_number("problem.turn_rate", turn_rate, above=0.0)
         self.walls = require_flag("problem.walls", walls)
         nominal = [self.speed, TURN * self.turn_rate][-len(controls) :]
-        side = lambda name: Interval(name, 0, self.size, "m") if self.walls else Angle(name, self.size, "m", 0.0)
-        box: list[Coordinate] = [side("x"), side("y"), Angle("heading")]
+        along = lambda name: Interval(name, 0, self.size, "m") if self.walls else Angle(name, self.size, "m", 0.0)
+        box: list[Coordinate] = [along("x"), along("y"), Angle("heading")]
         inner = tuple(0.5 * self.size * (1.0 + side * INNER) for side in (-1, 1))
         start = {"x": inner, "y": inner} if self.walls else None
         super().__init__(
@@ -59,7 +62,8 @@ class PlanarVehicle(Reaching):
             raise InputError(f"problem.failure_cost is {failure_cost:g}, but nothing fails without problem.walls=true.")
         if self.walls and not all(0.0 <= g <= self.size for g in self.target):
             raise InputError(f"problem.target is {self.target}, but must be in the room, from 0 to {self.size:g} m.")
-        reach = [max(g - c.left, c.left + c.length - g) for g, c in zip(self.target, box, strict=False)]
+        # From the target to the farther seams.
+        reach = [max(g, self.size - g) + 0.5 * (box[0].length - self.size) for g in self.target]
         self.bound_cost(math.hypot(*reach) ** 2 if self.walls else 2.0 * (self.size / math.pi) ** 2)
         self.heading_noise = require_number("problem.heading_noise", heading_noise, at_least=0.0)
         self.position_noise = require_number("problem.position_noise", position_noise, at_least=0.0)
@@ -74,10 +78,6 @@ class PlanarVehicle(Reaching):
         """What a speed of 1 m/s and a turn rate of 1 rad/s do to the state, ``(N, 3, 2)``."""
         cos, sin, still = s[:, 2].cos(), s[:, 2].sin(), torch.zeros_like(s[:, 2])
         return torch.stack([cos, still, sin, still, still, still + 1.0], dim=-1).unflatten(1, (3, 2))
-
-    def divergences(self, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Zero: the direction ahead does not depend on the position, nor the turn on the heading."""
-        return torch.zeros_like(s[:, 0]), s.new_zeros(len(s), self.control_dim)
 
     def _offsets(self, s: Tensor, points: Tensor) -> Tensor:
         """The shortest way to ``points`` ``(k, 2)``, in metres, ``(N, k, 2)``."""

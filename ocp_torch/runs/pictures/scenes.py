@@ -20,6 +20,7 @@ from ocp_torch.problems.systems.planar import PlanarVehicle
 from ocp_torch.problems.systems.quadrotor import Quadrotor
 from ocp_torch.problems.systems.robot import RobotArm
 from ocp_torch.problems.systems.satellite import Satellite
+from ocp_torch.runs.frame import frame_of
 from ocp_torch.runs.metrics.measures import Path
 from ocp_torch.runs.pictures.bodies import GHOSTS, draw_cart, draw_double_pendulum, draw_quadrotors, draw_satellites
 from ocp_torch.runs.pictures.strokes import broken, draw_balls, draw_obstacles, tracks
@@ -84,7 +85,7 @@ def draw_system(problem: System, axes: Any, path: Path, k: int) -> None:
         drawn = torch.stack([path.times[: k + 1], track[:, 0]], dim=-1) if alone else track
         axes.plot(*drawn.T, **look)
         axes.plot(*drawn[-1], "o", color=look["color"], markersize=4)
-    ends = [(c.left, c.left + c.length) for c in shown]
+    ends = [tuple(end) for end in frame_of(problem).ends[:2].tolist()]
     time = (0.0, float(path.times[-1]))
     axes.set(xlim=time if alone else ends[0], ylim=ends[-1], title=f"{path.times[k]:.2f}")
     axes.set_xlabel("time" if alone else shown[0].label, parse_math=False)
