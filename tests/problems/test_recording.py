@@ -31,6 +31,7 @@ from ocp_torch.runs import record as recording_command
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.evaluate import certify_saved, load_run
 from ocp_torch.runs.external import certify as certify_given
+from ocp_torch.runs.figures import draw
 from ocp_torch.runs.frame import frame_of, in_units
 from ocp_torch.training.checkpoint import load_checkpoint
 from ocp_torch.training.monitor import Silent
@@ -93,6 +94,17 @@ def test_names_and_units_are_recorded_and_stand_on_the_axes(tmp_path, suffix):
     control = in_units(data, lambda x: torch.ones(3, 1))
     assert control(None).tolist() == [[2.0]] * 3
     assert Dataset(str(record(tmp_path, Circle(), 300, f"b{suffix}"))).measures is None
+
+
+def test_a_strangers_names_are_no_formulas_in_a_figure(tmp_path):
+    path = record(tmp_path, Circle(), 300)
+    units = {"coordinates": [{"name": "$\\frac{"}], "controls": [{"name": "$\\over$ }"}]}
+    np.savez(path, **arrays_of(path), units=np.frombuffer(json.dumps(units).encode(), np.uint8))
+    fields = Fields({"value": PeriodicMLP(dim=1, width=8, depth=2, modes=2)})
+    data = Dataset(str(path))
+    for figure in draw(data, fields, resolve_constants(data, occupation_bound=2.0), None).values():
+        figure.canvas.draw()
+        assert figure.axes[0].get_xlabel() == "$\\frac{ [rad]"
 
 
 GOOD = {"coordinates": [{"name": "a"}, {"name": "b", "low": 0, "high": 2, "unit": "m"}], "controls": [{"name": "F"}]}
