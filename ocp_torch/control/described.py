@@ -24,8 +24,10 @@ def plain_parameters(parameters: dict) -> dict:
 
 def described(problem: Problem) -> dict:
     """What a file says of ``problem``: its name, the arguments that make it again, and its units where it has some."""
-    units = problem.units if isinstance(problem, System) else {}
-    return {"name": problem_name(problem), "parameters": plain_parameters(problem.parameters), **units}
+    # Those of a data set are its file's, which a saved controller does without.
+    units = problem.measures if isinstance(problem, System) else None
+    parameters = plain_parameters(problem.parameters)
+    return {"name": problem_name(problem), "parameters": parameters, **(units.plain if units else {})}
 
 
 def require_same(path: Path, problem: Problem, saved: dict) -> None:

@@ -21,7 +21,7 @@ LIBRARIES = tuple(
     | {sysconfig.get_paths()[key] for key in ("stdlib", "platstdlib", "purelib", "platlib")}
 )
 # What a user writes of physical states.
-PHYSICAL = ("cost", "dynamics", "disturbance")
+PHYSICAL = ("cost", "dynamics", "disturbance", "divergences")
 # Coordinates of a state, and signs of a message, that a sentence shows.
 MOST_SHOWN, LONGEST = 8, 300
 

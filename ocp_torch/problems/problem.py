@@ -17,6 +17,7 @@ from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.constant_noise import column_matrix, constant_diffusion
 from ocp_torch.problems.control_limit import Limit, control_cost
+from ocp_torch.problems.physical.measures import Measures
 from ocp_torch.problems.placed import Placed
 from ocp_torch.problems.reproducible import Reproducible
 from ocp_torch.problems.samples import Samples
@@ -68,6 +69,8 @@ class Problem(Reproducible, Placed):
     knows_control_matrix: bool = True
     # Arguments that say where the data come from, not what they are: another run may give others.
     incidental: tuple[str, ...] = ()
+    # What coordinates and controls are called and measured in, where they have names.
+    measures: Measures | None = None
 
     def __init__(
         self,

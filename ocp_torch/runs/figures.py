@@ -153,7 +153,7 @@ def _curve(title: str, x: Tensor, values: dict[str, Tensor], frame: Frame) -> Fi
             axis.plot(frame.places(x), values[label], form, label=label)
     if len(axis.lines) > 1:
         axis.legend()
-    axis.set_title(title)
+    axis.set_title(title, parse_math=False)  # a recording may have named the control
     axis.set_xlabel(frame.labels[0], parse_math=frame.symbols)
     return figure
 
@@ -172,7 +172,7 @@ def _map(title: str, x: Tensor, panels: dict[str, Tensor], frame: Frame) -> Figu
         if values.shape[1] > 1:
             axis.quiver(*some(frame.places(x)), *some(values), color="w")
         name = f"|{title}|" if values.shape[1] > 1 else title
-        axis.set(title=name if label == "learned" else f"{name}, {label}")
+        axis.set_title(name if label == "learned" else f"{name}, {label}", parse_math=False)
         axis.set_xlabel(frame.labels[0], parse_math=frame.symbols)
         axis.set_ylabel(frame.labels[1], parse_math=frame.symbols)
         figure.colorbar(image, ax=axis)

@@ -8,21 +8,20 @@ import torch
 from torch import Tensor
 
 from ocp_torch.problems import Problem
-from ocp_torch.problems.physical.system import System
+from ocp_torch.problems.physical.chart import Chart
 
 Function = Callable[[Tensor], Any]
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The unit cell from ``start`` on in each coordinate, through ``middle`` in those that are not drawn. Coordinates have
+    """The unit cell from ``start`` on in each coordinate, through its middle in those that are not drawn. Coordinates have
     ``labels``, which are formulas where they are ``symbols``; a place is `centre + length x`."""
 
     labels: tuple[str, ...]
     centre: Tensor
     length: Tensor
-    start: float = 0.0
-    middle: float = 0.5
+    start: Tensor
     symbols: bool = True
     control: str = ""  # what a single control is called and measured in
 
@@ -32,9 +31,9 @@ class Frame:
 
     def map(self, count: int) -> Tensor:
         """States ``(count^2, d)`` over the first two coordinates."""
-        middles = self.start + (torch.arange(count, dtype=torch.float64) + 0.5) / count
-        x = torch.full((count**2, len(self.labels)), self.middle, dtype=torch.float64)
-        x[:, :2] = torch.cartesian_prod(middles, middles)
+        middles = (torch.arange(count, dtype=torch.float64) + 0.5) / count
+        x = (self.start + 0.5).repeat(count**2, 1)
+        x[:, :2] = self.start[:2] + torch.cartesian_prod(middles, middles)
         return x
 
     def places(self, x: Tensor) -> Tensor:
@@ -42,31 +41,36 @@ class Frame:
         return self.centre + self.length * x
 
     @property
+    def ends(self) -> Tensor:
+        """Where each axis begins and ends, ``(d, 2)``."""
+        return torch.stack([self.places(at) for at in (self.start, self.start + 1.0)], dim=-1)
+
+    @property
     def extent(self) -> tuple[float, ...]:
         """Left, right, bottom and top of a map."""
-        ends = torch.stack([self.centre + self.length * at for at in (self.start, self.start + 1.0)], dim=-1)
-        return tuple(ends[:2].flatten().tolist())
+        return tuple(self.ends[:2].flatten().tolist())
 
     @property
     def aspect(self) -> str:
-        """A turn of either coordinate is as long as one of the other."""
-        return "equal" if self.symbols else "auto"
+        """Equal where a turn of either coordinate is as long as one of the other."""
+        return "equal" if len(set(self.length[:2].tolist())) == 1 else "auto"
 
 
 def frame_of(problem: Problem) -> Frame:
-    """The frame of ``problem``: that of a system has its middle in the middle, and its names and units."""
-    if isinstance(problem, System):
-        labels = tuple(c.label for c in problem.coordinates)
-        control = problem.controls[0].label if problem.control_dim == 1 else ""
-        return Frame(labels, problem.chart.centre, problem.chart.length, -0.5, 0.0, symbols=False, control=control)
+    """The frame of ``problem``: one in physical units begins where its coordinates do, and has their names and units."""
+    if (measures := problem.measures) is not None:
+        labels, chart = tuple(c.label for c in measures.coordinates), Chart(measures.coordinates)
+        control = measures.controls[0].label if problem.control_dim == 1 else ""
+        return Frame(labels, chart.centre, chart.length, chart.start, symbols=False, control=control)
     labels = ("x",) if problem.dim == 1 else tuple(f"$x_{i + 1}$" for i in range(problem.dim))
     one = torch.ones(problem.dim, dtype=torch.float64)
-    return Frame(labels, 0.0 * one, one)
+    return Frame(labels, 0.0 * one, one, 0.0 * one)
 
 
 def in_units(problem: Problem, control: Function) -> Function:
-    """A ``control`` ``(N, m)`` on the torus in the unit of a system's; as it is where there are several, of which a figure
+    """A ``control`` ``(N, m)`` on the torus in its unit where it has one; as it is where there are several, of which a figure
     shows the size, whose square is twice the price."""
-    if not isinstance(problem, System) or problem.control_dim > 1:
+    measures = problem.measures
+    if measures is None or problem.control_dim > 1:
         return control
-    return lambda x: None if (v := control(x)) is None else problem.from_controls(v)
+    return lambda x: None if (v := control(x)) is None else v / measures.scales[0]

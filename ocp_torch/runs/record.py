@@ -53,7 +53,7 @@ def record(problem: Problem, count: int, out: Path, seed: int, divergences: bool
     parts = [Samples.of(problem, part, divergences=divergences) for part in x.split(CHUNK)]
     numbers = {name: getattr(problem, name) for name in ("discount", "exponent", "control_limit")}
     density = None if contrast == 0.0 else _relative_density(x, contrast).prod(dim=-1)
-    recording.write(out, Samples.concatenate(parts), numbers, density)
+    recording.write(out, Samples.concatenate(parts), numbers, density, problem.measures)
     log.info("%s samples of d = %d, m = %d in %s", f"{count:,}", problem.dim, problem.control_dim, out)
     return out
 

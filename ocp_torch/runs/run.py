@@ -156,6 +156,7 @@ def summary(trainer: Trainer) -> str:
     used = ", ".join(f"{k} = {getattr(constants, k):.4g} ({constants.sources[k]})" for k in ("M", "C_V", "C_u"))
     lines = [
         f"{name}: d = {problem.dim}, m = {problem.control_dim}, rho = {problem.discount:g}, q = {problem.exponent:g}",
+        *([problem.measures.text] if problem.measures else []),
         f"{method}: {', '.join(trainer.objective.fields)}, {weights:,} weights, {settings.dtype} on {settings.torch_device}",
         f"{settings.steps:,} steps of {settings.batch} states, seed {trainer.seed}",
         *([f"going on from step {trainer.step:,}"] if trainer.step else []),

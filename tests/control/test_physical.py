@@ -1,5 +1,7 @@
 """A controller in physical units: what it is on the torus, in the units of the user, and after a file too."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -34,7 +36,7 @@ def test_it_is_the_control_on_the_torus_in_physical_units(make, tmp_path):
     torch.testing.assert_close(u, problem.from_controls(v))
     assert u.std() > 1e-4
     # What it costs is the price on the torus: half of sum_i r_i u_i^2.
-    roots = torch.tensor([c["scale"] for c in problem.units["controls"]], dtype=torch.float64)
+    roots = torch.tensor([c["scale"] for c in problem.measures.plain["controls"]], dtype=torch.float64)
     torch.testing.assert_close(0.5 * (roots.square() * u.square()).sum(-1), problem.control_cost.cost(v))
     assert np.array_equal(controller.physical(s.numpy()), u.numpy())
 
@@ -66,11 +68,8 @@ def test_a_file_is_loaded_with_the_units_of_its_run_alone(tmp_path):
     class Wider(Cart):
         def __init__(self):
             super().__init__(noisy=False)
-            self.coordinates = (
-                self.coordinates[0],
-                self.coordinates[1],
-                type(self.coordinates[0])("spin", -4.0, 8.0, "rad/s"),
-            )
+            spin = type(self.coordinates[0])("spin", -4.0, 8.0, "rad/s")
+            self.measures = replace(self.measures, coordinates=(*self.coordinates[:2], spin))
 
     Wider.__name__ = "Cart"
     with pytest.raises(InputError, match=r"problem.coordinates is .* but the run of .* has"):

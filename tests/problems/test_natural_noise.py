@@ -36,6 +36,7 @@ NOISY = {
     "robot": RobotArm(joint_noise=0.1),
     "dubins": Dubins(heading_noise=0.3, position_noise=0.05),
     "unicycle": Unicycle(heading_noise=0.3),
+    "unicycle in a room": Unicycle(walls=True, heading_noise=0.3, position_noise=0.05, noise=0.001),
     "kuramoto": Kuramoto(phase_noise=0.3),
     "kuramoto absolute": Kuramoto(relative=False, phase_noise=[0.0, 0.1, 0.2]),
     "neurons": PhaseNeurons(phase_noise=[0.3, 0.0]),

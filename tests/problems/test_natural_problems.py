@@ -32,6 +32,7 @@ from ocp_torch.problems import (
 )
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.systems.rest import occupation_bound_at_rest, optimal_contraction
+from ocp_torch.runs.metrics.measures import measure, simulate
 from ocp_torch.runs.metrics.trial import metrics
 from ocp_torch.studies.reference.reference import solve_reference
 from support import zoo
@@ -153,7 +154,7 @@ def test_the_arm_ends_where_a_sum_of_complex_numbers_does():
         for length, angle in zip(arm.lengths, angles, strict=True):
             total += angle
             end += cmath.rect(length, total)
-        found = arm.end_effector(arm.to_torus(torch.tensor([angles], dtype=torch.float64)))[0]
+        found = arm.end_effector(torch.tensor([angles], dtype=torch.float64))[0]
         assert complex(*found.tolist()) == pytest.approx(end, abs=1e-12)
 
 
@@ -176,7 +177,7 @@ def test_the_arms_cost_is_its_formula_point_by_point():
 def test_the_gap_to_an_obstacle_is_that_of_many_points_on_the_links():
     arm = Arm(dim=3, obstacles=[[0.5, 0.1, 0.1], [-0.3, 0.3, 0.2]])
     x = zoo.states(arm, 100, seed=3)
-    joints = arm.joints(x)
+    joints = arm.joints(arm.from_torus(x))
     s = torch.linspace(0.0, 1.0, 2001, dtype=torch.float64).reshape(-1, 1)
     points = torch.cat([joints[:, i : i + 1] + s * (joints[:, i + 1] - joints[:, i]).unsqueeze(1) for i in range(3)], 1)
     near = [(points - torch.tensor(o[:2])).norm(dim=-1).amin(dim=1) - o[2] for o in arm.obstacles]
@@ -195,7 +196,7 @@ def test_an_arm_without_obstacles_is_the_same_after_a_turn_of_everything():
 def test_a_unicycle_does_not_slide_sideways_and_goes_as_fast_as_it_says():
     unicycle = Unicycle(size=5.0, speed=2.0, turn_rate=0.5)
     x, u = zoo.states(unicycle, 100), torch.randn(100, 2, generator=generator(0), dtype=torch.float64)
-    velocity, ahead = unicycle.velocity(x, u), unicycle.heading(x)
+    velocity, ahead = unicycle.velocity(x, u), unicycle.heading(unicycle.from_torus(x))
     metres = 5.0 * velocity[:, :2]
     torch.testing.assert_close(metres, 2.0 * u[:, :1] * ahead, **ROUNDING)
     torch.testing.assert_close(velocity[:, 2], 0.5 * u[:, 1], **ROUNDING)
@@ -213,7 +214,7 @@ def test_dubins_goes_straight_without_control_and_in_a_circle_under_a_constant_o
         wrap=False,
     )[1]
     straight = 4.0 * (run(0.0, 3.0) - x0)[:, :2]
-    torch.testing.assert_close(straight, 3.0 * dubins.heading(x0), **ROUNDING)
+    torch.testing.assert_close(straight, 3.0 * dubins.heading(dubins.from_torus(x0)), **ROUNDING)
     # u = 1 is a quarter turn a second: closed after four.
     torch.testing.assert_close(run(1.0, 4.0) - x0, torch.tensor([[0.0, 0.0, 1.0]] * 20).double(), rtol=0.0, atol=1e-8)
 
@@ -223,6 +224,30 @@ def test_a_vehicles_cost_is_the_square_distance_near_the_target():
     near = unicycle.to_torus(torch.tensor([[2.01, 2.02, 0.3]], dtype=torch.float64))
     assert float(unicycle.state_cost(near)) == pytest.approx(3.0 * (0.01**2 + 0.02**2), rel=1e-3)
     assert float(unicycle.distance(near)) == pytest.approx(math.hypot(0.01, 0.02), rel=1e-9)
+
+
+def test_a_room_is_the_plane_up_to_its_walls_and_as_far_across_as_it_is():
+    plane, room = Unicycle(obstacles=[], target=[3.5, 2.0]), Unicycle(obstacles=[], target=[3.5, 2.0], walls=True)
+    s = torch.rand(100, 3, generator=generator(0), dtype=torch.float64) * torch.tensor([4.0, 4.0, TURN])
+    u = torch.randn(100, 2, generator=generator(1), dtype=torch.float64)
+    rates = [p.velocity(p.to_torus(s), u) * p.chart.length for p in (plane, room)]
+    torch.testing.assert_close(*rates)
+    near = torch.tensor([[3.49, 2.02, 1.0], [0.5, 2.0, 1.0]], dtype=torch.float64)
+    assert plane.distance(plane.to_torus(near)).tolist() == pytest.approx([math.hypot(0.01, 0.02), 1.0])
+    assert room.distance(room.to_torus(near)).tolist() == pytest.approx([math.hypot(0.01, 0.02), 3.0])
+    assert room.state_cost(room.to_torus(near)).tolist() == pytest.approx([0.01**2 + 0.02**2, 9.0])
+
+
+def test_a_vehicle_that_drives_into_a_wall_stops_there_and_pays_for_the_failure_for_ever():
+    """By default as much as the farthest corner, 2 m from the target both ways."""
+    dubins = Dubins(walls=True)
+    s = torch.tensor([[3.0, 2.0, 0.1], [1.0, 1.0, -2.0]], dtype=torch.float64)
+    path = simulate(dubins, lambda x: torch.zeros_like(x[:, :1]), dubins.to_torus(s), 20.0, 200)
+    end = path.states[-1]
+    assert bool(dubins.outside(end).all())
+    torch.testing.assert_close(dubins.state_cost(end), torch.full((2,), 8.0).double(), rtol=0.02, atol=0.0)
+    assert measure(dubins, path)["left"] == 1.0
+    assert float(dubins.initial_density(end).max()) == 0.0
 
 
 # Oscillators.
@@ -435,6 +460,9 @@ BAD = [
     (Unicycle, dict(size=-1.0), "problem.size"),
     (Unicycle, dict(target=[1.0, math.nan]), r"problem.target\[1\]"),
     (Dubins, dict(turn_rate="fast"), "problem.turn_rate"),
+    (Dubins, dict(failure_cost=5.0), "problem.failure_cost is 5, but nothing fails without problem.walls=true"),
+    (Unicycle, dict(walls=True, target=[5.0, 2.0]), "problem.target is .* in the room, from 0 to 4 m"),
+    (Unicycle, dict(walls="yes"), "problem.walls"),
     (Pendulum, dict(seam=8.0), "problem.seam is 8, but must be above problem.max_speed"),
     (Pendulum, dict(mass=0), "problem.mass"),
     (CartPole, dict(pole_mass=0.0), "problem.pole_mass is 0, but must be above 0"),

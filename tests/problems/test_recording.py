@@ -22,7 +22,7 @@ from ocp_torch.control.policies import NETWORK, trained_policies
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.objectives import Dual, primal, saddle
-from ocp_torch.problems import Circle, Dataset, Manufactured
+from ocp_torch.problems import Circle, Dataset, Manufactured, PhaseNeurons, Unicycle
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.recorded import recording
@@ -31,6 +31,8 @@ from ocp_torch.runs import record as recording_command
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.evaluate import certify_saved, load_run
 from ocp_torch.runs.external import certify as certify_given
+from ocp_torch.runs.figures import draw
+from ocp_torch.runs.frame import frame_of, in_units
 from ocp_torch.training.checkpoint import load_checkpoint
 from ocp_torch.training.monitor import Silent
 from support import zoo
@@ -80,6 +82,62 @@ def test_a_limit_for_each_control_is_recorded_and_one_for_fewer_or_more_refused(
         recording.write(path, samples, {"discount": 2.0, "control_limit": wrong})
         with pytest.raises(InputError, match=r"control_limit has shape \(.*must be one finite number, or one for each"):
             recording.read(path)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
+def test_names_and_units_are_recorded_and_stand_on_the_axes(tmp_path, suffix):
+    for problem in (Unicycle(walls=True), PhaseNeurons(strength=2.0)):
+        data = Dataset(str(record(tmp_path, problem, 300, f"a{suffix}")))
+        assert data.measures == problem.measures
+        mine, theirs = frame_of(data), frame_of(problem)
+        assert (mine.labels, mine.extent, mine.control) == (theirs.labels, theirs.extent, theirs.control)
+    control = in_units(data, lambda x: torch.ones(3, 1))
+    assert control(None).tolist() == [[2.0]] * 3
+    assert Dataset(str(record(tmp_path, Circle(), 300, f"b{suffix}"))).measures is None
+
+
+def test_a_strangers_names_are_no_formulas_in_a_figure(tmp_path):
+    path = record(tmp_path, Circle(), 300)
+    units = {"coordinates": [{"name": "$\\frac{"}], "controls": [{"name": "$\\over$ }"}]}
+    np.savez(path, **arrays_of(path), units=np.frombuffer(json.dumps(units).encode(), np.uint8))
+    fields = Fields({"value": PeriodicMLP(dim=1, width=8, depth=2, modes=2)})
+    data = Dataset(str(path))
+    for figure in draw(data, fields, resolve_constants(data, occupation_bound=2.0), None).values():
+        figure.canvas.draw()
+        assert figure.axes[0].get_xlabel() == "$\\frac{ [rad]"
+
+
+GOOD = {"coordinates": [{"name": "a"}, {"name": "b", "low": 0, "high": 2, "unit": "m"}], "controls": [{"name": "F"}]}
+UNREADABLE = {
+    "no text": [300.0] * 40,
+    "no JSON": b"{'a': 1",
+    "no UTF-8": b"\xff\xfe{}",
+    "a list": b"[]",
+    "endless": b" " * (recording.MOST_UNITS + 1),
+    "deep": b'{"a":' * 2000 + b"1" + b"}" * 2000,
+    "too few": {**GOOD, "coordinates": GOOD["coordinates"][:1]},
+    "words": {**GOOD, "controls": ["F", "G"]},
+    "the same name": {**GOOD, "controls": [{"name": "F"}, {"name": "F"}]},
+    "a long name": {**GOOD, "controls": [{"name": "F" * 99}, {"name": "G"}]},
+    "a name for a terminal": {**GOOD, "controls": [{"name": "\x1b[2J"}, {"name": "G"}]},
+    "no name": {**GOOD, "controls": [{"unit": "N"}, {"name": "G"}]},
+    "an unknown unit": {**GOOD, "controls": [{"name": "F", "unit": "parsecs"}, {"name": "G"}]},
+    "a scale of 0": {**GOOD, "controls": [{"name": "F", "scale": 0}, {"name": "G"}]},
+    "swapped": {**GOOD, "coordinates": [{"name": "a"}, {"name": "b", "low": 2, "high": 0}]},
+    "no low": {**GOOD, "coordinates": [{"name": "a"}, {"name": "b", "high": 0}]},
+    "a period of words": {**GOOD, "coordinates": [{"name": "a", "period": "long"}, {"name": "b"}]},
+}
+
+
+def test_strange_names_and_units_are_left_out_with_a_sentence(tmp_path, plain):
+    base = arrays_of(plain)
+    for name, units in {"good": {**GOOD, "controls": [{"name": "F"}, {"name": "G"}]}, **UNREADABLE}.items():
+        text = json.dumps(units).encode() if isinstance(units, dict) else units
+        as_array = np.frombuffer(text, np.uint8) if isinstance(text, bytes) else np.array(text)
+        np.savez(tmp_path / "a.npz", **base, units=as_array)
+        found = recording.read(tmp_path / "a.npz")
+        assert (found.measures is None, len(found.notes)) == ((name != "good"),) * 2, name
+        assert all(note.isprintable() and len(note) < 300 and note.endswith("left out.") for note in found.notes), name
 
 
 def arrays_of(path) -> dict[str, np.ndarray]:

@@ -265,6 +265,19 @@ def test_units_people_write_are_read(unit):
     assert Interval("v", 0, 1, unit).unit == unit
 
 
+def test_weight_and_limit_may_be_of_controls_in_units_of_nominal_ones():
+    """Two engines that cost 1/q at 5 N and at 0.2 N, and push the one five times that, together."""
+    q, nominal = 1.5, [5.0, 0.2]
+    arms = [Angle("a"), Angle("b")]
+    named = System(arms, ["u [N]", "v [N]"], exponent=q, control_limit=1.2, control_weight=2.0, nominal_control=nominal)
+    u = torch.tensor([[3.0, 0.1]], dtype=torch.float64)
+    parts = u / torch.tensor(nominal).double()
+    v = named.to_controls(u)
+    torch.testing.assert_close(named.control_cost.cost(v), 2.0 * parts.norm(dim=-1) ** q / q)
+    torch.testing.assert_close(named.from_controls(v), u)
+    assert named.control_limit == pytest.approx(1.2 * 2.0 ** (1.0 / q))
+
+
 def test_a_limit_and_a_weight_are_in_the_unit_of_the_control():
     system = Swing(control_limit=2.0)
     assert system.control_limit == pytest.approx(1.0)

@@ -75,6 +75,10 @@ MISTAKES = {
         dict(cost=lambda self, s: s[:, 0] + torch.ones(3, 4)),
         r"cost of my_module.Mistaken raised RuntimeError: .* at states of shape \(7, 2\)",
     ),
+    "divergences": (
+        dict(divergences=lambda self, s: (s[:, 0], torch.zeros_like(s[:, :1]))),
+        r"drift_divergence of my_module.Mistaken is \S+ at pole = .*, but by differences of drift it is 0",
+    ),
     "random": (
         dict(cost=lambda self, s: torch.rand(len(s), dtype=s.dtype)),
         "cost of my_module.Mistaken is no function of the state alone",

@@ -7,7 +7,7 @@ import torch
 
 from ocp_torch import load_controller
 from ocp_torch.certificate.report import table
-from ocp_torch.problems import Circle, Pendulum
+from ocp_torch.problems import Circle, Pendulum, Unicycle
 from ocp_torch.runs.figures import draw
 from ocp_torch.runs.frame import frame_of
 from ocp_torch.runs.metrics.trial import metrics, random_starts
@@ -57,7 +57,7 @@ def test_its_figures_have_names_and_units_on_their_axes(run):
     assert (moving.axes[0].get_xlabel(), moving.axes[0].get_ylabel()) == ("angle [rad]", "velocity [rad/s]")
 
 
-@pytest.mark.parametrize("problem", [Swing(), Conveyor(), Pendulum(), Circle()])
+@pytest.mark.parametrize("problem", [Swing(), Conveyor(), Pendulum(), Circle(), Unicycle()])
 def test_a_frame_maps_what_is_drawn_to_its_place(problem):
     """States are drawn where they are: in the middle of a system's frame is its centre."""
     frame = frame_of(problem)

@@ -21,12 +21,15 @@ def smooth_step(z: Tensor) -> Tensor:
 
 
 class Chart(Placed):
-    """`x_i = (s_i - centre_i) / length_i` mod 1, of ``coordinates``; an interval's seam is at `x_i = 1/2`."""
+    """`x_i = (s_i - centre_i) / length_i` mod 1, of ``coordinates``; an interval's seam is at `x_i = 1/2`. States are shown
+    from ``start``, in turns, on."""
 
     def __init__(self, coordinates: tuple[Coordinate, ...]) -> None:
         self.coordinates = coordinates
-        column = lambda name: torch.tensor([getattr(c, name) for c in coordinates], dtype=torch.float64)
+        column = lambda name: torch.tensor([getattr(c, name) or 0.0 for c in coordinates], dtype=torch.float64)
         self.centre, self.length = column("centre"), column("length")
+        halves = [isinstance(c, Interval) or c.low is None for c in coordinates]
+        self.start = torch.where(torch.tensor(halves), -0.5, column("low") / self.length)
         boxed = [(i, c) for i, c in enumerate(coordinates) if isinstance(c, Interval)]
         self.boxed = [i for i, _ in boxed]
         self.volume = float(self.length.prod())
@@ -34,8 +37,9 @@ class Chart(Placed):
         self._seam = torch.tensor([c.seam for _, c in boxed], dtype=torch.float64)
 
     def from_torus(self, x: Tensor) -> Tensor:
-        """States ``(N, d)`` in physical units: angles within half a period of 0, intervals up to their seams."""
-        turns = (x + 0.5).remainder(1.0) - 0.5
+        """States ``(N, d)`` in physical units: angles from their low end on, intervals up to their seams."""
+        start = self._like(x, "start", self.start)
+        turns = (x - start).remainder(1.0) + start
         return self._like(x, "centre", self.centre) + turns * self.lengths(x)
 
     def to_torus(self, s: Tensor) -> Tensor:

@@ -14,12 +14,14 @@ MARGIN = 0.125
 class Angle:
     """A coordinate of period ``period``, by default a full turn in its ``unit``: an angle, a phase, a place on a ring.
 
-    Its values are in `[-period / 2, period / 2)`. Raises `InputError` for an unknown unit, or a period it has no sense with.
+    Its values are in `[low, low + period)`, by default within half a period of 0, which is at 0 on the torus. Raises
+    `InputError` for an unknown unit, or a period it has no sense with.
     """
 
     name: str
     period: float | None = None
     unit: str = "rad"
+    low: float | None = None
 
     def __post_init__(self) -> None:
         _require_name("coordinate", self.name)
@@ -28,6 +30,8 @@ class Angle:
             raise InputError(f"the period of {self.name} is missing; give it, in {self.unit or 'its unit'}.")
         period = TURNS[self.unit] if self.period is None else self.period
         object.__setattr__(self, "period", require_number(f"the period of {self.name}", period, above=0.0))
+        if self.low is not None:
+            object.__setattr__(self, "low", require_number(f"the low end of {self.name}", self.low))
 
     @property
     def label(self) -> str:

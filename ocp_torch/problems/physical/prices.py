@@ -7,11 +7,14 @@ from ocp_torch.errors import InputError, require_number, require_numbers
 from ocp_torch.problems.constant_noise import one_or_each
 
 
+def positive_each(name: str, value: object, count: int) -> list[float]:
+    """``value`` of the field ``name``, one number above 0 or ``count`` of them, as a list."""
+    return [require_number(name, one, above=0.0) for one in one_or_each(name, value, count)]
+
+
 def weight_roots(weight: object, count: int, exponent: float) -> list[float]:
     """`r_i^{1/q}` of each control."""
-    each = one_or_each("problem.control_weight", weight, count)
-    for value in each:
-        require_number("problem.control_weight", value, above=0.0)
+    each = positive_each("problem.control_weight", weight, count)
     if exponent != 2.0 and min(each) != max(each):
         raise InputError(
             f"problem.control_weight is {weight}, but must be the same for all controls with problem.exponent = "

@@ -1,7 +1,6 @@
 r"""A problem in physical units: what a user writes in radians, metres and newtons, made a problem on the torus."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from functools import cached_property
 
 import torch
@@ -12,15 +11,16 @@ from ocp_torch.maths import jets
 from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.problems.physical.chart import Chart
 from ocp_torch.problems.physical.coordinates import Control, Coordinate, require_controls, require_coordinates
-from ocp_torch.problems.physical.prices import scaled_limit, weight_roots
+from ocp_torch.problems.physical.disturbed import Disturbed
+from ocp_torch.problems.physical.measures import Measures
+from ocp_torch.problems.physical.prices import positive_each, scaled_limit, weight_roots
 from ocp_torch.problems.physical.start import Density, Start, start_density
-from ocp_torch.problems.problem import Problem
 
 # States at which the largest cost in the box is sought.
 COSTED = 2**14
 
 
-class System(Problem):
+class System(Disturbed):
     r"""Base class: override `cost` and `dynamics`, and where there is noise `disturbance`, all in physical units.
 
     minimise  rho E int e^{-rho t} (cost(s_t) + sum_i r_i u_i^2 / 2) dt,   ds = (a(s) + B(s) u) dt + sigma(s) dW
@@ -36,12 +36,15 @@ class System(Problem):
 
     ``discount`` is `rho` per unit of time, ``exponent`` `q` (the price is `sum_i r_i |u_i|^q / q` where all weights are the
     same, as they must be for `q < 2`), ``control_weight`` `r > 0` or one for each control, ``control_limit`` a limit on `|u|`
-    (which needs equal weights) or a list of one for each `|u_i|`; ``start`` as in `start_density`, by default all of the
-    box; ``noise`` that of `Problem`, in units of the torus, which does cross seams. Raises `InputError` for wrong ones.
+    (which needs equal weights) or a list of one for each `|u_i|`; with ``nominal_control``, one or one for each, both are of
+    the `u_i` in those units. ``start`` is as in `start_density`, by default all of the box; ``noise`` that of `Problem`, in
+    units of the torus, which does cross seams. Raises `InputError` for wrong ones.
     """
 
     # The attribute of that name is a limit of `v`, not what was given.
     not_arguments = ("control_limit",)
+    # Whether neither `a` nor a column of `B` has a divergence, in physical units.
+    divergence_free = False
 
     def __init__(
         self,
@@ -54,17 +57,21 @@ class System(Problem):
         start: Start = None,
         noise: float | Sequence[float] = 0.0,
         failure_cost: float | None = None,
+        nominal_control: float | Sequence[float] = 1.0,
     ) -> None:
         self.coordinates, self.controls = require_coordinates(coordinates), require_controls(controls)
         q = require_number("problem.exponent", exponent, above=1.0, at_most=2.0)
         roots = weight_roots(control_weight, len(self.controls), q)
+        nominal = positive_each("problem.nominal_control", nominal_control, len(roots))
         limit = scaled_limit(control_limit, roots)
         super().__init__(len(self.coordinates), len(self.controls), discount, q, limit, noise)
         self.chart = Chart(self.coordinates)
         self.start = start
         # A function of the user's own may need what a subclass has yet to set.
         self._density: Density | None = None if callable(start) else start_density(self.chart, start)
-        self._roots = torch.tensor(roots, dtype=torch.float64)
+        self._roots = torch.tensor(roots, dtype=torch.float64) / torch.tensor(nominal, dtype=torch.float64)
+        self.measures = Measures(self.coordinates, self.controls, tuple(self._roots.tolist()))
+        self._factor = 1.0 / (self.chart.length.unsqueeze(-1) * self._roots)
         if failure_cost is not None:
             require_number("problem.failure_cost", failure_cost, at_least=0.0)
         self.failure_cost = failure_cost
@@ -77,9 +84,10 @@ class System(Problem):
         """`a` ``(N, d)``, in units of coordinates per unit of time, and `B` ``(N, d, m)``, the same per unit of control."""
         raise InputError(f"{type(self).__name__} must define dynamics(s), which gives a and B.")
 
-    def disturbance(self, s: Tensor) -> Tensor | None:
-        """`sigma`, ``(N, d, k)``, units of the coordinates per square root of the unit of time; `None` for no noise."""
-        return None
+    def divergences(self, s: Tensor) -> tuple[Tensor, Tensor] | None:
+        """`div a` ``(N,)`` and that of each column of `B` ``(N, m)``, of `dynamics`; `None` leaves them to autograd. For
+        those that know them, which is faster."""
+        return (torch.zeros_like(s[:, 0]), s.new_zeros(len(s), self.control_dim)) if self.divergence_free else None
 
     def to_torus(self, s: Tensor) -> Tensor:
         """Physical states ``(N, d)`` as states of the torus; raises `InputError` for one beyond a seam."""
@@ -97,15 +105,10 @@ class System(Problem):
         """Controls ``(N, m)`` of the torus problem in their units."""
         return v / self._like(v, "roots", self._roots)
 
-    @property
-    def units(self) -> dict:
-        """What states and controls are measured in, as JSON can hold it: ``scale`` is `v_i / u_i`."""
-        scales = self._roots.tolist()
-        controls = [{**asdict(c), "scale": scale} for c, scale in zip(self.controls, scales, strict=True)]
-        return {"coordinates": [asdict(c) for c in self.coordinates], "controls": controls}
-
     def state_cost(self, x: Tensor) -> Tensor:
-        s = self.from_torus(x)
+        s = self._places(x)
+        if not self.chart.boxed:
+            return self.cost(s)
         chi = self.chart.cut(s)
         return chi * self.cost(s) + (1.0 - chi) * self._failure
 
@@ -117,30 +120,44 @@ class System(Problem):
 
     def _moved(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """`a` ``(N, d)`` and `B` ``(N, d, m)`` on the torus."""
-        s = self.from_torus(x)
-        a, B = self.dynamics(s)
-        rate = self._rate(s)
-        return rate * a, rate.unsqueeze(-1) * B / self._like(x, "roots", self._roots)
+        s = self._places(x)
+        return self._scaled(*self.dynamics(s), self.chart.cut(s) if self.chart.boxed else None)
 
-    def _rate(self, s: Tensor) -> Tensor:
-        """`chi` over the lengths of the coordinates, ``(N, d)``."""
-        return self.chart.cut(s).unsqueeze(-1) / self.chart.lengths(s)
+    def _scaled(self, a: Tensor, B: Tensor, chi: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Those of `dynamics` on the torus, times `chi` ``(N,)`` where there is a box."""
+        lengths, factor = self.chart.lengths(a), self._like(a, "factor", self._factor)
+        if chi is not None:
+            chi = chi.unsqueeze(-1)
+            return chi / lengths * a, chi.unsqueeze(-1) * factor * B
+        # One matrix for all states stays one.
+        return a / lengths, (B[:1] * factor).expand(B.shape) if B.stride(0) == 0 else B * factor
+
+    def _places(self, x: Tensor) -> Tensor:
+        """`from_torus`, but for whole turns where there are only angles: functions of them are periodic."""
+        return self.from_torus(x) if self.chart.boxed else x * self.chart.lengths(x)
 
     def vector_fields(self, x: Tensor, divergences: bool = True) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
-        """From one evaluation of `dynamics`, and for the divergences a reverse pass through it for each entry that varies:
-        the lengths cancel in `d(chi a_i / length_i) / dx_i = d(chi a_i) / ds_i`, and `grad chi` is known."""
+        """From one evaluation of `dynamics`, and for divergences nobody knows a reverse pass through it for each entry that
+        varies: the lengths cancel in `d(chi a_i / length_i) / dx_i = d(chi a_i) / ds_i`, and `grad chi` is known."""
         if not divergences:
             return *self._moved(x), None, None
-        at = self.from_torus(x).detach().requires_grad_(True)
+        s, chi = self._places(x).detach(), None
+        known = self.divergences(s)
+        a, B, div_a, div_B = self._differentiated(s) if known is None else (*self.dynamics(s), *known)
+        if self.chart.boxed:
+            chi, slope = self.chart.cut_with_slope(s)
+            div_a = chi * div_a + (slope * a).sum(dim=-1)
+            div_B = chi.unsqueeze(-1) * div_B + torch.einsum("nd,ndm->nm", slope, B.expand(len(s), -1, -1))
+        return *self._scaled(a, B, chi), div_a, div_B / self._like(x, "roots", self._roots)
+
+    def _differentiated(self, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """`dynamics` and its divergences, by autograd."""
+        at = s.requires_grad_(True)
         with torch.enable_grad():
             a, B = self.dynamics(at)
             div_a, div_B = jets.column_divergences(a.unsqueeze(-1), at).squeeze(-1), jets.column_divergences(B, at)
-        s, a, B = at.detach(), a.detach(), B.detach()
-        chi, slope = self.chart.cut_with_slope(s)
-        div_a = chi * div_a + (slope * a).sum(dim=-1)
-        div_B = chi.unsqueeze(-1) * div_B + torch.einsum("nd,ndm->nm", slope, B.expand(len(s), -1, -1))
-        roots, rate = self._like(x, "roots", self._roots), chi.unsqueeze(-1) / self.chart.lengths(s)
-        return rate * a, rate.unsqueeze(-1) * B / roots, div_a, div_B / roots
+        s.requires_grad_(False)
+        return a.detach(), B.detach(), div_a, div_B
 
     def drift_divergence(self, x: Tensor) -> Tensor | None:
         return self.vector_fields(x)[2]
@@ -152,27 +169,9 @@ class System(Problem):
         a, B = self._moved(x)
         return a + torch.einsum("ndm,nm->nd", B, u)
 
-    def noise(self, x: Tensor) -> Tensor | None:
-        even, s = super().noise(x), self.from_torus(x)
-        sigma = self.disturbance(s)
-        if sigma is None:
-            return even
-        sigma = self._rate(s).unsqueeze(-1) * sigma
-        return sigma if even is None else torch.cat([even, sigma], dim=-1)
-
-    def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Of `D_ij = chi^2 E_ij / (length_i length_j)` with `E = sigma sigma^T / 2` of `disturbance`, by the product rule."""
-        s = self.from_torus(x)
-        sigma = self.disturbance(s)
-        if sigma is None:
-            return torch.zeros_like(x), torch.zeros_like(x[:, 0])
-        div_E, div_div_E = jets.diffusion_divergences(self.disturbance, s)
-        square = jets.jet(lambda at: self.chart.cut(at).square(), s, sigma)
-        along = 0.5 * (sigma @ torch.einsum("ndk,nd->nk", sigma, square.gradient).unsqueeze(-1)).squeeze(-1)
-        div_div_D = square.curvature + 2.0 * (square.gradient * div_E).sum(dim=-1) + square.value * div_div_E
-        return (along + square.value.unsqueeze(-1) * div_E) / self.chart.lengths(s), div_div_D
-
     def initial_density(self, x: Tensor) -> Tensor:
+        if self.start is None and not self.chart.boxed:
+            return super().initial_density(x)
         if self._density is None:
             self._density = start_density(self.chart, self.start)
         return self._density(self.from_torus(x)) * self.chart.volume

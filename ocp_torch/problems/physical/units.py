@@ -10,7 +10,8 @@ OTHERS = "deg turn rev rpm min h d kg degC % 1".split()
 PREFIXES = ("", *"n u m c d k M G".split())
 SYMBOLS = {prefix + unit for prefix in PREFIXES for unit in SI} | set(OTHERS)
 # Full turns, by the unit of an angle.
-TURNS = {"rad": 6.283185307179586, "deg": 360.0, "turn": 1.0, "rev": 1.0}
+TURN = 6.283185307179586
+TURNS = {"rad": TURN, "deg": 360.0, "turn": 1.0, "rev": 1.0}
 WRITTEN = str.maketrans({"²": "2", "³": "3", "·": " ", "*": " ", "Ω": "Ohm", "µ": "u", "μ": "u", "°": "deg"})
 
 

@@ -83,7 +83,7 @@ class Dataset(Problem):
         if self._B is not None and self._B.shape != (self.dim, self.control_dim):
             raise InputError(f"problem.constant_matrix has shape {tuple(self._B.shape)}, but must be (d, m).")
         if self._recording is not None:
-            self._split(self._recording.samples)
+            self._split(self._recording)
 
     @property
     def parameters(self) -> dict:
@@ -96,12 +96,13 @@ class Dataset(Problem):
             found = read(self.path, self.wrap)
             if (sizes := tuple(found.samples.B.shape[1:])) != (self.dim, self.control_dim):
                 raise InputError(f"{self.path} is of d, m = {sizes}, not {(self.dim, self.control_dim)}.")
-            self._split(found.samples)
+            self._split(found)
             self._recording = found
         return self._recording
 
-    def _split(self, samples: Samples) -> None:
-        """The three parts."""
+    def _split(self, found: Recording) -> None:
+        """The three parts, and what the file says of units."""
+        samples, self.measures = found.samples, found.measures
         # The largest cost among the samples, with head-room: an estimate, and the certificate calls it one.
         self.state_cost_bound = MARGIN * float(samples.f.max())
         samples = completed(samples)

@@ -4,10 +4,12 @@ Arrays: ``x (N, d)`` in `[0, 1)`, ``f (N,)``, ``a (N, d)``, ``B (N, d, m)``; opt
 ``mu0 (N,)``, and ``density (N,)``, that of the distribution ``x`` was drawn from (uniform where it is left out). Where there
 is noise ``noise (N, d, k)``, `sigma`, and optionally ``div_D (N, d)`` and ``div_div_D (N,)`` of `D = sigma sigma^T / 2`; they
 are 0 where `sigma` is the same at all samples. Optionally the numbers ``discount``, ``exponent`` and ``control_limit``
-(one, or one for each control). Samples must be independent draws.
+(one, or one for each control); and ``units``, the bytes of a text, `Measures.plain` as JSON: names and units of coordinates
+and controls. Samples must be independent draws.
 """
 
 import hashlib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,33 +19,39 @@ import torch
 from safetensors.numpy import save_file
 from torch import Tensor
 
-from ocp_torch.errors import InputError, nearest
+from ocp_torch.errors import InputError, nearest, visible
 from ocp_torch.files.arrays import read_npz
+from ocp_torch.files.plain import NotPlain, json_object
 from ocp_torch.files.reading import kind
 from ocp_torch.files.storage import read_safetensors, write_atomically
+from ocp_torch.problems.physical.measures import Measures
 from ocp_torch.problems.recorded.plausible import dependence_notes, samples_of
 from ocp_torch.problems.samples import Samples
 
 REQUIRED = {"x": "Nd", "f": "N", "a": "Nd", "B": "Ndm"}
 OPTIONAL = {"div_a": "N", "div_B": "Nm", "mu0": "N", "density": "N", "noise": "Ndk", "div_D": "Nd", "div_div_D": "N"}
 NUMBERS = ("discount", "exponent", "control_limit")
-KNOWN = (*REQUIRED, *OPTIONAL, *NUMBERS)
+UNITS = "units"
+KNOWN = (*REQUIRED, *OPTIONAL, *NUMBERS, UNITS)
 SUFFIXES = (".npz", ".safetensors")
 # Fewer samples say too little of their own distribution for it to be checked.
 FEWEST = 100
 # What is read into memory at most, unpacked.
 MOST_BYTES = 2**33
+# Bytes of names and units: some two hundred for each of the most coordinates and controls there may be.
+MOST_UNITS = 2**19
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Samples in float64, weighted by one over the density of their law; the numbers of the file; its SHA-256; and what a
-    user should be told of it."""
+    """Samples in float64, weighted by one over the density of their law; the numbers of the file; its SHA-256; what a user
+    should be told of it; and names and units, where it has some."""
 
     samples: Samples
     numbers: dict[str, Any]  # each a float, but a limit for each control is a list
     digest: str
     notes: tuple[str, ...] = ()
+    measures: Measures | None = None
 
 
 def read(path: str | Path, wrap: bool = False) -> Recording:
@@ -72,6 +80,7 @@ def read(path: str | Path, wrap: bool = False) -> Recording:
             wanted = "one finite number" + (", or one for each control" if name == "control_limit" else "")
             raise InputError(f"{path}: {name} has shape {number.shape}, but must be {wanted}.")
         numbers[name] = float(number.reshape(())) if number.size == 1 else number.tolist()
+    units = arrays.pop(UNITS, None)
     _require_shapes(path, arrays)
     for name, array in arrays.items():
         bad = ~np.isfinite(array).reshape(len(array), -1).all(axis=1)
@@ -82,10 +91,29 @@ def read(path: str | Path, wrap: bool = False) -> Recording:
     for name in sorted(arrays):
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(arrays[name]).data)
-    return Recording(samples, numbers, digest.hexdigest(), dependence_notes(path, samples))
+    measures, notes = (None, ()) if units is None else _measures(path, units, *samples.B.shape[1:])
+    return Recording(samples, numbers, digest.hexdigest(), dependence_notes(path, samples) + notes, measures)
 
 
-def write(path: str | Path, samples: Samples, numbers: dict[str, Any], density: Tensor | None = None) -> None:
+def _measures(path: Path, units: np.ndarray, dim: int, control_dim: int) -> tuple[Measures | None, tuple[str, ...]]:
+    """Names and units as they were written; or none, as they are but labels, and what is wrong with them."""
+    try:
+        if units.ndim != 1 or units.size > MOST_UNITS or not ((units >= 0) & (units < 256)).all():
+            raise NotPlain("it is no text")
+        return Measures.of(json_object(units.astype(np.uint8).tobytes().decode()), dim, control_dim), ()
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        return None, (
+            f"names and units of {path.name} cannot be read ({visible(error, 200).rstrip('.')}), and are left out.",
+        )
+
+
+def write(
+    path: str | Path,
+    samples: Samples,
+    numbers: dict[str, Any],
+    density: Tensor | None = None,
+    measures: Measures | None = None,
+) -> None:
     """Write ``samples`` for `read`; ``density`` ``(N,)`` is that of the distribution of ``x``, uniform if `None`."""
     path = Path(path)
     if path.suffix not in SUFFIXES:
@@ -94,6 +122,8 @@ def write(path: str | Path, samples: Samples, numbers: dict[str, Any], density: 
     columns["density"] = density
     arrays = {k: np.ascontiguousarray(v.detach().cpu().numpy()) for k, v in columns.items() if v is not None}
     arrays |= {k: np.asarray(v, dtype=np.float64) for k, v in numbers.items() if v is not None}
+    if measures is not None:
+        arrays[UNITS] = np.frombuffer(json.dumps(measures.plain).encode(), dtype=np.uint8)
 
     def fill(temporary: Path) -> None:
         if path.suffix == ".safetensors":

@@ -5,16 +5,16 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import require_number, require_numbers
+from ocp_torch.errors import require_integer, require_numbers
 from ocp_torch.problems.control_limit import Limit
-from ocp_torch.problems.systems.angles import TURN
+from ocp_torch.problems.problem import MOST_COORDINATES
 from ocp_torch.problems.systems.linkage import Linkage
 
 
 class Arm(Linkage):
-    r"""A `Linkage` in the plane: `x_i` is the angle of joint `i` against the link before it, in turns.
+    r"""A `Linkage` in the plane: `s_i` is the angle of joint `i` against the link before it.
 
-    Joint `i` ends at `r_i = r_{i-1} + l_i (cos, sin)(2 pi (x_1 + ... + x_i))`, in metres from the base, and the tip is
+    Joint `i` ends at `r_i = r_{i-1} + l_i (cos, sin)(s_1 + ... + s_i)`, in metres from the base, and the tip is
     `p = r_n` (Murray, Li, Sastry: *A Mathematical Introduction to Robotic Manipulation*, chapter 3). An obstacle costs
     about ``obstacle_weight`` where any part of the arm is inside.
 
@@ -40,22 +40,21 @@ class Arm(Linkage):
         joint_noise: float | Sequence[float] = 0.0,
         noise: float | Sequence[float] = 0.0,
     ) -> None:
-        super().__init__(dim, dim, discount, exponent, control_limit, noise)
-        self.shake(joint_noise)
+        joints = require_integer("problem.dim", dim, 1, maximum=MOST_COORDINATES)
+        super().__init__(joints, speed, joint_noise, discount, exponent, control_limit, noise)
         self.pursue(2, target, obstacles, clearance, target_weight, obstacle_weight)
-        self.speed = require_number("problem.speed", speed, above=0.0)
         equal = [1.0 / self.dim] * self.dim
         self.lengths = equal if lengths is None else require_numbers("problem.lengths", lengths, self.dim, above=0.0)
         self._lengths = torch.tensor(self.lengths, dtype=torch.float64)
         self.stretch(sum(self.lengths), [0.0, 0.0])
 
-    def joints(self, x: Tensor) -> Tensor:
+    def joints(self, s: Tensor) -> Tensor:
         """Base, joints and end effector in metres, ``(N, n + 1, 2)``."""
-        angle = TURN * x.cumsum(dim=-1)
-        links = torch.stack([angle.cos(), angle.sin()], dim=-1) * self._like(x, "lengths", self._lengths).unsqueeze(-1)
-        return torch.cat([links.new_zeros(len(x), 1, 2), links.cumsum(dim=1)], dim=1)
+        angle = s.cumsum(dim=-1)
+        links = torch.stack([angle.cos(), angle.sin()], dim=-1) * self._like(s, "lengths", self._lengths).unsqueeze(-1)
+        return torch.cat([links.new_zeros(len(s), 1, 2), links.cumsum(dim=1)], dim=1)
 
-    def jacobian(self, x: Tensor) -> Tensor:
-        joints = self.joints(x)
+    def jacobian(self, s: Tensor) -> Tensor:
+        joints = self.joints(s)
         lever = joints[:, -1:] - joints[:, :-1]
         return torch.stack([-lever[..., 1], lever[..., 0]], dim=1)

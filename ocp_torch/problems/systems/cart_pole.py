@@ -9,7 +9,7 @@ from ocp_torch.errors import require_number
 from ocp_torch.problems.physical.coordinates import Angle, Interval
 from ocp_torch.problems.physical.start import Start
 from ocp_torch.problems.physical.system import System
-from ocp_torch.problems.systems.rest import linearised, occupation_bound_at_rest
+from ocp_torch.problems.systems.rest import bound_at_rest
 
 
 class CartPole(System):
@@ -80,10 +80,7 @@ class CartPole(System):
         )
         seams = torch.tensor([[0.5 * c.length if isinstance(c, Interval) else torch.pi for c in box]]).double()
         self.state_cost_bound = max(float(self.cost(seams)), self._failure)
-        # Noise shakes it at the state of rest too.
-        rest = linearised(self, [0.0] * self.dim)
-        at_rest = None if self.noisy else occupation_bound_at_rest(*rest, self.discount, self.exponent)
-        self.occupation_bound = at_rest
+        self.occupation_bound = bound_at_rest(self, [0.0] * self.dim)
 
     def cost(self, s: Tensor) -> Tensor:
         position, pole, velocity, spin = s.unbind(-1)

@@ -32,6 +32,8 @@ class DoubleIntegrator(System):
     is all there is; ``noise`` crosses seams, and nothing is known. Raises `InputError` for wrong arguments.
     """
 
+    divergence_free = True
+
     def __init__(
         self,
         mass: float = 1.0,

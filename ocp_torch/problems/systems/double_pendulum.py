@@ -10,7 +10,7 @@ from ocp_torch.errors import InputError, nearest, require_number, require_number
 from ocp_torch.problems.physical.coordinates import Angle, Interval
 from ocp_torch.problems.physical.start import Points
 from ocp_torch.problems.physical.system import System
-from ocp_torch.problems.systems.rest import linearised, occupation_bound_at_rest
+from ocp_torch.problems.systems.rest import bound_at_rest
 
 HANGING = (math.pi, 0.0, 0.0, 0.0)
 # Where a run may start: within so much of hanging at rest (rad and rad/s); or at any angles, up to a part of the top speeds.
@@ -90,9 +90,7 @@ class DoublePendulum(System):
         self._set_constants()
         seams = [0.5 * c.length for c in speeds]
         self.state_cost_bound = 8.0 + self.speed_cost * sum(v**2 for v in seams)
-        at_rest = occupation_bound_at_rest(*linearised(self, [0.0] * 4), self.discount, self.exponent)
-        # Noise shakes it at the state of rest too.
-        self.occupation_bound = None if self.noisy else at_rest
+        self.occupation_bound = bound_at_rest(self, [0.0] * 4)
 
     def _set_constants(self) -> None:
         (m1, m2), (l1, _), (r1, r2), (I1, I2) = self.masses, self.lengths, self.centres, self.inertias

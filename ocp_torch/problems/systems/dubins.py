@@ -1,20 +1,19 @@
-r"""Dubins' vehicle in a periodic plane: constant speed, only the turn rate is controlled; stay near a target."""
+r"""Dubins' vehicle in a periodic plane or a room: constant speed, only the turn rate is controlled; stay near a target."""
 
 import math
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from ocp_torch.problems.control_limit import Limit
-from ocp_torch.problems.systems.angles import TURN
+from ocp_torch.problems.physical.units import TURN
 from ocp_torch.problems.systems.planar import PlanarVehicle
 
 
 class Dubins(PlanarVehicle):
-    r"""`size dx_1/dt = speed cos(2 pi x_3)`, `size dx_2/dt = speed sin(2 pi x_3)`, `dx_3/dt = turn_rate u`: `d = 3`, `m = 1`.
+    r"""`x' = speed cos(heading)`, `y' = speed sin(heading)`, `heading' = w`: `d = 3`, `m = 1`.
 
-    Dubins (1957), with a price on turning in place of a limit. `u = 1` is ``turn_rate`` turns per second. The vehicle
+    Dubins (1957), with a price on turning, `|u|^q / q` of `u = w` in units of ``turn_rate`` turns/s, for a limit. The vehicle
     cannot stop: at best it circles near the target. The cost is that of `PlanarVehicle`.
 
     The drift is not in the range of `B`, so the paper's assumption A2 fails. What then still holds: `f`, `a`, `B` are
@@ -43,19 +42,15 @@ class Dubins(PlanarVehicle):
         heading_noise: float = 0.0,
         position_noise: float = 0.0,
         noise: float | Sequence[float] = 0.0,
+        walls: bool = False,
+        failure_cost: float | None = None,
     ) -> None:
-        super().__init__(3, 1, discount, exponent, control_limit, noise)
         self.pursue(2, target, obstacles, clearance, target_weight, obstacle_weight)
-        self.drive(size, speed, turn_rate)
-        self.shake(heading_noise, position_noise)
+        price, noises = (discount, exponent, control_limit), (heading_noise, position_noise, noise)
+        super().__init__(["turn rate [rad/s]"], size, speed, turn_rate, walls, failure_cost, *price, *noises)
         gathers = TURN * self.turn_rate > self.discount and not self.noisy
         self.occupation_bound = math.inf if gathers else None
 
-    def drift(self, x: Tensor) -> Tensor:
-        return self.ahead(x)
-
-    def drift_divergence(self, x: Tensor) -> Tensor:
-        return torch.zeros_like(x[:, 0])
-
-    def control_matrix(self, x: Tensor) -> Tensor:
-        return self.turning(x).unsqueeze(-1)
+    def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        moves = self.moves(s)
+        return self.speed * moves[..., 0], moves[..., 1:]

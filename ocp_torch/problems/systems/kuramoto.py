@@ -8,20 +8,21 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
 from ocp_torch.problems.control_limit import Limit
-from ocp_torch.problems.systems.angles import TURN
+from ocp_torch.problems.physical.coordinates import Angle
 from ocp_torch.problems.systems.graphs import GRAPHS, adjacency
 from ocp_torch.problems.systems.oscillators import ENTRAIN, SYNCHRONISE, Oscillators
 
 
 class Kuramoto(Oscillators):
-    r"""`dtheta_i/dt = omega_i + (coupling / n) sum_j A_ij sin(theta_j - theta_i) + strength u_i`, `x = theta / 2 pi`.
+    r"""`dtheta_i/dt = omega_i + (coupling / n) sum_j A_ij sin(theta_j - theta_i) + p_i`.
 
     Kuramoto (1975), on a graph as in Rodrigues et al. (Physics Reports 610, 2016). Phases are in radians, ``frequencies``
-    `omega`, ``coupling`` and ``strength`` in rad/s; `u_i` acts on those in ``controlled`` (numbers from 0; null: all).
+    `omega` and ``coupling`` in rad/s; pushes `p_i`, with the price `|u|^q / q` of `u = p` in units of ``strength`` rad/s, act
+    on those in ``controlled`` (numbers from 0; null: all).
     Cost: ``weight`` times `1 - r^2` to synchronise, `r^2` to desynchronise (`r` the order parameter), or
     `mean_i (1 - cos theta_i) / 2` to entrain, that is to bring all to phase 0.
 
-    ``relative`` phases `y_i = x_i - x_n`, `i < n`, drop one dimension and lose nothing where the cost depends on
+    ``relative`` phases, to the last one, drop one dimension and lose nothing where the cost depends on
     differences alone: it is the default to (de)synchronise, and refused to entrain. ``frequencies`` is a list, or null for
     normal draws of deviation ``spread`` by ``seed``, shifted to mean 0; ``graph`` is complete, ring, random (by
     ``probability`` and ``seed``), a file or a list of rows. The flow contracts onto the goal: `mu*` is declared unbounded,
@@ -58,7 +59,13 @@ class Kuramoto(Oscillators):
         if self.relative and goal == ENTRAIN:
             raise InputError("problem.relative is true, but problem.goal = entrain asks for phases, not differences.")
         self.controlled = _subset(controlled, n)
-        super().__init__(n - self.relative, len(self.controlled), discount, exponent, control_limit, noise)
+        self.strength = require_number("problem.strength", strength, above=0.0)
+        last = f" - phase {n - 1}" if self.relative else ""
+        phases = [Angle(f"phase {i}{last}") for i in range(n - self.relative)]
+        pushes = [f"push {i} [rad/s]" for i in self.controlled]
+        super().__init__(
+            phases, pushes, discount, exponent, 1.0, control_limit, noise=noise, nominal_control=self.strength
+        )
         self.aim(goal, weight)
         self.seed = require_integer("problem.seed", seed, 0)
         self.spread = require_number("problem.spread", spread, at_least=0.0)
@@ -66,43 +73,38 @@ class Kuramoto(Oscillators):
         if frequencies is None:
             drawn = torch.randn(n, generator=torch.Generator().manual_seed(self.seed), dtype=torch.float64)
             frequencies = (self.spread * (drawn - drawn.mean())).tolist()
-        self.run_at(frequencies, n, coupling, strength)
+        self.run_at(frequencies, n, coupling)
         self._adjacency = adjacency("problem.graph", graph, n, self.probability, self.seed)
         # Rows, not a file's name: what is saved with a controller must not depend on another file.
         self.graph = graph if graph in GRAPHS else self._adjacency.tolist()
         coordinates = torch.eye(n, dtype=torch.float64)
         if self.relative:
             coordinates = coordinates[:-1] - coordinates[-1]
-        self._B = self.strength / TURN * coordinates[:, self.controlled]
+        self._B = coordinates[:, self.controlled]
         self.shake(phase_noise, coordinates)
         self.occupation_bound = None if self.noisy else math.inf
 
-    def phases(self, x: Tensor) -> Tensor:
+    def phases(self, s: Tensor) -> Tensor:
         """In relative coordinates the last one is 0."""
-        return torch.cat([x, torch.zeros_like(x[:, :1])], dim=-1) if self.relative else x
+        return torch.cat([s, torch.zeros_like(s[:, :1])], dim=-1) if self.relative else s
 
-    def drift(self, x: Tensor) -> Tensor:
-        (cosine, sine), A = self.circular(x), self._like(x, "A", self._adjacency)
+    def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        (cosine, sine), A = self.circular(s), self._like(s, "A", self._adjacency)
         # sin(theta_j - theta_i), summed over j, without a matrix for each state.
         pulled = cosine * (sine @ A.T) - sine * (cosine @ A.T)
-        rate = (self._like(x, "omega", self._omega) + self.coupling / self.oscillators * pulled) / TURN
-        return rate[:, :-1] - rate[:, -1:] if self.relative else rate
+        rate = self._like(s, "omega", self._omega) + self.coupling / self.oscillators * pulled
+        a = rate[:, :-1] - rate[:, -1:] if self.relative else rate
+        return a, self._like(s, "B", self._B).expand(len(s), -1, -1)
 
-    def drift_divergence(self, x: Tensor) -> Tensor:
-        """`-(coupling / n) sum_ij A_ij cos(theta_j - theta_i)`, also of the relative phases."""
-        (cosine, sine), A = self.circular(x), self._like(x, "A", self._adjacency)
+    def divergences(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        """`-(coupling / n) sum_ij A_ij cos(theta_j - theta_i)`, also of the relative phases, and 0."""
+        (cosine, sine), A = self.circular(s), self._like(s, "A", self._adjacency)
         together = (cosine * (cosine @ A.T) + sine * (sine @ A.T)).sum(dim=-1)
-        return -self.coupling / self.oscillators * together
+        return -self.coupling / self.oscillators * together, s.new_zeros(len(s), self.control_dim)
 
-    def control_matrix(self, x: Tensor) -> Tensor:
-        return self._like(x, "B", self._B).expand(len(x), -1, -1)
-
-    def control_divergence(self, x: Tensor) -> Tensor:
-        return x.new_zeros(len(x), self.control_dim)
-
-    def to_torus(self, phases: Tensor) -> Tensor:
-        """In relative coordinates the last phase is taken off."""
-        return super().to_torus(phases[:, :-1] - phases[:, -1:] if self.relative else phases)
+    def to_torus(self, s: Tensor) -> Tensor:
+        """In relative coordinates all `n` phases will do too: the last one is taken off."""
+        return super().to_torus(s[:, :-1] - s[:, -1:] if s.shape[1] > self.dim else s)
 
 
 def _subset(controlled: object, count: int) -> list[int]:

@@ -7,28 +7,45 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ocp_torch.errors import require_number
 from ocp_torch.problems.constant_noise import one_or_each
-from ocp_torch.problems.systems.angles import TURN, to_radians, to_turns
+from ocp_torch.problems.control_limit import Limit
+from ocp_torch.problems.physical.coordinates import Angle
+from ocp_torch.problems.physical.units import TURN
 from ocp_torch.problems.systems.reaching import Reaching, bump
 
 
 class Linkage(Reaching):
-    r"""`dx/dt = speed u` and `f = target_weight |p(x) - target|^2 + obstacle_weight sum_o (1 - prod_s (1 - b_o(r_s(x))))`.
+    r"""`ds/dt = w` and `cost = target_weight |p(s) - target|^2 + obstacle_weight sum_o (1 - prod_k (1 - b_o(r_k(s))))`.
 
-    `x_i` is the angle of joint `i` in turns, so that the state space is exactly the torus and there is no drift; `u = 1`
-    turns a joint by ``speed`` turns per second. `p` is the tip, and `s` runs over ``points_per_link`` points of each link,
-    where the bump `b_o` of an obstacle is 1 at its centre and 0 from ``clearance`` metres outside its surface on; all is
-    twice differentiable. A subclass gives `joints` and `jacobian`, sets ``speed``, and calls `pursue`, `shake` and `stretch`.
+    States are the angles of the joints in rad, so that their space is exactly the torus and there is no drift, controls their
+    rates in rad/s, with the price `|u|^q / q` of `u = w` in units of ``speed`` turns per second. `p` is the tip, and `k` runs
+    over ``points_per_link`` points of each link, where the bump `b_o` of an obstacle is 1 at its centre and 0 from
+    ``clearance`` metres outside its surface on; all is twice differentiable. A subclass gives `joints` and `jacobian`, and
+    calls `__init__`, `pursue` and `stretch`.
     """
 
+    driftless = divergence_free = True
     points_per_link = 8
-    speed: float  # turns per second at `u = 1`
 
-    def shake(self, joint_noise: float | Sequence[float]) -> None:
-        """Note how far a joint strays in a second, ``joint_noise`` in rad/sqrt(s): one for each joint, or one for all."""
+    def __init__(
+        self,
+        joints: int,
+        speed: float,
+        joint_noise: float | Sequence[float],
+        discount: float,
+        exponent: float,
+        control_limit: Limit,
+        noise: float | Sequence[float],
+    ) -> None:
+        """A joint strays by ``joint_noise`` in a second, in rad/sqrt(s): one for each joint, or one for all."""
+        self.speed, self.joint_noise = require_number("problem.speed", speed, above=0.0), joint_noise
+        angles = [Angle(f"joint {i + 1}") for i in range(joints)]
+        rates = [f"rate {i + 1} [rad/s]" for i in range(joints)]
+        nominal = TURN * self.speed
+        super().__init__(angles, rates, discount, exponent, 1.0, control_limit, noise=noise, nominal_control=nominal)
         each = one_or_each("problem.joint_noise", joint_noise, self.dim)
-        self.joint_noise = joint_noise
-        self.add_noise(torch.tensor(each, dtype=torch.float64).diag() / TURN)
+        self.disturb(torch.tensor(each, dtype=torch.float64).diag())
 
     def stretch(self, length: float, shoulder: list[float]) -> None:
         """Note that the tip stays within ``length`` metres of the ``shoulder``, the first joint's place."""
@@ -38,51 +55,40 @@ class Linkage(Reaching):
         self.occupation_bound = None if self.noisy else math.inf
 
     @abstractmethod
-    def joints(self, x: Tensor) -> Tensor:
+    def joints(self, s: Tensor) -> Tensor:
         """The corners of the arm from base to tip in metres, ``(N, k, c)`` with `c` coordinates."""
 
     @abstractmethod
-    def jacobian(self, x: Tensor) -> Tensor:
+    def jacobian(self, s: Tensor) -> Tensor:
         """`dp / d angle` in metres per radian, ``(N, c, n)``."""
 
-    def end_effector(self, x: Tensor) -> Tensor:
-        """`p(x)` in metres, ``(N, c)``."""
-        return self.joints(x)[:, -1]
+    def end_effector(self, s: Tensor) -> Tensor:
+        """`p(s)` in metres, ``(N, c)``."""
+        return self.joints(s)[:, -1]
 
     def to_target(self, x: Tensor) -> Tensor:
-        return self._like(x, "target", self._target) - self.end_effector(x)
+        return self._like(x, "target", self._target) - self.end_effector(self.from_torus(x))
 
     def gaps(self, x: Tensor, balls: Tensor) -> Tensor:
-        joints = self.joints(x)
+        joints = self.joints(self.from_torus(x))
         start, link = joints[:, :-1].unsqueeze(2), joints.diff(dim=1).unsqueeze(2)
         away = balls[:, :-1] - start
         square = link.square().sum(dim=-1).clamp_min(torch.finfo(x.dtype).tiny)  # joints may share a place
         nearest = ((away * link).sum(dim=-1) / square).clamp(0.0, 1.0)
         return (away - nearest.unsqueeze(-1) * link).norm(dim=-1) - balls[:, -1]
 
-    def state_cost(self, x: Tensor) -> Tensor:
-        joints = self.joints(x)
-        off = (joints[:, -1] - self._like(x, "target", self._target)).square().sum(dim=-1)
+    def cost(self, s: Tensor) -> Tensor:
+        joints = self.joints(s)
+        off = (joints[:, -1] - self._like(s, "target", self._target)).square().sum(dim=-1)
         cost = self.target_weight * off
         if not self.obstacles:
             return cost
-        balls = self._like(x, "balls", self._balls)
-        along = torch.arange(1, self.points_per_link + 1).to(x).unsqueeze(-1) / self.points_per_link
+        balls = self._like(s, "balls", self._balls)
+        along = torch.arange(1, self.points_per_link + 1).to(s).unsqueeze(-1) / self.points_per_link
         points = joints[:, :-1].unsqueeze(2) + along * joints.diff(dim=1).unsqueeze(2)  # (N, links, points, c)
         square = (points.unsqueeze(-2) - balls[:, :-1]).square().sum(dim=-1)
         missed = (1.0 - bump(square, balls[:, -1] + self.clearance)).flatten(1, 2).prod(dim=1)  # (N, obstacles)
         return cost + self.obstacle_weight * (1.0 - missed).sum(dim=-1)
 
-    def control_matrix(self, x: Tensor) -> Tensor:
-        return self.speed * super().control_matrix(x)
-
-    def control_divergence(self, x: Tensor) -> Tensor:
-        return torch.zeros_like(x)
-
-    def to_torus(self, angles: Tensor) -> Tensor:
-        """Joint angles in radians ``(N, n)`` as states."""
-        return to_turns(angles)
-
-    def from_torus(self, x: Tensor) -> Tensor:
-        """States as joint angles in [-pi, pi) radians, ``(N, n)``."""
-        return to_radians(x)
+    def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.zeros_like(s), torch.eye(self.dim, dtype=s.dtype, device=s.device).expand(len(s), -1, -1)

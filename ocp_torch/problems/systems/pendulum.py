@@ -12,8 +12,7 @@ from ocp_torch.problems.physical.coordinates import Angle, Interval
 from ocp_torch.problems.physical.prices import scaled_limit
 from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
-from ocp_torch.problems.systems.angles import TURN
-from ocp_torch.problems.systems.rest import occupation_bound_at_rest
+from ocp_torch.problems.systems.rest import bound_at_rest
 
 SPEED_COST = 0.1
 # The environment this is a model of: it observes cos theta, sin theta and theta', and takes a torque in N m.
@@ -37,6 +36,7 @@ class Pendulum(System):
     """
 
     initial_density = Problem.initial_density
+    divergence_free = True
 
     def __init__(
         self,
@@ -79,15 +79,11 @@ class Pendulum(System):
         self.torque_noise = require_number("problem.torque_noise", torque_noise, at_least=0.0)
         self._pull = 1.5 * self.gravity / self.length
         self._push = 3.0 / (self.mass * self.length**2)
+        self.disturb(torch.tensor([[0.0], [self._push * self.torque_noise]], dtype=torch.float64))
         self._scale = 0.5 / (self.torque_cost * self.max_torque**2)
         self._square_at_seam = float(self._square(torch.tensor(self.seam, dtype=torch.float64)))
         self.state_cost_bound = self._scale * (4.0 + SPEED_COST * self._square_at_seam)
-        A = torch.tensor([[0.0, 2.0 * self.seam / TURN], [self._pull * TURN / (2.0 * self.seam), 0.0]]).double()
-        B = torch.tensor([[0.0], [self._push * self.max_torque / (2.0 * self.seam)]], dtype=torch.float64)
-        Q = 2.0 * self._scale * torch.tensor([TURN**2, SPEED_COST * (2.0 * self.seam) ** 2], dtype=torch.float64).diag()
-        # Noise shakes it at the state of rest too.
-        at_rest = None if self.noisy else occupation_bound_at_rest(A, B, Q, self.discount, self.exponent)
-        self.occupation_bound = at_rest
+        self.occupation_bound = bound_at_rest(self, [0.0, 0.0])
 
     def _square(self, velocity: Tensor) -> Tensor:
         """`c = 2 int_0^v |v| chi dv`: `v^2` up to ``max_speed``, level at the seam."""
@@ -95,7 +91,9 @@ class Pendulum(System):
         z = ((velocity.abs() - self.max_speed) / width).clamp(0.0, 1.0)
         level = z - 2.5 * z**4 + 3.0 * z**5 - z**6
         slope = 0.5 * z**2 - 2.0 * z**5 + 2.5 * z**6 - 6.0 / 7.0 * z**7
-        return velocity.abs().clamp_max(self.max_speed) ** 2 + 2.0 * width * (self.max_speed * level + width * slope)
+        return velocity.clamp(-self.max_speed, self.max_speed) ** 2 + 2.0 * width * (
+            self.max_speed * level + width * slope
+        )
 
     def cost(self, s: Tensor) -> Tensor:
         # 2 (1 - cos) as 4 sin^2 of the half angle loses no digits near upright.
@@ -108,14 +106,8 @@ class Pendulum(System):
 
     def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:
         angle, velocity = s.unbind(-1)
-        return torch.stack([velocity, self._pull * angle.sin()], dim=-1), self._columns(s, self._push)
-
-    def disturbance(self, s: Tensor) -> Tensor | None:
-        return self._columns(s, self._push * self.torque_noise) if self.torque_noise else None
-
-    def _columns(self, s: Tensor, acceleration: float) -> Tensor:
-        """A column ``(N, 2, 1)`` that acts on the velocity alone."""
-        return s.new_tensor([[0.0], [acceleration]]).expand(len(s), 2, 1)
+        push = s.new_tensor([[0.0], [self._push]]).expand(len(s), 2, 1)
+        return torch.stack([velocity, self._pull * angle.sin()], dim=-1), push
 
     def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
         """The state of Pendulum-v1 that shows `(cos theta, sin theta, theta')`; speeds beyond the seam are taken at it."""

@@ -8,7 +8,7 @@ from torch import Tensor
 from ocp_torch.errors import require_number, require_numbers
 from ocp_torch.problems.physical.coordinates import Angle, Interval
 from ocp_torch.problems.physical.system import System
-from ocp_torch.problems.systems.rest import linearised, occupation_bound_at_rest
+from ocp_torch.problems.systems.rest import bound_at_rest
 
 
 class PhaseLockedLoop(System):
@@ -24,6 +24,8 @@ class PhaseLockedLoop(System):
     Without noise `mu*` is declared unbounded where the linear loop gathers mass at lock faster than the discount forgets it;
     with noise nothing is known of it. Raises `InputError` for wrong arguments.
     """
+
+    divergence_free = True
 
     def __init__(
         self,
@@ -60,12 +62,10 @@ class PhaseLockedLoop(System):
             noise=noise,
             failure_cost=failure_cost,
         )
+        self.disturb(torch.tensor([self.phase_noise, self.frequency_noise], dtype=torch.float64).diag())
         fastest = torch.tensor([[torch.pi, 0.5 * box[1].length]], dtype=torch.float64)
         self.state_cost_bound = max(float(self.cost(fastest)), self._failure)
-        # Noise shakes it when locked too.
-        locked = linearised(self, [0.0, 0.0])
-        at_rest = None if self.noisy else occupation_bound_at_rest(*locked, self.discount, self.exponent)
-        self.occupation_bound = at_rest
+        self.occupation_bound = bound_at_rest(self, [0.0, 0.0])
 
     def cost(self, s: Tensor) -> Tensor:
         phase, frequency = s.unbind(-1)
@@ -74,7 +74,3 @@ class PhaseLockedLoop(System):
     def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:
         a = torch.stack([s[:, 1], torch.zeros_like(s[:, 1])], dim=-1)
         return a, -torch.eye(2).to(s).expand(len(s), 2, 2)
-
-    def disturbance(self, s: Tensor) -> Tensor | None:
-        each = [self.phase_noise, self.frequency_noise]
-        return s.new_tensor(each).diag().expand(len(s), 2, 2) if any(each) else None

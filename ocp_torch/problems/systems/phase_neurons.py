@@ -7,20 +7,20 @@ from torch import Tensor
 
 from ocp_torch.errors import require_choice, require_integer, require_number
 from ocp_torch.problems.control_limit import Limit
-from ocp_torch.problems.systems.angles import TURN
+from ocp_torch.problems.physical.coordinates import Angle
 from ocp_torch.problems.systems.oscillators import DESYNCHRONISE, Oscillators
 
 TYPE_1, TYPE_2 = "type1", "type2"
 
 
 class PhaseNeurons(Oscillators):
-    r"""`dtheta_i/dt = omega_i + (coupling / n) sum_j sin(theta_j - theta_i) + strength Z(theta_i) u`, `x = theta / 2 pi`.
+    r"""`dtheta_i/dt = omega_i + (coupling / n) sum_j sin(theta_j - theta_i) + Z(theta_i) p`.
 
     The phase reduction of Brown, Moehlis and Holmes (Neural Computation 16, 2004), one stimulus for all as in Wilson and
-    Moehlis (SIAM Review 57, 2015): `m = 1`, `B_i = Z(x_i)`. The response `Z` is `1 - cos theta` for neurons of type1 (near
+    Moehlis (SIAM Review 57, 2015): `m = 1`. The response `Z` is `1 - cos theta` for neurons of type1 (near
     a saddle-node on a circle), `-sin theta` for type2 (near a Hopf bifurcation); a neuron spikes at phase 0. ``frequencies``,
-    ``coupling`` and ``strength`` are in rad/s, `u` is the stimulus in units of ``strength``. Cost: ``weight`` times `r^2` to
-    desynchronise, `1 - r^2` to synchronise, `r` the order parameter.
+    ``coupling`` and the stimulus `p` are in rad/s, its price is `|u|^q / q` of `u = p` in units of ``strength``. Cost:
+    ``weight`` times `r^2` to desynchronise, `1 - r^2` to synchronise, `r` the order parameter.
 
     ``frequencies`` is a list, or null for ``frequency`` times equally spaced factors from `1 - spread / 2` to `1 + spread /
     2`; ``phase_noise`` is in rad/sqrt(s), one for all neurons or each. The drift is not in the range of `B`, so the paper's
@@ -46,31 +46,27 @@ class PhaseNeurons(Oscillators):
         noise: float | Sequence[float] = 0.0,
     ) -> None:
         self.neurons = n = require_integer("problem.neurons", neurons, 2, maximum=512)
-        super().__init__(n, 1, discount, exponent, control_limit, noise)
+        self.strength = require_number("problem.strength", strength, above=0.0)
+        phases, stimulus = [Angle(f"phase {i}") for i in range(n)], ["stimulus [rad/s]"]
+        super().__init__(
+            phases, stimulus, discount, exponent, 1.0, control_limit, noise=noise, nominal_control=self.strength
+        )
         self.aim(goal, weight)
         self.response = require_choice("problem.response", response, (TYPE_1, TYPE_2))
         self.frequency = require_number("problem.frequency", frequency)
         self.spread = require_number("problem.spread", spread, at_least=0.0)
         factors = 1.0 + self.spread * torch.linspace(-0.5, 0.5, n, dtype=torch.float64)
         given = (self.frequency * factors).tolist() if frequencies is None else frequencies
-        self.run_at(given, n, coupling, strength)
+        self.run_at(given, n, coupling)
         self.shake(phase_noise, torch.eye(n, dtype=torch.float64))
 
-    def drift(self, x: Tensor) -> Tensor:
-        cosine, sine = self.circular(x)
+    def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        cosine, sine = self.circular(s)
         pulled = cosine * sine.mean(dim=-1, keepdim=True) - sine * cosine.mean(dim=-1, keepdim=True)
-        return (self._like(x, "omega", self._omega) + self.coupling * pulled) / TURN
-
-    def drift_divergence(self, x: Tensor) -> Tensor:
-        """`-coupling (n r^2 - 1)`: each neuron's own term is no coupling."""
-        return self.coupling * (1.0 - self.neurons * self.square_order(x))
-
-    def control_matrix(self, x: Tensor) -> Tensor:
-        cosine, sine = self.circular(x)
         Z = 1.0 - cosine if self.response == TYPE_1 else -sine
-        return (self.strength / TURN * Z).unsqueeze(-1)
+        return self._like(s, "omega", self._omega) + self.coupling * pulled, Z.unsqueeze(-1)
 
-    def control_divergence(self, x: Tensor) -> Tensor:
-        cosine, sine = self.circular(x)
-        slope = sine if self.response == TYPE_1 else -cosine
-        return self.strength * slope.sum(dim=-1, keepdim=True)
+    def divergences(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        """`-coupling (n r^2 - 1)`, as each neuron's own term is no coupling, and the sum of `Z'`."""
+        slope = s.sin() if self.response == TYPE_1 else -s.cos()
+        return self.coupling * (1.0 - self.neurons * self.square_order(s)), slope.sum(dim=-1, keepdim=True)

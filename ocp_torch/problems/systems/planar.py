@@ -1,86 +1,102 @@
-r"""What vehicles in a periodic plane share: position and heading, a target, round obstacles."""
+r"""What vehicles in the plane share: position and heading, a target, round obstacles, and walls where there are any."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import require_number
-from ocp_torch.problems.systems.angles import TURN, to_radians, to_turns
+from ocp_torch.errors import InputError, require_flag, require_number
+from ocp_torch.problems.control_limit import Limit
+from ocp_torch.problems.physical.coordinates import Angle, Coordinate, Interval
+from ocp_torch.problems.physical.units import TURN
 from ocp_torch.problems.systems.reaching import Reaching, bump
+
+# Part of a room it starts in: with less room than this no vehicle that cannot stop can turn away from a wall.
+INNER = 0.7
 
 
 class PlanarVehicle(Reaching):
-    r"""State `(x_1, x_2, x_3)`: the position in periods of ``size`` metres, and the heading in turns.
+    r"""State `(x, y, heading)`, in m and rad: in a plane that repeats itself after ``size`` metres, or with ``walls`` in a
+    room, `[0, size]^2`.
 
-    `f = target_weight r(x)^2 + obstacle_weight sum_o b_o(x)`, with the smooth periodic distance
-    `r^2 = (size/pi)^2 (sin^2 pi(x_1 - g_1) + sin^2 pi(x_2 - g_2))` in metres from the target `g`, and bumps `b_o` that are 1
-    at the centre of an obstacle and 0 from ``clearance`` metres outside its rim on. Positions are in metres, in [0, size).
-    A subclass calls `pursue`, `drive` and `shake`.
+    `cost = target_weight r^2 + obstacle_weight sum_o b_o`, with the smooth periodic distance `r^2 = (size/pi)^2 (sin^2 pi(x -
+    g_1)/size + sin^2 pi(y - g_2)/size)` from the target `g`, in a room Euclid's, and bumps `b_o` that are 1 at the centre of
+    an obstacle and 0 from ``clearance`` metres outside its rim on. To leave the room, in whose inner part it starts, is
+    a failure that costs ``failure_cost`` for ever, by default the largest cost in it.
     """
 
-    def drive(self, size: float, speed: float, turn_rate: float) -> None:
-        """Note the ``size`` of the plane, the ``speed`` in metres and the ``turn_rate`` in turns per second."""
+    # The direction ahead does not depend on the position, nor the turn on the heading.
+    divergence_free = True
+
+    def __init__(
+        self,
+        controls: Sequence[str],
+        size: float,
+        speed: float,
+        turn_rate: float,
+        walls: bool,
+        failure_cost: float | None,
+        discount: float,
+        exponent: float,
+        control_limit: Limit,
+        heading_noise: float,
+        position_noise: float,
+        noise: float | Sequence[float],
+    ) -> None:
+        """``controls`` are the last of speed and turn rate, in units of ``speed`` m/s and ``turn_rate`` turns/s. It strays by
+        ``heading_noise`` in rad/sqrt(s), and by ``position_noise`` in m/sqrt(s) along each axis. Call `pursue` before."""
         self.size = require_number("problem.size", size, above=0.0)
         self.speed = require_number("problem.speed", speed, above=0.0)
         self.turn_rate = require_number("problem.turn_rate", turn_rate, above=0.0)
-        self.bound_cost(2.0 * (self.size / math.pi) ** 2)
-
-    def shake(self, heading_noise: float, position_noise: float) -> None:
-        """Note how far it strays in a second: ``heading_noise`` in rad/sqrt(s), and ``position_noise`` in m/sqrt(s) along
-        each axis of the plane."""
+        self.walls = require_flag("problem.walls", walls)
+        nominal = [self.speed, TURN * self.turn_rate][-len(controls) :]
+        along = lambda name: Interval(name, 0, self.size, "m") if self.walls else Angle(name, self.size, "m", 0.0)
+        box: list[Coordinate] = [along("x"), along("y"), Angle("heading")]
+        inner = tuple(0.5 * self.size * (1.0 + side * INNER) for side in (-1, 1))
+        start = {"x": inner, "y": inner} if self.walls else None
+        super().__init__(
+            box, controls, discount, exponent, 1.0, control_limit, start, noise, failure_cost, nominal_control=nominal
+        )
+        if not self.walls and failure_cost is not None:
+            raise InputError(f"problem.failure_cost is {failure_cost:g}, but nothing fails without problem.walls=true.")
+        if self.walls and not all(0.0 <= g <= self.size for g in self.target):
+            raise InputError(f"problem.target is {self.target}, but must be in the room, from 0 to {self.size:g} m.")
+        # From the target to the farther seams.
+        reach = [max(g, self.size - g) + 0.5 * (box[0].length - self.size) for g in self.target]
+        self.bound_cost(math.hypot(*reach) ** 2 if self.walls else 2.0 * (self.size / math.pi) ** 2)
         self.heading_noise = require_number("problem.heading_noise", heading_noise, at_least=0.0)
         self.position_noise = require_number("problem.position_noise", position_noise, at_least=0.0)
-        slip = self.position_noise / self.size
-        self.add_noise(torch.tensor([slip, slip, self.heading_noise / TURN], dtype=torch.float64).diag())
+        each = [self.position_noise, self.position_noise, self.heading_noise]
+        self.disturb(torch.tensor(each, dtype=torch.float64).diag())
 
-    def heading(self, x: Tensor) -> Tensor:
+    def heading(self, s: Tensor) -> Tensor:
         """The unit vector ahead, ``(N, 2)``."""
-        angle = TURN * x[:, 2]
-        return torch.stack([angle.cos(), angle.sin()], dim=-1)
+        return torch.stack([s[:, 2].cos(), s[:, 2].sin()], dim=-1)
 
-    def ahead(self, x: Tensor) -> Tensor:
-        """What the vehicle's own speed does to the state, ``(N, 3)``."""
-        velocity = self.speed / self.size * self.heading(x)
-        return torch.cat([velocity, torch.zeros_like(velocity[:, :1])], dim=-1)
+    def moves(self, s: Tensor) -> Tensor:
+        """What a speed of 1 m/s and a turn rate of 1 rad/s do to the state, ``(N, 3, 2)``."""
+        cos, sin, still = s[:, 2].cos(), s[:, 2].sin(), torch.zeros_like(s[:, 2])
+        return torch.stack([cos, still, sin, still, still, still + 1.0], dim=-1).unflatten(1, (3, 2))
 
-    def turning(self, x: Tensor) -> Tensor:
-        """What its turn rate does to the state, ``(N, 3)``."""
-        return x.new_tensor([0.0, 0.0, self.turn_rate]).expand(len(x), 3)
-
-    def _square_distances(self, x: Tensor, points: Tensor) -> Tensor:
-        """Smooth periodic `r^2` from ``points`` ``(k, 2)`` in metres, ``(N, k)``."""
-        turns = x[:, None, :2] - points / self.size
-        return (self.size / math.pi) ** 2 * (math.pi * turns).sin().square().sum(dim=-1)
-
-    def _offsets(self, x: Tensor, points: Tensor) -> Tensor:
+    def _offsets(self, s: Tensor, points: Tensor) -> Tensor:
         """The shortest way to ``points`` ``(k, 2)``, in metres, ``(N, k, 2)``."""
-        return ((points / self.size - x[:, None, :2] + 0.5).remainder(1.0) - 0.5) * self.size
+        off = points - s[:, None, :2]
+        return off if self.walls else (off + 0.5 * self.size).remainder(self.size) - 0.5 * self.size
+
+    def _square_distances(self, s: Tensor, points: Tensor) -> Tensor:
+        """`r^2` from ``points`` ``(k, 2)``, ``(N, k)``."""
+        off, wave = points - s[:, None, :2], math.pi / self.size
+        return (off if self.walls else (wave * off).sin() / wave).square().sum(dim=-1)
 
     def to_target(self, x: Tensor) -> Tensor:
-        return self._offsets(x, self._like(x, "target", self._target).unsqueeze(0))[:, 0]
+        return self._offsets(self.from_torus(x), self._like(x, "target", self._target).unsqueeze(0))[:, 0]
 
     def gaps(self, x: Tensor, balls: Tensor) -> Tensor:
-        return self._offsets(x, balls[:, :2]).norm(dim=-1) - balls[:, 2]
+        return self._offsets(self.from_torus(x), balls[:, :2]).norm(dim=-1) - balls[:, 2]
 
-    def state_cost(self, x: Tensor) -> Tensor:
-        target = self._like(x, "target", self._target).unsqueeze(0)
-        cost = self.target_weight * self._square_distances(x, target)[:, 0]
-        if not self.obstacles:
-            return cost
-        discs = self._like(x, "balls", self._balls)
-        bumps = bump(self._square_distances(x, discs[:, :2]), discs[:, 2] + self.clearance)
-        return cost + self.obstacle_weight * bumps.sum(dim=-1)
-
-    def control_divergence(self, x: Tensor) -> Tensor:
-        """Zero: the direction ahead does not depend on the position, nor the turn on the heading."""
-        return x.new_zeros(len(x), self.control_dim)
-
-    def to_torus(self, physical: Tensor) -> Tensor:
-        """Positions in metres and headings in radians ``(N, 3)`` as states."""
-        position = (physical[:, :2] / self.size).remainder(1.0)
-        return torch.cat([position, to_turns(physical[:, 2:])], dim=-1)
-
-    def from_torus(self, x: Tensor) -> Tensor:
-        """States as positions in [0, size) metres and headings in [-pi, pi) radians, ``(N, 3)``."""
-        return torch.cat([x[:, :2].remainder(1.0) * self.size, to_radians(x[:, 2:])], dim=-1)
+    def cost(self, s: Tensor) -> Tensor:
+        target, discs = self._like(s, "target", self._target), self._like(s, "balls", self._balls)
+        bumps = bump(self._square_distances(s, discs[:, :2]), discs[:, 2] + self.clearance)
+        away = self._square_distances(s, target.unsqueeze(0))[:, 0]
+        return self.target_weight * away + self.obstacle_weight * bumps.sum(dim=-1)

@@ -8,16 +8,15 @@ from torch import Tensor
 from ocp_torch.errors import require_number, require_numbers
 from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.physical.coordinates import Interval
-from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.systems.reaching import Reaching, bump
-from ocp_torch.problems.systems.rest import linearised, occupation_bound_at_rest
+from ocp_torch.problems.systems.rest import bound_at_rest
 
 # It starts in the inner part of the room, and slower and more level than the box allows.
 INNER, SLOW = 0.7, 0.3
 LIMITS = [1.0, 1.0]  # N
 
 
-class Quadrotor(System, Reaching):
+class Quadrotor(Reaching):
     r"""`x'' = -T sin(pitch) / m`, `z'' = T cos(pitch) / m - g`, `pitch'' = arm (u_2 - u_1) / J`, `T = m g + u_1 + u_2`.
 
     The thrusts of its left and right rotors are `m g / 2 + u_i`: `u = 0` hovers. `d = 6`, `m = 2`; `x`, `z` in m, pitch in
@@ -87,9 +86,7 @@ class Quadrotor(System, Reaching):
         far = torch.where((seams[0] - self._goal).abs() > (seams[1] - self._goal).abs(), seams[0], seams[1])
         bumps = self.obstacle_weight * len(self.obstacles)
         self.state_cost_bound = max(float(self._smooth(far[None])) + bumps, self._failure)
-        at_rest = occupation_bound_at_rest(*linearised(self, self._goal.tolist()), self.discount, self.exponent)
-        # Noise shakes it at the state of rest too.
-        self.occupation_bound = None if self.noisy else at_rest
+        self.occupation_bound = bound_at_rest(self, self._goal.tolist())
 
     @property
     def _goal(self) -> Tensor:
@@ -104,8 +101,6 @@ class Quadrotor(System, Reaching):
         return self.target_weight * way + self.pitch_cost * tilt + self.speed_cost * speed
 
     def cost(self, s: Tensor) -> Tensor:
-        if not self.obstacles:
-            return self._smooth(s)
         balls = self._like(s, "balls", self._balls)
         square = (s[:, None, :2] - balls[:, :2]).square().sum(dim=-1)
         return self._smooth(s) + self.obstacle_weight * bump(square, balls[:, 2] + self.clearance).sum(dim=-1)

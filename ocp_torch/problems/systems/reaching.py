@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError, require_number, require_numbers, shown
-from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.physical.system import System
 
 
-class Reaching(Problem, ABC):
-    """A problem with a target and obstacles in physical space, in metres; a subclass makes `f` of them."""
+class Reaching(System, ABC):
+    """A system with a target and obstacles in physical space, in metres; a subclass makes `f` of them."""
 
     def pursue(
         self,
@@ -40,7 +40,8 @@ class Reaching(Problem, ABC):
 
     def bound_cost(self, farthest: float) -> None:
         """Note that the square distance from the target is at most ``farthest`` square metres."""
-        self.state_cost_bound = self.target_weight * farthest + self.obstacle_weight * len(self.obstacles)
+        most = self.target_weight * farthest + self.obstacle_weight * len(self.obstacles)
+        self.state_cost_bound = max(most, self.failure_cost or 0.0)
 
     @abstractmethod
     def to_target(self, x: Tensor) -> Tensor:

@@ -45,6 +45,13 @@ def occupation_bound_at_rest(A: Tensor, B: Tensor, Q: Tensor, rho: float, expone
     return math.inf if contraction >= rho * (1.0 - ROUNDING) else None
 
 
+def bound_at_rest(system: System, state: Sequence[float]) -> float | None:
+    """`occupation_bound_at_rest` at a ``state`` of rest of ``system``; `None` with noise, which shakes it there too."""
+    if system.noisy:
+        return None
+    return occupation_bound_at_rest(*linearised(system, state), system.discount, system.exponent)
+
+
 def linearised(system: System, state: Sequence[float]) -> tuple[Tensor, Tensor, Tensor]:
     """`A` ``(d, d)``, `B` ``(d, m)`` and `Q` ``(d, d)``, the Hessian of the cost, at a ``state`` of rest: of physical states,
     and of controls whose price is `|v|^2 / 2`."""

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError, require_number, require_numbers, shown
+from ocp_torch.errors import InputError, require_integer, require_numbers, shown
 from ocp_torch.files.reading import kind, require_file
 from ocp_torch.problems.control_limit import Limit
-from ocp_torch.problems.systems.angles import TURN
+from ocp_torch.problems.problem import MOST_COORDINATES
 from ocp_torch.problems.systems.linkage import Linkage
 
 TURNING, STIFF = ("revolute", "continuous"), "fixed"
@@ -32,7 +32,7 @@ ELBOW = [
 
 
 class RobotArm(Linkage):
-    r"""A `Linkage` in space, with the tip at `p = T_1 R_1(x_1) ... T_n R_n(x_n) T_tip 0` in metres.
+    r"""A `Linkage` in space, with the tip at `p = T_1 R_1(s_1) ... T_n R_n(s_n) T_tip 0` in metres.
 
     The fixed transforms `T` and rotations `R` about the joints' axes are those that the ``urdf`` file names up to the link
     ``tip`` (null: the last one that turning joints move; without a file, a six-joint elbow arm). Every joint turns all the
@@ -73,11 +73,9 @@ class RobotArm(Linkage):
                 "problem.chain must be a list of rows of 15 numbers, one for each joint and one for the tip."
             )
         self.chain = [require_numbers(f"problem.chain[{i}]", row, 15) for i, row in enumerate(given)]
-        joints = len(self.chain) - 1
-        super().__init__(joints, joints, discount, exponent, control_limit, noise)
-        self.shake(joint_noise)
+        joints = require_integer("the number of joints", len(self.chain) - 1, 1, maximum=MOST_COORDINATES)
+        super().__init__(joints, speed, joint_noise, discount, exponent, control_limit, noise)
         self.pursue(3, target, obstacles, clearance, target_weight, obstacle_weight)
-        self.speed = require_number("problem.speed", speed, above=0.0)
         self.urdf, self.tip = None, None  # a saved controller needs no file
         rows = torch.tensor(self.chain, dtype=torch.float64)
         self._fixed, self._axes = rows[:, :12].reshape(-1, 3, 4), rows[:-1, 12:]
@@ -86,12 +84,12 @@ class RobotArm(Linkage):
         steps = self._fixed[:, :, 3]
         self.stretch(float(steps[1:].norm(dim=-1).sum()), steps[0].tolist())
 
-    def _frames(self, x: Tensor) -> tuple[Tensor, list[Tensor]]:
+    def _frames(self, s: Tensor) -> tuple[Tensor, list[Tensor]]:
         """What `joints` gives, and the frame that each joint turns in, `n` times ``(N, 3, 3)``."""
-        angle = (TURN * x)[..., None, None]
-        fixed, K = self._like(x, "fixed", self._fixed), self._like(x, "turners", self._turners)
-        turns = torch.eye(3).to(x) + angle.sin() * K + (1.0 - angle.cos()) * (K @ K)
-        rotation, at = torch.eye(3).to(x).expand(len(x), 3, 3), x.new_zeros(len(x), 3)
+        angle = s[..., None, None]
+        fixed, K = self._like(s, "fixed", self._fixed), self._like(s, "turners", self._turners)
+        turns = torch.eye(3).to(s) + angle.sin() * K + (1.0 - angle.cos()) * (K @ K)
+        rotation, at = torch.eye(3).to(s).expand(len(s), 3, 3), s.new_zeros(len(s), 3)
         points, held = [at], []
         for i in range(self.dim + 1):
             at = at + rotation @ fixed[i, :, 3]
@@ -101,13 +99,13 @@ class RobotArm(Linkage):
                 rotation = held[-1] @ turns[:, i]
         return torch.stack(points, dim=1), held
 
-    def joints(self, x: Tensor) -> Tensor:
+    def joints(self, s: Tensor) -> Tensor:
         """The base, each joint and the tip in metres, ``(N, n + 2, 3)``."""
-        return self._frames(x)[0]
+        return self._frames(s)[0]
 
-    def jacobian(self, x: Tensor) -> Tensor:
-        joints, held = self._frames(x)
-        axes = torch.stack(held, dim=1) @ self._like(x, "axes", self._axes).unsqueeze(-1)
+    def jacobian(self, s: Tensor) -> Tensor:
+        joints, held = self._frames(s)
+        axes = torch.stack(held, dim=1) @ self._like(s, "axes", self._axes).unsqueeze(-1)
         return torch.linalg.cross(axes.squeeze(-1), joints[:, -1:] - joints[:, 1:-1], dim=-1).mT
 
 

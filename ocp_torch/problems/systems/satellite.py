@@ -9,7 +9,7 @@ from ocp_torch.errors import InputError, require_number, require_numbers, shown
 from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.physical.coordinates import Interval
 from ocp_torch.problems.physical.system import System
-from ocp_torch.problems.systems.rest import linearised, occupation_bound_at_rest
+from ocp_torch.problems.systems.rest import bound_at_rest
 
 # The part of the box that it starts in: of the attitudes (half a turn about one axis is 1), and of the rates.
 ATTITUDES, RATES = 0.6, 0.3
@@ -67,9 +67,7 @@ class Satellite(System):
         )
         seam = torch.tensor([[0.5 * c.length for c in self.coordinates]], dtype=torch.float64)
         self.state_cost_bound = float(self.cost(seam))
-        at_rest = occupation_bound_at_rest(*linearised(self, [0.0] * 6), self.discount, self.exponent)
-        # Noise shakes it at the state of rest too.
-        self.occupation_bound = None if self.noisy else at_rest
+        self.occupation_bound = bound_at_rest(self, [0.0] * 6)
 
     def angle(self, s: Tensor) -> Tensor:
         """The pointing error in rad, the shorter way round, ``(N,)``."""

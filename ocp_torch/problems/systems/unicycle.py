@@ -1,4 +1,4 @@
-r"""A unicycle in a periodic plane: speed and turn rate are the controls, a target and round obstacles the cost."""
+r"""A unicycle in a periodic plane or a room: speed and turn rate are the controls, a target and round obstacles the cost."""
 
 import math
 from collections.abc import Sequence
@@ -11,14 +11,16 @@ from ocp_torch.problems.systems.planar import PlanarVehicle
 
 
 class Unicycle(PlanarVehicle):
-    r"""`size dx_1/dt = speed cos(2 pi x_3) u_1`, `size dx_2/dt = speed sin(2 pi x_3) u_1`, `dx_3/dt = turn_rate u_2`.
+    r"""`x' = v cos(heading)`, `y' = v sin(heading)`, `heading' = w`: `d = 3`, `m = 2`, no drift.
 
-    The kinematic model of a wheeled robot that cannot slide sideways (LaValle, *Planning Algorithms*, section 13.1.2):
-    `d = 3`, `m = 2`, no drift. `u_1 = 1` is ``speed`` metres per second ahead, `u_2 = 1` is ``turn_rate`` turns per second.
-    The cost is that of `PlanarVehicle`. Where the flow contracts onto the target line by line faster than the discount
+    The kinematic model of a wheeled robot that cannot slide sideways (LaValle, *Planning Algorithms*, section 13.1.2). Its
+    price is `|u|^q / q` of `u_1 = v`, in units of ``speed`` m/s, and `u_2 = w`, in units of ``turn_rate`` turns per second;
+    the cost is that of `PlanarVehicle`. Where the flow contracts onto the target line by line faster than the discount
     forgets, which for `q = 2` is `2 target_weight speed^2 >= 2 discount^2`, `mu*` is declared unbounded; not with
     ``heading_noise`` in rad/sqrt(s), ``position_noise`` in m/sqrt(s) or ``noise``.
     """
+
+    driftless = True
 
     def __init__(
         self,
@@ -36,15 +38,17 @@ class Unicycle(PlanarVehicle):
         heading_noise: float = 0.0,
         position_noise: float = 0.0,
         noise: float | Sequence[float] = 0.0,
+        walls: bool = False,
+        failure_cost: float | None = None,
     ) -> None:
-        super().__init__(3, 2, discount, exponent, control_limit, noise)
         self.pursue(2, target, obstacles, clearance, target_weight, obstacle_weight)
-        self.drive(size, speed, turn_rate)
-        self.shake(heading_noise, position_noise)
+        price, noises = (discount, exponent, control_limit), (heading_noise, position_noise, noise)
+        controls = ["speed [m/s]", "turn rate [rad/s]"]
+        super().__init__(controls, size, speed, turn_rate, walls, failure_cost, *price, *noises)
         # With V = p r^2 / 2 along the heading: p + (speed p)^2 / rho^2 = 2 target_weight, contraction speed^2 p / rho. The
         # control vanishes at the target, so that no limit changes any of it there.
         fast = not self.noisy and self.target_weight * self.speed**2 >= self.discount**2
         self.occupation_bound = math.inf if fast and self.exponent == 2.0 else None
 
-    def control_matrix(self, x: Tensor) -> Tensor:
-        return torch.stack([self.ahead(x), self.turning(x)], dim=-1)
+    def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.zeros_like(s), self.moves(s)

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from ocp_torch.control.policies import Policy
 from ocp_torch.problems.problem import Problem
-from ocp_torch.problems.systems.angles import TURN
 from ocp_torch.problems.systems.cart_pole import CartPole
 from ocp_torch.problems.systems.double_integrator import DoubleIntegrator
 from ocp_torch.problems.systems.double_pendulum import DoublePendulum
@@ -43,15 +42,14 @@ def classical_policy(problem: Problem) -> Policy | None:
 def resolved_rate(problem: Linkage, x: Tensor) -> Tensor:
     r"""`dtheta/dt = k J^+ (target - p)`, `J^+` the damped pseudo-inverse (Whitney, 1969; Nakamura and Hanafusa, 1986)."""
     damping = (DAMPING * problem.length) ** 2 or 1.0  # a tip on the last of its joints does not move: J = 0
-    J, way = problem.jacobian(x), problem.to_target(x)
+    J, way = problem.jacobian(problem.from_torus(x)), problem.to_target(x)
     square = J @ J.mT + damping * torch.eye(way.shape[1]).to(x)
-    rate = REACH * (J.mT @ torch.linalg.solve(square, way.unsqueeze(-1))).squeeze(-1)
-    return rate / (TURN * problem.speed)
+    return problem.to_controls(REACH * (J.mT @ torch.linalg.solve(square, way.unsqueeze(-1))).squeeze(-1))
 
 
 def _bearing(problem: Unicycle | Dubins, x: Tensor) -> tuple[Tensor, Tensor]:
     """The way to the target along and across the heading, in metres, both ``(N,)``."""
-    way, ahead = problem.to_target(x), problem.heading(x)
+    way, ahead = problem.to_target(x), problem.heading(problem.from_torus(x))
     return (way * ahead).sum(dim=-1), ahead[:, 0] * way[:, 1] - ahead[:, 1] * way[:, 0]
 
 
@@ -59,13 +57,13 @@ def go_to_goal(problem: Unicycle, x: Tensor) -> Tensor:
     """Speed in proportion to the way ahead, turn rate to the bearing of the nearer end, front or back."""
     along, across = _bearing(problem, x)
     bearing = torch.atan2(across, along.abs()) * torch.where(along < 0.0, -1.0, 1.0)
-    return torch.stack([DRIVE * along / problem.speed, STEER * bearing / (TURN * problem.turn_rate)], dim=-1)
+    return problem.to_controls(torch.stack([DRIVE * along, STEER * bearing], dim=-1))
 
 
 def pursue(problem: Dubins, x: Tensor) -> Tensor:
     """Turn rate in proportion to the bearing of the target."""
     along, across = _bearing(problem, x)
-    return (STEER * torch.atan2(across, along) / (TURN * problem.turn_rate)).unsqueeze(-1)
+    return problem.to_controls(STEER * torch.atan2(across, along).unsqueeze(-1))
 
 
 def descend(problem: Problem, x: Tensor) -> Tensor:

@@ -109,18 +109,22 @@ def measure(problem: Problem, path: Path) -> dict[str, float] | None:
 @measure.register(Linkage)
 @measure.register(PlanarVehicle)
 def _(problem, path: Path) -> dict[str, float]:
-    """Success: at the end within 5 % of the arm's length or the plane's period of the target, and never in an obstacle."""
+    """Success: at the end within 5 % of the arm's length or the plane's size of the target, never in an obstacle, and never
+    out of a room."""
     size = problem.length if isinstance(problem, Linkage) else problem.size
     reached = problem.distance(path.states[-1]) <= REACHED * size
-    crossed = (path.each(problem.gap) < 0.0).any(dim=0)
-    return {"success": _part(reached & ~crossed), "reached": _part(reached), "crossed": _part(crossed)}
+    crossed, left = (path.each(problem.gap) < 0.0).any(dim=0), path.each(problem.outside).any(dim=0)
+    found = {"success": _part(reached & ~crossed & ~left), "reached": _part(reached), "crossed": _part(crossed)}
+    return found | ({"left": _part(left)} if problem.chart.boxed else {})
 
 
 @measure.register
 def _(problem: Dubins, path: Path) -> dict[str, float]:
-    """It cannot stop: the mean distance from the target late on, in metres; and how many were ever in an obstacle."""
-    crossed = (path.each(problem.gap) < 0.0).any(dim=0)
-    return {"distance": float(path.each(problem.distance, late=True).mean()), "crossed": _part(crossed)}
+    """It cannot stop: the mean distance from the target late on, in metres; and how many were ever in an obstacle, or out of
+    a room."""
+    crossed, left = (path.each(problem.gap) < 0.0).any(dim=0), path.each(problem.outside).any(dim=0)
+    found = {"distance": float(path.each(problem.distance, late=True).mean()), "crossed": _part(crossed)}
+    return found | ({"left": _part(left)} if problem.walls else {})
 
 
 @measure.register(Kuramoto)

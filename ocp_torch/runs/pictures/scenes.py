@@ -20,6 +20,7 @@ from ocp_torch.problems.systems.planar import PlanarVehicle
 from ocp_torch.problems.systems.quadrotor import Quadrotor
 from ocp_torch.problems.systems.robot import RobotArm
 from ocp_torch.problems.systems.satellite import Satellite
+from ocp_torch.runs.frame import frame_of
 from ocp_torch.runs.metrics.measures import Path
 from ocp_torch.runs.pictures.bodies import GHOSTS, draw_cart, draw_double_pendulum, draw_quadrotors, draw_satellites
 from ocp_torch.runs.pictures.strokes import broken, draw_balls, draw_obstacles, tracks
@@ -34,9 +35,10 @@ def draw_arm(problem: Linkage, axes: Any, path: Path, k: int) -> None:
     obstacles = draw_obstacles if len(base) == 2 else draw_balls
     obstacles(axes, problem.obstacles, problem.clearance)
     *others, (mean, _) = tracks(path, k)
-    poses = problem.joints(mean)
+    joints = lambda x: problem.joints(problem.from_torus(x))
+    poses = joints(mean)
     for x, look in others:
-        axes.plot(*problem.joints(x)[:, -1].T, "-", **{**look, "color": "C1"})
+        axes.plot(*joints(x)[:, -1].T, "-", **{**look, "color": "C1"})
     for j in range(0, k + 1, max(1, len(path.times) // GHOSTS)):
         axes.plot(*poses[j].T, "-", color="C0", alpha=0.15 + 0.35 * j / len(path.times))
     axes.plot(*poses[:, -1].T, "-", color="C1", linewidth=1.0)
@@ -46,17 +48,18 @@ def draw_arm(problem: Linkage, axes: Any, path: Path, k: int) -> None:
 
 
 def draw_vehicles(problem: PlanarVehicle, axes: Any, path: Path, k: int) -> None:
-    """Trajectories in the periodic plane with their headings."""
-    draw_obstacles(axes, problem.obstacles, problem.clearance, problem.size)
+    """Trajectories in the plane, or between its walls, with their headings."""
+    draw_obstacles(axes, problem.obstacles, problem.clearance, None if problem.walls else problem.size)
     some = torch.cat([torch.arange(0, k, max(1, len(path.times) // 16)), torch.tensor([k])])
     for x, look in tracks(path, k):
-        track, ahead = problem.from_torus(x)[:, :2], problem.heading(x)
+        track, ahead = (s := problem.from_torus(x))[:, :2], problem.heading(s)
         axes.plot(*broken(track, 0.5 * problem.size).T, **look)
         if "alpha" not in look:
             axes.quiver(*track[some].T, *ahead[some].T, color=look["color"], scale=28, width=0.005, pivot="mid")
     axes.plot(*problem.target, "*", color="k", markersize=14)
     limits = {"xlim": (0, problem.size), "ylim": (0, problem.size)}
-    axes.set(**limits, aspect="equal", xlabel="m", title=f"{path.times[k]:.2f}")
+    axes.set(**limits, aspect="equal", title=f"{path.times[k]:.2f} s")
+    axes.set(xlabel=problem.coordinates[0].label, ylabel=problem.coordinates[1].label)
 
 
 def draw_phases(problem: Kuramoto | PhaseNeurons, axes: Any, path: Path, k: int) -> None:
@@ -82,7 +85,7 @@ def draw_system(problem: System, axes: Any, path: Path, k: int) -> None:
         drawn = torch.stack([path.times[: k + 1], track[:, 0]], dim=-1) if alone else track
         axes.plot(*drawn.T, **look)
         axes.plot(*drawn[-1], "o", color=look["color"], markersize=4)
-    ends = [(c.centre - 0.5 * c.length, c.centre + 0.5 * c.length) for c in shown]
+    ends = [tuple(end) for end in frame_of(problem).ends[:2].tolist()]
     time = (0.0, float(path.times[-1]))
     axes.set(xlim=time if alone else ends[0], ylim=ends[-1], title=f"{path.times[k]:.2f}")
     axes.set_xlabel("time" if alone else shown[0].label, parse_math=False)

@@ -1,0 +1,58 @@
+r"""Noise in physical units, and what it is on the torus: cut off at the seams as all motion is."""
+
+import torch
+from torch import Tensor
+
+from ocp_torch.maths import jets
+from ocp_torch.problems.physical.chart import Chart
+from ocp_torch.problems.problem import Problem
+
+
+class Disturbed(Problem):
+    """A problem with a ``chart``, whose noise is that of `disturbance`, or constant columns that `disturb` was given."""
+
+    chart: Chart
+    _columns: Tensor | None = None
+
+    def disturbance(self, s: Tensor) -> Tensor | None:
+        """`sigma`, ``(N, d, k)``, units of the coordinates per square root of the unit of time; `None` for no noise. By
+        default what `disturb` was given where there is a box."""
+        return None if self._columns is None else self._like(s, "columns", self._columns).expand(len(s), -1, -1)
+
+    def disturb(self, columns: Tensor) -> None:
+        """Noise ``columns`` ``(d, k)`` that are the same everywhere in the box, as `disturbance` has them; for `__init__`."""
+        columns = columns.double()[:, columns.any(dim=0)]
+        if not self.chart.boxed:  # on the torus it is the same everywhere too
+            self.add_noise(columns / self.chart.length.unsqueeze(-1))
+        elif columns.shape[1]:
+            self._columns = columns
+
+    @property
+    def _constant(self) -> bool:
+        """Whether the disturbance is the same everywhere."""
+        return type(self).disturbance is Disturbed.disturbance
+
+    def _disturbance_at(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Physical states, and `disturbance` there; neither is asked for where there is none."""
+        quiet = self._constant and self._columns is None
+        s = x if quiet else self.chart.from_torus(x)
+        return s, None if quiet else self.disturbance(s)
+
+    def noise(self, x: Tensor) -> Tensor | None:
+        even, (s, sigma) = super().noise(x), self._disturbance_at(x)
+        if sigma is None:
+            return even
+        rate = self.chart.cut(s).unsqueeze(-1) / self.chart.lengths(s)
+        sigma = rate.unsqueeze(-1) * sigma
+        return sigma if even is None else torch.cat([even, sigma], dim=-1)
+
+    def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Of `D_ij = chi^2 E_ij / (length_i length_j)` with `E = sigma sigma^T / 2` of `disturbance`, by the product rule."""
+        zero, (s, sigma) = (torch.zeros_like(x), torch.zeros_like(x[:, 0])), self._disturbance_at(x)
+        if sigma is None:
+            return zero
+        div_E, div_div_E = zero if self._constant else jets.diffusion_divergences(self.disturbance, s)
+        square = jets.jet(lambda at: self.chart.cut(at).square(), s, sigma)
+        along = 0.5 * (sigma @ torch.einsum("ndk,nd->nk", sigma, square.gradient).unsqueeze(-1)).squeeze(-1)
+        div_div_D = square.curvature + 2.0 * (square.gradient * div_E).sum(dim=-1) + square.value * div_div_E
+        return (along + square.value.unsqueeze(-1) * div_E) / self.chart.lengths(s), div_div_D
