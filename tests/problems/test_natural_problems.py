@@ -380,6 +380,20 @@ def test_the_pendulum_accelerates_as_gymnasiums_does():
     torch.testing.assert_close(2.0 * pendulum.seam * velocity[:, 1], expected, **ROUNDING)
 
 
+def test_its_square_cost_is_gymnasiums_up_to_a_factor_within_the_speed_limit():
+    pendulum = Pendulum(torque_cost=0.001, square_cost=True)
+    angle, velocity = (torch.linspace(-end, end, 30, dtype=torch.float64) for end in (3.14, 7.99))
+    s = torch.cartesian_prod(angle, velocity)
+    theirs = s[:, 0].square() + 0.1 * s[:, 1].square()
+    torch.testing.assert_close(
+        pendulum.state_cost(pendulum.to_torus(s)) / pendulum._scale, theirs, rtol=1e-10, atol=1e-12
+    )
+    everywhere = pendulum.state_cost(
+        pendulum.to_torus(torch.cartesian_prod(angle, torch.linspace(-9.99, 9.99, 50).double()))
+    )
+    assert everywhere.max() <= pendulum.state_cost_bound
+
+
 def test_its_cost_is_gymnasiums_near_upright_up_to_a_factor():
     pendulum = Pendulum(torque_cost=0.001)
     x = pendulum.to_torus(torch.tensor([[0.05, 3.0], [-0.02, -7.9]], dtype=torch.float64))

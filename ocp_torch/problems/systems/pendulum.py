@@ -1,12 +1,13 @@
 r"""Swing up a pendulum by a torque at its pivot: the model and parameters of Gymnasium's Pendulum-v1, made periodic."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError, require_number
+from ocp_torch.errors import InputError, require_flag, require_number
 from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.physical.coordinates import Angle, Interval
 from ocp_torch.problems.physical.prices import scaled_limit
@@ -25,7 +26,8 @@ class Pendulum(System):
     Cost `f = s (2 (1 - cos theta) + 0.1 c(theta'))` and `s torque_cost tau^2 = |u|^2 / 2` with `tau = max_torque u` and
     `s = 1 / (2 torque_cost max_torque^2)`: Gymnasium's `theta^2 + 0.1 theta'^2 + 0.001 tau^2`, times `s`, with `theta^2` made
     smooth at the bottom (it agrees to second order upright), and with a torque cost of its own, since without a limit on
-    the torque Gymnasium's 0.001 makes it all but free. With `torque_cost = 0.001` and a control limit of 1 the two agree.
+    the torque Gymnasium's 0.001 makes it all but free. With ``square_cost``, which is `theta^2` with its kink at the bottom,
+    `torque_cost = 0.001` and a control limit of 1 the two agree.
 
     The box is `|theta'| <= max_speed`, with the seam at ``seam`` `= W` rad/s; `c` is `theta'^2` in it and flattens beyond
     (where Gymnasium clips the speed), and the path in phase space stays the same. It starts everywhere, also beyond. `d = 2`,
@@ -47,6 +49,7 @@ class Pendulum(System):
         seam: float = 10.0,
         max_torque: float = 2.0,
         torque_cost: float = 0.1,
+        square_cost: bool = False,
         discount: float = 2.0,
         exponent: float = 2.0,
         control_limit: Limit = None,
@@ -76,13 +79,15 @@ class Pendulum(System):
             noise=noise,
         )
         self.torque_cost = require_number("problem.torque_cost", torque_cost, above=0.0)
+        self.square_cost = require_flag("problem.square_cost", square_cost)
         self.torque_noise = require_number("problem.torque_noise", torque_noise, at_least=0.0)
         self._pull = 1.5 * self.gravity / self.length
         self._push = 3.0 / (self.mass * self.length**2)
         self.disturb(torch.tensor([[0.0], [self._push * self.torque_noise]], dtype=torch.float64))
         self._scale = 0.5 / (self.torque_cost * self.max_torque**2)
         self._square_at_seam = float(self._square(torch.tensor(self.seam, dtype=torch.float64)))
-        self.state_cost_bound = self._scale * (4.0 + SPEED_COST * self._square_at_seam)
+        largest = math.pi**2 if self.square_cost else 4.0
+        self.state_cost_bound = self._scale * (largest + SPEED_COST * self._square_at_seam)
         self.occupation_bound = bound_at_rest(self, [0.0, 0.0])
 
     def _square(self, velocity: Tensor) -> Tensor:
@@ -96,8 +101,9 @@ class Pendulum(System):
         )
 
     def cost(self, s: Tensor) -> Tensor:
+        angle = s[:, 0]
         # 2 (1 - cos) as 4 sin^2 of the half angle loses no digits near upright.
-        tilt = 4.0 * (0.5 * s[:, 0]).sin().square()
+        tilt = angle.square() if self.square_cost else 4.0 * (0.5 * angle).sin().square()
         return self._scale * (tilt + SPEED_COST * self._square(s[:, 1]))
 
     def state_cost(self, x: Tensor) -> Tensor:
