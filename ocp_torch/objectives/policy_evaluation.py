@@ -15,10 +15,10 @@ class PolicyEvaluation(Objective):
     `r = mu0 - mu (1 + (grad log mu . g_u + div g_u) / rho)`, and what noise adds, is the Liouville residual, `Q_u` the
     Bellman slack and `s` the scale of the `V` network: the strong forms of P(u) and D(u) (section 5.4 of the paper).
     The two players do not interact; there is no hinge and no game. Missing mass (`r > 0`) may cost the bounds more, or
-    less, than surplus: ``positive_weight`` is what `r^2` weighs there, where it weighs 1 elsewhere. With noise `r^2` is
-    divided by `1 + mu`, as data: a density of high peaks is then worth fitting. Its plain squares are larger than those of
-    `mu = 0`, to which fits collapsed (dubins with heading and position noise: Lagrangian bound 130 % above OPT; divided,
-    5 %).
+    less, than surplus: ``positive_weight`` is what `r^2` weighs there, where it weighs 1 elsewhere. And `r^2` is divided by
+    `1 + mu`, as data: a density of high peaks is then worth fitting. Its plain squares are larger than those of `mu = 0`, to
+    which fits collapsed (Lagrangian bound above Perf, plain and divided: dubins with noise 130 and 5 %; without, arm 106 and
+    62 %, kuramoto 22 and 9 %, pendulum 34 and 24 %, unicycle 4.8 and 5.2 %; on the torus they differ by 0.006 %).
     """
 
     def __init__(self, problem: ClosedLoop, with_value: bool, positive_weight: float = 1.0) -> None:
@@ -33,9 +33,7 @@ class PolicyEvaluation(Objective):
         generator = self.generator(samples)
         mu, outflow = generator.occupation_outflow(fields.log_occupation)
         r = samples.mu0 - outflow
-        squares = torch.where(r > 0.0, self.positive_weight, 1.0) * r.square()
-        if samples.noise is not None:
-            squares = squares / (1.0 + mu.detach())
+        squares = torch.where(r > 0.0, self.positive_weight, 1.0) * r.square() / (1.0 + mu.detach())
         losses = {"occupation": samples.mean(squares)}
         if "value" in self.players:
             slack = generator.hjb_slack(generator.jet(fields.value))
