@@ -92,7 +92,7 @@ class ValueIteration:
         weight = (values / values.mean().clamp_min(1e-30) + LEVEL) ** -2.0
         weight = weight / weight.mean()
         for _ in range(FITS):
-            rows = self._pick(len(x), BATCH)
+            rows = self._pick(len(x), min(BATCH, len(x)))
             loss = (weight[rows] * ((self.network(x[rows]) - y[rows]) / self.scale).square()).mean()
             self.loss = float(loss.detach())
             if not math.isfinite(self.loss):

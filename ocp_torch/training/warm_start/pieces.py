@@ -31,7 +31,7 @@ def roll(problem: Problem, value: Field, x: Tensor, pace: Pace, steps: int, gene
     Of the cost of a step the part of the state is the mean of that at its ends, exact to second order.
     """
     policy, cost = ValuePolicy(problem, value), problem.control_cost
-    states, values, costs = [x], [], []
+    states, values, costs = [x], list[Tensor](), list[Tensor]()
     with torch.no_grad():
         at = Samples.live(problem, x)
     for k in range(steps + 1):
