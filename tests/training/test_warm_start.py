@@ -76,7 +76,10 @@ class Stop(Silent):
             raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("way", [("method=dual",), ("method=pd", "problem.torque_noise=0.3")])
+NOISY = pytest.param(("method=pd", "problem.torque_noise=0.3"), marks=pytest.mark.nightly)
+
+
+@pytest.mark.parametrize("way", [("method=dual",), NOISY])
 def test_a_run_that_is_killed_in_its_warm_start_goes_on_to_the_same_bits(way, tmp_path):
     way = (*SWING, *WARM, *way, "trainer.steps=3")
     whole = small(*way)
