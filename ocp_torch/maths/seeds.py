@@ -41,7 +41,7 @@ class Branch(IntEnum):
     BROWNIAN = 24  # paths of the noise; below, the rows they are for and how often their steps are halved
     POOL = 28  # states that are scored to see where training states count
     START_MASS = 29  # states for the mass of a start; below, the replicate
-    WARM_START = 31  # pieces of trajectory of the warm start, and from one on the starts of its looks
+    WARM_START = 31  # pieces of trajectory of the warm start, and from one on the starts of its trials
     AUDIT = 1000  # which trajectories are simulated again with finer steps
 
 

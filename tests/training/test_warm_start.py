@@ -5,11 +5,12 @@ import math
 
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.errors import InputError
-from ocp_torch.fields import PeriodicMLP
+from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.runs.run import run_to_end
 from ocp_torch.training.monitor import Silent
@@ -102,6 +103,13 @@ def test_the_controller_of_the_warm_start_is_a_candidate_and_can_be_handed_out(t
     trainer = small(*WARM, "method=dual", "trainer.figures=false")
     certificate = run_to_end(trainer, build_certificate_settings(trainer.config), tmp_path)
     assert {name for name, perf in certificate.perf.items() if perf is not None} == {"value", "trajectories"}
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    assert (
+        [e.step for e in events.Scalars("warm_start/cost")]
+        == [e.step for e in events.Scalars("warm_start/loss")]
+        == [10, 12]
+    )
     fields = trainer.averaged_fields
     x = states(trainer.problem, 16, dtype=torch.float32)
     best = ValuePolicy(trainer.problem, fields.trajectory_value)(x)
@@ -136,6 +144,47 @@ def test_auto_stays_out_where_mass_cannot_gather_and_changes_no_bit_there():
 def test_what_cannot_be_is_refused_in_a_sentence(overrides, words):
     with pytest.raises(InputError, match=words):
         small(*overrides)
+
+
+class Told:
+    """A trial whose outcomes are known beforehand."""
+
+    def __init__(self, *costs: float) -> None:
+        self.costs = list(costs)
+
+    def cost_of_nothing(self) -> float:
+        return 5.0
+
+    def cost_of(self, value) -> float:
+        return self.costs.pop(0)
+
+
+def warmed_up_to(*costs: float) -> ValueIteration:
+    """The end of one whose trials cost ``costs``."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = PeriodicMLP(1, width=4)
+    warm = ValueIteration(fresh("circle rho=2"), network, WarmStartSettings("on", 10**4, 8, 1, 0.5), 0)
+    warm.trial = Told(*costs)
+    while not warm.done:
+        warm.advance()
+    return warm
+
+
+def test_the_best_controller_is_kept_and_gone_back_to_and_no_improvement_is_the_end():
+    warm = warmed_up_to(4.0, 2.0, 3.0, 3.0, 2.0, 1.0, 1.5, 1.0, 1.0)
+    assert (warm.least, warm.trial.costs, warm.round, warm.found) == (1.0, [], 90, True)
+    assert differences(warm.best, warm.average.state_dict()) == []
+    assert warm.optimizer.param_groups[0]["lr"] == 5e-4  # halved twice
+    useless = warmed_up_to(*[6.0] * 6)
+    assert (useless.found, useless.least) == (False, 5.0)
+    fields = Fields({"value": PeriodicMLP(1, width=4), "trajectory_value": PeriodicMLP(1, width=4)})
+    before = {name: tensor.clone() for name, tensor in fields.state_dict().items()}
+    useless.hand_over([fields])
+    assert differences(before, fields.state_dict()) == []
+    warm.hand_over([fields])
+    assert differences(fields.value.state_dict(), warm.best) == []
+    assert differences(fields.trajectory_value.state_dict(), warm.best) == []
 
 
 @pytest.mark.nightly

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
-from ocp_torch.maths.jets import Field
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem
 from ocp_torch.problems.starts import drawn_starts
@@ -18,6 +17,7 @@ from ocp_torch.steppers.fitting import optimizer_maker
 from ocp_torch.training.warm_start.pace import Pace
 from ocp_torch.training.warm_start.pieces import lambda_returns, roll
 from ocp_torch.training.warm_start.settings import WarmStartSettings
+from ocp_torch.training.warm_start.trial import STARTS, Trial
 
 # Parts of the pieces that start uniformly, and where earlier pieces ended; the rest start as `mu0` says.
 UNIFORM, GOING_ON = 0.125, 0.5
@@ -26,9 +26,9 @@ FITS, BATCH, RATE, HALF = 16, 2048, 2e-3, 0.5
 # An error counts in units of `V` itself and this part of its mean: near the goal, where trajectories spend their time, small
 # ones decide. On a limited pendulum and a cart-pole controllers came sooner than with equal weights.
 LEVEL = 0.2
-# A look follows so many rounds: the cost from so many starts for that time, in units of `1 / rho`.
-LOOK_EVERY, LOOK_STARTS, LOOK_TIME = 10, 256, 6.0
-# After so many looks none of which is better by that part than the best, it goes on from the best at half the rate; the
+# A trial follows so many rounds.
+TRIAL_EVERY = 10
+# After so many trials none of which is better by that part than the best, it goes on from the best at half the rate; the
 # second time it is over. The best is doing nothing at first.
 PATIENCE, BETTER = 3, 0.002
 # Starts that pieces draw from, for each piece.
@@ -36,7 +36,7 @@ POOLED = 8
 
 
 class ValueIteration:
-    """Fits ``network``, a fresh `V` of ``problem``, round by round; `best` are the weights whose controller cost least.
+    """Fits a copy of ``network``, a fresh `V` of ``problem``; `best` are the weights whose controller cost least so far.
 
     ``done`` says that it is over. All that changes is in `state_dict`: a resumed one goes on to the same bits.
     """
@@ -49,20 +49,24 @@ class ValueIteration:
         self.like, self.pace = next(network.parameters()).detach(), Pace.of(problem)
         branch = derive_seed(seed, Branch.WARM_START)
         self.generator = torch.Generator().manual_seed(branch)
-        self.looked = branch + 1  # the noise of every look is the same
         self.starts = drawn_starts(problem, POOLED * settings.pieces, branch).to(self.like)
-        self.shown_starts = drawn_starts(problem, LOOK_STARTS, branch + 1).to(self.like)
+        starts = drawn_starts(problem, STARTS, branch + 1).to(self.like)
+        self.trial = Trial(problem, self.pace, starts, branch + 1)
         self.ends: Tensor | None = None  # (k, d), where pieces ended
         self.round, self.stale, self.restarts, self.done = 0, 0, 0, False
-        self.loss, self.cost, self.least = math.nan, math.nan, math.inf  # of the last fit, the last look, the best look
+        self.loss, self.cost, self.least = (
+            math.nan,
+            math.nan,
+            math.inf,
+        )  # of the last fit, the last trial, the best trial
         self.found, self.best = False, self._weights()  # whether a controller is better than none, and its weights
         self.largest = math.inf if problem.state_cost_bound is None else float(problem.state_cost_bound)
         self.scale = float(getattr(network, "scale", 1.0))
 
     def advance(self) -> bool:
-        """One round; whether a look was made after it."""
+        """One round; whether a trial was made after it."""
         if self.round == 0:
-            self.least = self.cost_of(lambda x: 0.0 * x.sum(dim=-1))
+            self.least = self.trial.cost_of_nothing()
         x = self._draw()
         pieces = roll(self.problem, self.average, x, self.pace, self.settings.steps, self.generator)
         # No controller that is worth having costs more than the dearest state.
@@ -71,9 +75,9 @@ class ValueIteration:
         self.ends = pieces.states[-1][self._pick(len(x), round(GOING_ON * len(x)))]
         self._fit(pieces.states[:-1].flatten(0, 1), y.flatten(), values[:-1].flatten())
         self.round += 1
-        due = self.round % LOOK_EVERY == 0 or self.round >= self.settings.rounds or self.done
+        due = self.round % TRIAL_EVERY == 0 or self.round >= self.settings.rounds or self.done
         if due:
-            self._look()
+            self._try()
         return due
 
     def _draw(self) -> Tensor:
@@ -105,9 +109,9 @@ class ValueIteration:
             for mean, own in zip(self.average.parameters(), self.network.parameters(), strict=True):
                 mean.lerp_(own, HALF)
 
-    def _look(self) -> None:
-        """What the present controller costs from fixed starts; keep the best, go back to it when it is long ago, and end."""
-        self.cost = self.cost_of(self.average)
+    def _try(self) -> None:
+        """What the present controller costs; keep the best, go back to it when it is long ago, and end."""
+        self.cost = self.trial.cost_of(self.average)
         if self.cost < (1.0 - BETTER) * self.least:
             self.least, self.best, self.stale, self.found = self.cost, self._weights(), 0, True
         else:
@@ -120,16 +124,6 @@ class ValueIteration:
             for group in self.optimizer.param_groups:
                 group["lr"] *= 0.5
         self.done |= self.round >= self.settings.rounds
-
-    def cost_of(self, value: Field) -> float:
-        """The mean discounted cost of the controller of ``value`` from the starts of all looks; infinite for none."""
-        steps = math.ceil(LOOK_TIME / (self.problem.discount * self.pace.step))
-        noise = torch.Generator().manual_seed(self.looked)
-        ran = roll(self.problem, value, self.shown_starts, self.pace, steps, noise)
-        # What comes later is taken to cost what it does at the end.
-        held = torch.cat([torch.zeros_like(ran.costs), ran.last.unsqueeze(0)])
-        cost = float(lambda_returns(ran.costs, held, self.problem.discount, self.pace.step, 1.0)[0].mean())
-        return cost if math.isfinite(cost) else math.inf
 
     @property
     def drawn(self) -> int:
@@ -147,6 +141,8 @@ class ValueIteration:
         """How it ended, as a user is told."""
         if not self.found:
             return f"the warm start found no controller better than none in {self.round} rounds; training starts afresh"
+        if not math.isfinite(self.loss):
+            return f"the warm start ended in round {self.round}, as its fit is not finite; the best V before is taken"
         return f"warm start: a controller of cost {self.least:.4g} after {self.round} rounds, a candidate from now on"
 
     @torch.no_grad()

@@ -40,6 +40,7 @@ class WarmStartSettings:
 
 def pays(problem: Problem, constants: Constants) -> bool:
     """Whether good controllers are likely to come late without it: mass gathers without bound, and more coordinates move by
-    themselves than there are controls. Not for a simulator, each evaluation of which may be dear."""
+    themselves than there are controls. Not for a simulator, each evaluation of which may be dear. What is found to be no
+    better than doing nothing is not used."""
     underactuated = not problem.driftless and problem.control_dim < problem.dim
     return constants.unbounded and underactuated and not isinstance(problem, Simulator)
