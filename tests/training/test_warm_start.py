@@ -129,7 +129,9 @@ def test_auto_stays_out_where_mass_cannot_gather_and_changes_no_bit_there():
         trainer.fit(Silent())
         assert trainer.state.warm is None
     assert differences(state_of(runs[0]), state_of(runs[1])) == differences(state_of(runs[0]), state_of(older)) == []
-    assert small(*SWING, "method=dual", "warm_start.mode=auto").state.warm is not None
+    auto = lambda *way: small(*way, "method=dual", "warm_start.mode=auto").state.warm
+    assert auto("problem=cart_pole") is not None
+    assert auto("problem=cart_pole", "problem.control_limit=null") is auto(*SWING) is None
 
 
 @pytest.mark.parametrize(

@@ -177,7 +177,7 @@ class ValueIteration:
         self.best = self._weights()
         for name in ("network", "average", "optimizer"):
             getattr(self, name).load_state_dict(copy.deepcopy(state[name]))
-        self.ends = ends
+        self.ends = None if ends is None else ends.to(self.like)
         self.generator.set_state(state["generator"])
 
 
