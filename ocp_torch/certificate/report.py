@@ -83,6 +83,7 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
         lines.append(f"{'OPT (exact)':26}{exact:14.8f}")
     row("Perf: controller from V", certificate["perf"].get("value"))
     row("Perf: controller w/mu", certificate["perf"].get("density"))
+    row("Perf: from trajectories", certificate["perf"].get("trajectories"))
     for kind, estimate in certificate.get(PERFORMANCE, {}).items():
         row(f"Perf, at least: {visible(kind, LONGEST_NAME)}", estimate)
     row("Perf: this controller", certificate["perf"].get("given"))

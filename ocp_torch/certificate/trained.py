@@ -75,7 +75,8 @@ class FieldsContext(Context):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainedContext(FieldsContext):
-    """Up to two controllers, from `V` and from `w / mu`: both are simulated, and the better one is handed out."""
+    """Up to three controllers, from `V`, from `w / mu` and from the `V` of a warm start: all are simulated, and the best
+    one is handed out."""
 
     divergent = "J, G and the Lagrangian bound"
 

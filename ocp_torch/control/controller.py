@@ -12,7 +12,7 @@ from torch import Tensor
 from ocp_torch.control.described import described, problem_name, require_same
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, trained_policies
 from ocp_torch.errors import InputError, notes
-from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, MODELS, VALUE, Fields
+from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, MODELS, TRAJECTORY_VALUE, VALUE, Fields
 from ocp_torch.files.limits import require_held, require_modest_problem
 from ocp_torch.files.storage import load_tensors, save_tensors
 from ocp_torch.problems import PROBLEMS, Problem
@@ -25,7 +25,7 @@ from ocp_torch.problems.physical.system import System
 SCHEMA = 1
 # What the file holds of a controller just as it is.
 PLAIN = ("model", "occupation", "kind", "certificate", "config")
-FIELDS = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION)
+FIELDS = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION, TRAJECTORY_VALUE)
 # Controls are given as what the states are.
 States = TypeVar("States", Tensor, np.ndarray)
 
@@ -34,8 +34,9 @@ States = TypeVar("States", Tensor, np.ndarray)
 class Controller:
     """`u(x)` with all it came from.
 
-    ``kind`` says which policy `u` is: ``value`` (from `V` alone) or ``density`` (`w / mu`). ``certificate`` is the dict of
-    `certificate.json`, ``config`` the resolved configuration of the run, ``model`` the network's configuration.
+    ``kind`` says which policy `u` is: ``value`` (from `V` alone), ``density`` (`w / mu`) or ``trajectories`` (from the `V` of
+    the warm start). ``certificate`` is the dict of `certificate.json`, ``config`` the resolved configuration of the run,
+    ``model`` the network's configuration.
     """
 
     problem: Problem

@@ -77,7 +77,8 @@ def occupation_density(kind: str | None, problem: Problem, fields: Fields, const
 
 
 def trained_policies(kind: str | None, problem: Problem, fields: Fields, constants: Constants) -> dict[str, Policy]:
-    """The controllers trained fields give: ``value`` if they hold `V`, ``density`` if they hold `w`."""
+    """The controllers trained fields give: ``value`` if they hold `V`, ``density`` if they hold `w`, and ``trajectories`` if
+    they hold the `V` of a warm start."""
     policies: dict[str, Policy] = {}
     if fields.value is not None:
         policies["value"] = ValuePolicy(problem, fields.value)
@@ -85,4 +86,6 @@ def trained_policies(kind: str | None, problem: Problem, fields: Fields, constan
     if fields.control_density is not None and (kind == NETWORK or problem.has_simulator):
         mu = occupation_density(kind, problem, fields, constants)
         policies["density"] = density_policy(fields.control_density, mu, problem.control_cost)
+    if fields.trajectory_value is not None:
+        policies["trajectories"] = ValuePolicy(problem, fields.trajectory_value)
     return policies

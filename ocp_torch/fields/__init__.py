@@ -7,10 +7,19 @@ null.
 
 from typing import Any
 
-from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, VALUE, Fields
+from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, TRAJECTORY_VALUE, VALUE, Fields
 from ocp_torch.fields.mlp import PeriodicMLP
 from ocp_torch.fields.sobolev import SobolevField
 
 MODELS: dict[str, Any] = {"mlp": PeriodicMLP, "sobolev": SobolevField}
 
-__all__ = ["CONTROL_DENSITY", "LOG_OCCUPATION", "MODELS", "VALUE", "Fields", "PeriodicMLP", "SobolevField"]
+__all__ = [
+    "CONTROL_DENSITY",
+    "LOG_OCCUPATION",
+    "MODELS",
+    "TRAJECTORY_VALUE",
+    "VALUE",
+    "Fields",
+    "PeriodicMLP",
+    "SobolevField",
+]

@@ -14,6 +14,8 @@ from ocp_torch.fields.waves import STATES, prominent_waves
 from ocp_torch.problems.problem import Problem
 
 VALUE, CONTROL_DENSITY, LOG_OCCUPATION = "value", "control_density", "log_occupation"
+# A second `V`, from values of trajectories: what controls best and what bounds best differ. No player moves it.
+TRAJECTORY_VALUE = "trajectory_value"
 # Builds a network from (dim, outputs, shift, scale); outputs None means a scalar field.
 NetworkFactory = Callable[..., nn.Module]
 
@@ -37,6 +39,7 @@ class Fields(nn.Module):
             CONTROL_DENSITY: dict(outputs=problem.control_dim, shift=0.0, scale=control),
             LOG_OCCUPATION: dict(outputs=None, shift=0.0, scale=1.0),
         }
+        forms[TRAJECTORY_VALUE] = forms[VALUE]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             fields = cls({name: network(dim=problem.dim, **forms[name]) for name in names})
@@ -59,6 +62,11 @@ class Fields(nn.Module):
     def log_occupation(self) -> Any:
         """`log mu`: ``(N, d) -> (N,)``."""
         return self._get(LOG_OCCUPATION)
+
+    @property
+    def trajectory_value(self) -> Any:
+        """The `V` of the warm start: ``(N, d) -> (N,)``."""
+        return self._get(TRAJECTORY_VALUE)
 
     def _get(self, name: str) -> nn.Module | None:
         return self.networks[name] if name in self.networks else None

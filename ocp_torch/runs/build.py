@@ -13,7 +13,7 @@ from torch import nn
 from ocp_torch.certificate import CertificateSettings, StageSettings
 from ocp_torch.control.controller import problem_name
 from ocp_torch.errors import InputError, call, nearest, require_choice, require_integer, require_number, require_section
-from ocp_torch.fields import MODELS, VALUE, Fields
+from ocp_torch.fields import MODELS, TRAJECTORY_VALUE, VALUE, Fields
 from ocp_torch.fields.fields import cost_unit
 from ocp_torch.fields.waves import STATES
 from ocp_torch.files.limits import require_memory
@@ -24,7 +24,7 @@ from ocp_torch.problems import Dataset, Problem
 from ocp_torch.problems.blame import in_their_words, origin, words
 from ocp_torch.problems.checks.check import check_once
 from ocp_torch.problems.commands import current_target
-from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.problems.problem import MOST_COORDINATES
 from ocp_torch.steppers import STEPPERS, Stepper, averaged, optimizer_maker, schedule_maker
 from ocp_torch.training.batches import Batches
@@ -33,6 +33,8 @@ from ocp_torch.training.health import Health
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.state import TrainState
 from ocp_torch.training.trainer import Trainer
+from ocp_torch.training.warm_start.iteration import ValueIteration
+from ocp_torch.training.warm_start.settings import WarmStartSettings
 
 # Numbers that a step keeps per unit of a network and state: 6 to 10 were measured, in one and in four dimensions.
 VALUES_PER_UNIT = 5
@@ -111,8 +113,13 @@ def build_trainer(config: dict) -> Trainer:
             "use dual or pd."
         )
     network = build_network(config["model"])
-    fields = Fields.build(problem, objective.fields, network, derive_seed(seed, Branch.WEIGHTS))
+    warm_start = _warm_start(config, problem, objective, constants)
+    # The last of them: the first weights of the others are what they are without it.
+    names = (*objective.fields, *([] if warm_start is None else [TRAJECTORY_VALUE]))
+    fields = Fields.build(problem, names, network, derive_seed(seed, Branch.WEIGHTS))
     fields = fields.to(dtype=settings.torch_dtype, device=settings.torch_device)
+    if warm_start is not None:
+        fields.trajectory_value.requires_grad_(False)
     # What a step keeps of a state at least: x, f, a and mu0 (a constant B takes no room), and all units with derivatives.
     kept = 2 * problem.dim + 2 + VALUES_PER_UNIT * sum(p.shape[0] for p in fields.parameters() if p.dim() == 2)
     require_memory("trainer.batch", settings.batch, settings.torch_dtype.itemsize * kept)
@@ -133,9 +140,18 @@ def build_trainer(config: dict) -> Trainer:
         assert isinstance(problem, Dataset)
         sampler = RowSampler(problem.rows, seed, problem.recording.digest)
     batches = Batches(problem, fields, objective, sampler, settings.batch, seed, visited)
-    names = (problem_name(problem), name)
-    state = TrainState(names, config, fields, average, stepper, batches, Health.of(problem), constants)
+    warm = None if warm_start is None else ValueIteration(problem, fields.trajectory_value, warm_start, seed)
+    run = (problem_name(problem), name)
+    state = TrainState(run, config, fields, average, stepper, batches, Health.of(problem), constants, warm=warm)
     return Trainer(problem, objective, settings, network, seed, state)
+
+
+def _warm_start(config: dict, problem: Problem, objective: Objective, constants: Constants) -> WarmStartSettings | None:
+    """The settings of the warm start, where there is to be one; runs from before there was any have no section for it."""
+    if config.get("warm_start") is None:
+        return None
+    settings = call(WarmStartSettings, "warm_start", require_section("warm_start", config["warm_start"]))
+    return settings if settings.wanted(problem, objective, constants) else None
 
 
 def build_network(model: object) -> Callable[..., nn.Module]:

@@ -29,6 +29,7 @@ TITLES = {
     "value": "V",
     "control_value": "u from V",
     "control_density": "u = w / mu",
+    "control_trajectories": "u from V of trajectories",
     "occupation": "mu",
     "slack": "HJB slack Q",
 }

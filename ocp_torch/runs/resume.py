@@ -19,7 +19,7 @@ from ocp_torch.training.checkpoint import LAST
 # Classes that a file may name; those of earlier versions are read by their present names.
 OWN_TARGETS = {f"{PACKAGE}.{c.__name__}" for c in PROBLEMS.values()}
 # What a checkpoint's tensors belong to; everything else may be set anew at a resume.
-FIXED = ("problem", "method", "model", "averaging", "sampler", "seed", "optimizer.name", "trainer.dtype")
+FIXED = ("problem", "method", "model", "averaging", "sampler", "warm_start", "seed", "optimizer.name", "trainer.dtype")
 
 
 def find_run(composed: dict, roots: Iterable[Path]) -> Path | None:

@@ -100,7 +100,7 @@ def run_to_end(trainer: Trainer, settings: CertificateSettings, folder: Path) ->
     last = folder / "checkpoints" / LAST
     for place in (folder, last.parent, *folder.glob(".hydra/resume_*")):
         sweep_temporaries(place)
-    if trainer.step == 0:
+    if trainer.fresh:
         seed_generators(trainer.seed)
     log.info(summary(trainer))
     try:
@@ -160,6 +160,7 @@ def summary(trainer: Trainer) -> str:
         f"{method}: {', '.join(trainer.objective.fields)}, {weights:,} weights, {settings.dtype} on {settings.torch_device}",
         f"{settings.steps:,} steps of {settings.batch} states, seed {trainer.seed}",
         *([f"going on from step {trainer.step:,}"] if trainer.step else []),
+        *([trainer.state.warm.plan] if trainer.state.warm is not None and not trainer.state.warm.done else []),
         f"bounds: {used}",
         *(f"warning: {warning}" for warning in (*constants.warnings, *trainer.objective.notes)),
     ]

@@ -51,12 +51,14 @@ class Monitor(Silent):
     gradient_norm, violation and throughput."""
 
     def __init__(self, folder: Path, trainer: Trainer) -> None:
-        done = trainer.step
+        warm = trainer.state.warm
+        done = trainer.step or (0 if warm is None else warm.round)
         # What a killed start still wrote beyond its last checkpoint is not shown twice.
         self.writer = SummaryWriter(str(folder), purge_step=done + 1 if done else None)
         # disable=None: no bar where the output is not a terminal.
         hidden = None if trainer.settings.progress else True
-        self.bar = tqdm(total=max(trainer.end, done), initial=done, unit="step", dynamic_ncols=True, disable=hidden)
+        step = trainer.step
+        self.bar = tqdm(total=max(trainer.end, step), initial=step, unit="step", dynamic_ncols=True, disable=hidden)
         self.stages = Stages(hidden)
         self._folder = folder
         self._shown: dict[str, str] = {}
@@ -87,6 +89,20 @@ class Monitor(Silent):
         self._mark = (now, trainer.samples)
         self.writer.add_scalar("throughput/samples_per_second", speed, step)
         self._show({"samples/s": f"{speed:,.0f}"})
+
+    def warmed(self, trainer: Trainer, looked: bool) -> None:
+        warm = trainer.state.warm
+        assert warm is not None  # who tells of it has one
+        self.bar.set_description_str(f"warm start {warm.round}/{warm.settings.rounds}", refresh=False)
+        self._show({"loss": f"{warm.loss:.2g}", "cost": f"{warm.cost:.4g}"})
+        self.bar.refresh()
+        if looked:
+            for name in ("loss", "cost"):
+                self.writer.add_scalar(f"warm_start/{name}", getattr(warm, name), warm.round)
+            log.debug("warm start, round %d: cost %.6g, best %.6g", warm.round, warm.cost, warm.least)
+        if warm.done:
+            self.bar.set_description_str("")
+            log.info(warm.outcome)
 
     def evaluated(self, trainer: Trainer, certificate: Certificate) -> None:
         record(self.writer, certificate, trainer.step)

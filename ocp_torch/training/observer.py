@@ -13,6 +13,9 @@ class Silent:
     def evaluated(self, trainer, certificate: Certificate) -> None:
         """A quick certificate was made."""
 
+    def warmed(self, trainer, looked: bool) -> None:
+        """A round of the warm start was made; ``looked`` says whether its controller was tried after it."""
+
     def extended(self, trainer) -> None:
         """Another round begins."""
 

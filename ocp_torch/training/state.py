@@ -16,6 +16,7 @@ from ocp_torch.steppers import Average, NonFiniteError, Stepper
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.health import Health
 from ocp_torch.training.settings import TrainerSettings
+from ocp_torch.training.warm_start.iteration import ValueIteration
 
 # What decides the learning rates: where one of these differs at a resume, they are those of the new configuration.
 rates_of = lambda config: (config["optimizer"], config["schedule"], config["trainer"]["steps"])
@@ -43,6 +44,7 @@ class TrainState:
     pending: bool = False  # a full certificate may reach the target gap, and is to be made
     retry: int = 0  # none is made before this step
     ended: bool = False  # nothing was left to do when it was saved
+    warm: ValueIteration | None = None  # the warm start, where there is one
 
     def state_dict(self) -> dict:
         """All of it as plain data and tensors."""
@@ -56,6 +58,7 @@ class TrainState:
             "stepper": self.stepper.state_dict(),
             "batches": self.batches.state_dict(),
             "watch": self.health.state_dict(),
+            "warm": None if self.warm is None else self.warm.state_dict(),
             "generators": generator_states(),
         }
 
@@ -92,6 +95,8 @@ class TrainState:
         self.stepper.load_state_dict(saved["stepper"], moves=moves)
         self.batches.load_state_dict(saved["batches"])
         self.health.load_state_dict(saved["watch"])
+        if self.warm is not None:
+            self.warm.load_state_dict(saved["warm"])
         # Last: to restore the rest may draw from them.
         restore_generators(saved["generators"])
 

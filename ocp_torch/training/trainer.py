@@ -51,6 +51,11 @@ class Trainer:
         return self.state.step
 
     @property
+    def fresh(self) -> bool:
+        """Whether nothing has been done yet."""
+        return self.step == 0 and (self.state.warm is None or self.state.warm.round == 0)
+
+    @property
     def samples(self) -> int:
         return self.state.samples
 
@@ -87,6 +92,7 @@ class Trainer:
         an update that is not finite.
         """
         self.state.ended = False
+        self._warm_up(monitor, checkpoint, signals)
         while reason_to_stop(self.settings, self.state) is None:
             if self.step < self.end:
                 self._advance(monitor, checkpoint)
@@ -106,6 +112,24 @@ class Trainer:
     def why_stopped(self) -> str:
         """The reason for which `fit` stopped, in words."""
         return in_words(self.stopped, self.settings, self.state)
+
+    def _warm_up(self, monitor: Silent, checkpoint: Path | None, signals: Signals | None) -> None:
+        """What is left of the warm start; `V` then begins as its best one, which itself stays a candidate."""
+        state, warm = self.state, self.state.warm
+        while warm is not None and not warm.done and reason_to_stop(self.settings, state) is None:
+            started = time.perf_counter()
+            looked = warm.advance()
+            if looked:
+                warm.hand_over([self.fields, self.averaged_fields])
+            state.samples += warm.drawn
+            spent = time.perf_counter() - started
+            state.seconds, state.elapsed = state.seconds + spent, state.elapsed + spent
+            monitor.warmed(self, looked)
+            stop = signals is not None and signals.received is not None
+            if looked or stop:
+                self.save(checkpoint)
+            if stop and signals is not None:
+                signals.take()
 
     def _advance(self, monitor: Silent, checkpoint: Path | None) -> None:
         """One step, and what is due after it."""

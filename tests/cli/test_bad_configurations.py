@@ -17,7 +17,7 @@ EXAMPLES = int(os.environ.get("OCP_TORCH_EXAMPLES", "200"))
 
 GROUPS = {group.name: sorted(p.stem for p in group.glob("*.yaml")) for group in CONFIGS.iterdir() if group.is_dir()}
 DEFAULTS = {"problem": "circle", "method": "pd", "model": "mlp", "optimizer": "soap", "schedule": "cosine"}
-DEFAULTS |= {"stepper": "simultaneous", "averaging": "ema", "sampler": "default"}
+DEFAULTS |= {"stepper": "simultaneous", "averaging": "ema", "sampler": "default", "warm_start": "default"}
 DEFAULTS |= {"trainer": "default", "certificate": "default"}
 FIELDS = [
     f"{group}.{field}"

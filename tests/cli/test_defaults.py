@@ -21,6 +21,7 @@ from ocp_torch.studies.reference.reference import solve_reference
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.budgets import fill
 from ocp_torch.training.settings import TrainerSettings
+from ocp_torch.training.warm_start.settings import WarmStartSettings
 
 register_resolvers()
 CHOICES = sorted(
@@ -37,6 +38,7 @@ TAKERS: dict[str, Callable[[dict], list[Callable]]] = {
     "averaging": lambda section: [averaged],
     "sampler": lambda section: [Batches, *SAMPLERS.values()],
     "trainer": lambda section: [TrainerSettings],
+    "warm_start": lambda section: [WarmStartSettings],
     "certificate": lambda section: [CertificateSettings],
 }
 # Fields that choose the taker, or are made of others.

@@ -1,0 +1,217 @@
+"""The warm start: what it fits is the value, a run stopped in it goes on to the same bits, and it knows when to stay out."""
+
+import copy
+import math
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from ocp_torch.control.controller import Controller, load_controller
+from ocp_torch.control.policies import ValuePolicy
+from ocp_torch.errors import InputError
+from ocp_torch.fields import Fields, PeriodicMLP
+from ocp_torch.runs.build import build_certificate_settings, build_trainer
+from ocp_torch.runs.run import run_to_end
+from ocp_torch.training.monitor import Silent
+from ocp_torch.training.warm_start.iteration import ValueIteration
+from ocp_torch.training.warm_start.pace import Pace
+from ocp_torch.training.warm_start.pieces import lambda_returns, roll
+from ocp_torch.training.warm_start.settings import WarmStartSettings
+from support.bits import differences
+from support.small import SMALL, configured, small, state_of
+from support.zoo import FEW_SMOOTH, NATURAL, QUIET, fresh, on, states
+
+pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
+WARM = ("warm_start.mode=on", "warm_start.rounds=12", "warm_start.pieces=16", "warm_start.steps=4")
+SWING = ("problem=pendulum", "problem.control_limit=1.0")
+
+
+@pytest.mark.parametrize("trace", [0.0, 0.6, 1.0])
+def test_lambda_returns_are_the_weighted_sum_of_all_returns_of_n_steps(trace):
+    rho, step, K = 1.3, 0.2, 5
+    costs, values = torch.rand(K, 3).double(), torch.rand(K + 1, 3).double()
+    kept = math.exp(-rho * step)
+
+    def of_n_steps(k: int, n: int) -> torch.Tensor:
+        paid = sum((1.0 - kept) * kept**j * costs[k + j] for j in range(n))
+        return paid + kept**n * values[k + n]
+
+    found = lambda_returns(costs, values, rho, step, trace)
+    for k in range(K):
+        last = K - k
+        expected = trace ** (last - 1) * of_n_steps(k, last)
+        expected = expected + sum((1.0 - trace) * trace ** (n - 1) * of_n_steps(k, n) for n in range(1, last))
+        torch.testing.assert_close(found[k], expected)
+
+
+@on(QUIET)
+def test_the_exact_value_is_a_fixed_point_to_first_order_in_the_step_at_least(problem):
+    x, errors = states(problem, 64), []
+    for halvings in (0, 1):
+        pace, steps = Pace(0.02 / problem.discount / 2**halvings, 1), 10 * 2**halvings
+        ran = roll(problem, problem.exact_value, x, pace, steps, torch.Generator())
+        y = lambda_returns(ran.costs, ran.values, problem.discount, pace.step, 0.95)
+        errors.append(float((y[0] - ran.values[0]).abs().mean()))
+    spread = float(ran.values[0].std())
+    assert errors[1] < 0.6 * errors[0] < 0.01 * spread or errors[0] < 1e-4 * spread
+
+
+@on([name for name in FEW_SMOOTH if name not in QUIET])
+def test_returns_along_noisy_pieces_have_the_value_as_their_mean(problem):
+    x = states(problem, 4).repeat_interleave(4096, dim=0)
+    pace = Pace(0.01 / problem.discount, 1)
+    ran = roll(problem, problem.exact_value, x, pace, 20, torch.Generator().manual_seed(1))
+    y = lambda_returns(ran.costs, ran.values, problem.discount, pace.step, 0.9)[0]
+    off = (y - ran.values[0]).reshape(4, -1)
+    se = off.std(dim=1) / math.sqrt(off.shape[1])
+    assert float(se.min()) > 0.0
+    assert (off.mean(dim=1).abs() < 4.0 * se + 0.005 * float(ran.values[0].std())).all()
+
+
+class Stop(Silent):
+    """Kills a run in the middle of its warm start."""
+
+    def warmed(self, trainer, looked):
+        if trainer.state.warm.round == 11:
+            raise KeyboardInterrupt
+
+
+NOISY = pytest.param(("method=pd", "problem.torque_noise=0.3"), marks=pytest.mark.nightly)
+
+
+@pytest.mark.parametrize("way", [("method=dual",), NOISY])
+def test_a_run_that_is_killed_in_its_warm_start_goes_on_to_the_same_bits(way, tmp_path):
+    way = (*SWING, *WARM, *way, "trainer.steps=3")
+    whole = small(*way)
+    whole.fit(Silent())
+    assert whole.state.warm.done
+    assert whole.step == 3
+    with pytest.raises(KeyboardInterrupt):
+        small(*way).fit(Stop(), tmp_path / "last.pt")
+    resumed = small(*way)
+    resumed.resume(tmp_path / "last.pt")
+    assert (resumed.state.warm.round, resumed.fresh) == (10, False)
+    resumed.fit(Silent(), tmp_path / "last.pt")
+    assert differences(state_of(resumed), state_of(whole)) == []
+    again = small(*way)
+    again.resume(tmp_path / "last.pt")
+    assert differences(again.state_dict()["fields"], whole.state_dict()["fields"]) == []
+
+
+def test_the_controller_of_the_warm_start_is_a_candidate_and_can_be_handed_out(tmp_path):
+    trainer = small(*WARM, "method=dual", "trainer.figures=false")
+    certificate = run_to_end(trainer, build_certificate_settings(trainer.config), tmp_path)
+    assert {name for name, perf in certificate.perf.items() if perf is not None} == {"value", "trajectories"}
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    assert (
+        [e.step for e in events.Scalars("warm_start/cost")]
+        == [e.step for e in events.Scalars("warm_start/loss")]
+        == [10, 12]
+    )
+    fields = trainer.averaged_fields
+    x = states(trainer.problem, 16, dtype=torch.float32)
+    best = ValuePolicy(trainer.problem, fields.trajectory_value)(x)
+    assert (best != ValuePolicy(trainer.problem, fields.value)(x)).any()
+    made = Controller(
+        trainer.problem, fields, trainer.constants, None, "trajectories", trainer.config["model"], {}, trainer.config
+    )
+    made.save(tmp_path / "other.safetensors")
+    assert torch.equal(load_controller(tmp_path / "other.safetensors")(x), best)
+
+
+def test_auto_stays_out_where_mass_cannot_gather_and_changes_no_bit_there():
+    runs = [small(f"warm_start.mode={mode}") for mode in ("off", "auto")]
+    before = copy.deepcopy(configured(*SMALL))
+    del before["warm_start"]  # as in runs from before there was one
+    for trainer in (*runs, older := build_trainer(before)):
+        trainer.fit(Silent())
+        assert trainer.state.warm is None
+    assert differences(state_of(runs[0]), state_of(runs[1])) == differences(state_of(runs[0]), state_of(older)) == []
+    auto = lambda *way: small(*way, "method=dual", "warm_start.mode=auto").state.warm
+    assert auto("problem=cart_pole") is not None
+    assert auto("problem=cart_pole", "problem.control_limit=null") is auto(*SWING) is None
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (("method=primal", "warm_start.mode=on"), "warm_start.mode is on, but this method has no V"),
+        (("warm_start.mode=maybe",), "warm_start.mode"),
+        (("warm_start.trace=1.5",), "warm_start.trace"),
+        (("warm_start.pieces=0",), "warm_start.pieces"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_sentence(overrides, words):
+    with pytest.raises(InputError, match=words):
+        small(*overrides)
+
+
+class Told:
+    """A trial whose outcomes are known beforehand."""
+
+    def __init__(self, *costs: float) -> None:
+        self.costs = list(costs)
+
+    def cost_of_nothing(self) -> float:
+        return 5.0
+
+    def cost_of(self, value) -> float:
+        return self.costs.pop(0)
+
+
+def warmed_up_to(*costs: float) -> ValueIteration:
+    """The end of one whose trials cost ``costs``."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = PeriodicMLP(1, width=4)
+    warm = ValueIteration(fresh("circle rho=2"), network, WarmStartSettings("on", 10**4, 8, 1, 0.5), 0)
+    warm.trial = Told(*costs)
+    while not warm.done:
+        warm.advance()
+    return warm
+
+
+def test_the_best_controller_is_kept_and_gone_back_to_and_no_improvement_is_the_end():
+    warm = warmed_up_to(4.0, 2.0, 3.0, 3.0, 2.0, 1.0, 1.5, 1.0, 1.0)
+    assert (warm.least, warm.trial.costs, warm.round, warm.found) == (1.0, [], 90, True)
+    assert differences(warm.best, warm.average.state_dict()) == []
+    assert warm.optimizer.param_groups[0]["lr"] == 5e-4  # halved twice
+    useless = warmed_up_to(*[6.0] * 6)
+    assert (useless.found, useless.least) == (False, 5.0)
+    fields = Fields({"value": PeriodicMLP(1, width=4), "trajectory_value": PeriodicMLP(1, width=4)})
+    before = {name: tensor.clone() for name, tensor in fields.state_dict().items()}
+    useless.hand_over([fields])
+    assert differences(before, fields.state_dict()) == []
+    warm.hand_over([fields])
+    assert differences(fields.value.state_dict(), warm.best) == []
+    assert differences(fields.trajectory_value.state_dict(), warm.best) == []
+
+
+@pytest.mark.nightly
+@on(NATURAL)
+def test_every_system_can_be_warmed_up(problem):
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = PeriodicMLP(problem.dim, width=8)
+    warm = ValueIteration(problem, network, WarmStartSettings("on", 1, 8, 2, 0.95), 0)
+    assert warm.advance()
+    assert warm.done
+    assert all(math.isfinite(number) for number in (warm.loss, warm.cost, warm.least))
+
+
+@pytest.mark.nightly
+def test_rounds_lead_to_the_exact_value():
+    problem = fresh("manufactured 2-d q=2")
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = PeriodicMLP(2, width=32)
+    warm = ValueIteration(problem, network, WarmStartSettings("on", 40, 256, 25, 0.95), 0)
+    while not warm.done:
+        warm.advance()
+    x = states(problem, 1024, dtype=torch.float32)
+    exact = problem.exact_value(x)
+    warm.average.load_state_dict(warm.best)
+    error = (warm.average(x) - exact).square().mean().sqrt()
+    assert float(error) < 0.05 * float(exact.std())
