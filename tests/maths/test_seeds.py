@@ -20,6 +20,7 @@ BARE = {
     "maths/sampling.py",  # `evaluation_points`, whose seed is derived in the line before
     "training/state.py",  # the process's own generators, from a derived seed
     "runs/metrics/trial.py",  # `random_starts`, handed a derived seed
+    "training/warm_start/trial.py",  # handed a derived seed
     "problems/exact/manufactured.py",
     "problems/exact/torus.py",
     "problems/systems/graphs.py",

@@ -47,18 +47,14 @@ class ValueIteration:
         self.average = copy.deepcopy(network).requires_grad_(False)
         self.optimizer = optimizer_maker("soap", RATE)(list(self.network.parameters()))
         self.like, self.pace = next(network.parameters()).detach(), Pace.of(problem)
-        branch = derive_seed(seed, Branch.WARM_START)
-        self.generator = torch.Generator().manual_seed(branch)
-        self.starts = drawn_starts(problem, POOLED * settings.pieces, branch).to(self.like)
-        starts = drawn_starts(problem, STARTS, branch + 1).to(self.like)
-        self.trial = Trial(problem, self.pace, starts, branch + 1)
+        place = lambda number: derive_seed(seed, Branch.WARM_START, number)
+        self.generator = torch.Generator().manual_seed(derive_seed(seed, Branch.WARM_START))
+        self.starts = drawn_starts(problem, POOLED * settings.pieces, place(0)).to(self.like)
+        self.trial = Trial(problem, self.pace, drawn_starts(problem, STARTS, place(1)).to(self.like), place(2))
         self.ends: Tensor | None = None  # (k, d), where pieces ended
         self.round, self.stale, self.restarts, self.done = 0, 0, 0, False
-        self.loss, self.cost, self.least = (
-            math.nan,
-            math.nan,
-            math.inf,
-        )  # of the last fit, the last trial, the best trial
+        # Of the last fit, of the last trial and of the best one.
+        self.loss, self.cost, self.least = math.nan, math.nan, math.inf
         self.found, self.best = False, self._weights()  # whether a controller is better than none, and its weights
         self.largest = math.inf if problem.state_cost_bound is None else float(problem.state_cost_bound)
         self.scale = float(getattr(network, "scale", 1.0))
