@@ -41,7 +41,7 @@ class Branch(IntEnum):
     POOL = 28  # states that are scored to see where training states count
     START_MASS = 29  # states for the mass of a start; below, the replicate
     TIGHTENING = 30  # states on which V is trained on for the shifted bound
-    WARM_START = 31  # pieces of trajectory of the warm start; below, 0 for their starts, 1 for those of trials, 2 for noise in these
+    WARM_START = 31  # pieces of trajectory of the warm start; below, their starts, those of trials, the noise of these
     AUDIT = 1000  # which trajectories are simulated again with finer steps
 
 
