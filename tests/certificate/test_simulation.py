@@ -165,6 +165,33 @@ def test_a_system_at_rest_costs_what_its_states_cost_but_for_the_tail(problem):
     assert 1e-6 * found.value < missing <= found.bias < 1e-4 * found.value
 
 
+class Even(Problem):
+    """Costs 1 everywhere, with noise."""
+
+    def __init__(self) -> None:
+        super().__init__(1, 1, noise=0.02)
+
+    def state_cost(self, x):
+        return torch.ones_like(x[:, 0])
+
+    def drift(self, x):
+        return torch.zeros_like(x)
+
+    def control_matrix(self, x):
+        return torch.ones_like(x).unsqueeze(-1)
+
+
+def test_what_the_truncation_leaves_out_is_within_the_bias_with_noise(monkeypatch):
+    monkeypatch.setattr("ocp_torch.certificate.simulated.performance.TAIL", 0.05)  # much more than the steps' own error
+    problem = Even()
+    found = simulate_performance(problem, lambda x: torch.zeros_like(x), 8, 2, seed=0, tolerance=1e-7).perf
+    assert 0.01 < 1.0 - found.value <= found.bias < 0.1
+    given = simulate_performance(
+        problem, lambda x: torch.zeros_like(x), 8, 2, seed=0, value=lambda x: 1.0 + 0.0 * x[:, 0], initial=[1.0] * 2
+    )
+    assert given.perf.value == pytest.approx(1.0, abs=1e-12)
+
+
 class Step(Problem):
     """A system at rest that costs 1 below ``edge`` and 0 above, and a wave of mean ``slope``: `edge + slope` in the mean."""
 
