@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -17,7 +17,14 @@ from ocp_torch.certificate.simulated.performance import Candidate
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
 from ocp_torch.certificate.upper.penalised import DensityBounds, density_bounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
-from ocp_torch.control.policies import Density, Policy, admissible_density, occupation_density, trained_policies
+from ocp_torch.control.policies import (
+    TRAJECTORIES,
+    Density,
+    Policy,
+    admissible_density,
+    occupation_density,
+    trained_policies,
+)
 from ocp_torch.fields.fields import Fields
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.samples import Samples
@@ -86,8 +93,13 @@ class TrainedContext(FieldsContext):
 
     @property
     def candidates(self) -> dict[str, Candidate]:
-        initial = None if self.sampled_value is None else self.sampled_value.initial
-        return {name: Candidate(policy, self.value, initial) for name, policy in self.policies.items()}
+        sampled, own = self.sampled_value, self.fields.trajectory_value
+        initial = None if sampled is None else sampled.initial
+        found = {name: Candidate(policy, self.value, initial) for name, policy in self.policies.items()}
+        if sampled is not None and own is not None:  # its controller has a control variate of its own
+            initial = replace(sampled, value=own, search=False).initial
+            found[TRAJECTORIES] = Candidate(self.policies[TRAJECTORIES], own, initial)
+        return found
 
     @cached_property
     def kind(self) -> str:

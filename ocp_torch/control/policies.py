@@ -15,6 +15,9 @@ from ocp_torch.problems.generator import Generator, pull_back
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
+# The controller from the `V` of a warm start, which the values of trajectories were fitted to.
+TRAJECTORIES = "trajectories"
+
 # A policy maps states (N, d) to controls (N, m); a density maps them to (N,).
 Policy = Callable[[Tensor], Tensor]
 Density = Callable[[Tensor], Tensor]
@@ -87,5 +90,5 @@ def trained_policies(kind: str | None, problem: Problem, fields: Fields, constan
         mu = occupation_density(kind, problem, fields, constants)
         policies["density"] = density_policy(fields.control_density, mu, problem.control_cost)
     if fields.trajectory_value is not None:
-        policies["trajectories"] = ValuePolicy(problem, fields.trajectory_value)
+        policies[TRAJECTORIES] = ValuePolicy(problem, fields.trajectory_value)
     return policies
