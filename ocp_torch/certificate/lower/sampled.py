@@ -51,8 +51,8 @@ class SampledValue:
         """That of `V` itself, or of a function made of it where it is higher."""
         if not self.search:
             return self.own
-        best = self.own
-        for W in tightened(self.problem, self.value, self.seed):
+        best, batch = self.own, len(self.sets[0])  # a small certificate is a quick one
+        for W in tightened(self.problem, self.value, self.seed, batch):
             before, shift = best.bound, replace(self.own, value=W, name="V tightened")
             best = max(best, shift, key=lambda shift: shift.bound)
             if not shift.bound - before > WORTH * abs(shift.bound):

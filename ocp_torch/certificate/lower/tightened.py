@@ -25,21 +25,21 @@ from ocp_torch.steppers.nonfinite import NonFiniteError
 # The slack's mean over a hundredth of the torus stands for its supremum. Over a thirtieth a pendulum with limited torque had
 # no bound in the end; over a thousandth others have a lower one.
 PHASE = Phase(Constants(M=100.0, C_V=1.0, C_u=1.0, sources={}))
-# States of a step, rounds at most, steps of the first, each further one twice as long, and the first learning rate of each: a
-# larger one forgets what `V` knows. Gaps before and after each round: dubins with noise 9.1, 1.9, 1.6 %; a pendulum with
-# limited torque 61, 24, and 17 % after three; a unicycle 2.5, 1.8, and 1.2 % after three.
+# States of a step and rounds, both at most, steps of the first, each further one twice as long, and the first learning rate
+# of each: a larger one forgets what `V` knows. Gaps before and after each round: dubins with noise 9.1, 1.9, 1.6 %; a pendulum
+# with limited torque 61, 24, and 17 % after three; a unicycle 2.5, 1.8, and 1.2 % after three.
 BATCH, ROUNDS, STEPS, RATE = 2048, 3, 300, 5e-4
 
 
-def tightened(problem: Problem, value: Field, seed: int) -> Iterator[Field]:
-    """`W` for ``value`` `V` in float64, after each round of training in float32; none where `V` has no weights, none more
-    where these do not stay finite."""
+def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> Iterator[Field]:
+    """`W` for ``value`` `V` in float64, after each round of training in float32 on up to ``batch`` states a step; none where
+    `V` has no weights, none more where these do not stay finite."""
     if not isinstance(value, nn.Module) or not any(True for _ in value.parameters()):
         return
     objective, unit = LevelledDual(problem), cost_unit(problem)
     fields = Fields({VALUE: copy.deepcopy(value).float().requires_grad_(True)})
     sampler = SobolSampler(problem.dim, derive_seed(seed, Branch.TIGHTENING), torch.float32)
-    draw = lambda _: problem.samples(sampler.draw(BATCH), divergences=False)
+    draw = lambda _: problem.samples(sampler.draw(min(batch, BATCH)), divergences=False)
     for k in range(ROUNDS):
         stepper, average = short_fit(fields, objective, RATE, STEPS * 2**k, unit)
         try:
