@@ -26,8 +26,8 @@ from ocp_torch.steppers.nonfinite import NonFiniteError
 # no bound in the end; over a thousandth others have a lower one.
 PHASE = Phase(Constants(M=100.0, C_V=1.0, C_u=1.0, sources={}))
 # States of a step and rounds, both at most, steps of the first, each further one twice as long, and the first learning rate
-# of each: a larger one forgets what `V` knows. Gaps before and after each round: dubins with noise 9.1, 1.9, 1.6 %; a pendulum
-# with limited torque 61, 24, and 17 % after three; a unicycle 2.5, 1.8, and 1.2 % after three.
+# of each: a larger one forgets what `V` knows. Gaps before and after each round: dubins with noise 9.1, 1.9, 1.6; a pendulum
+# with limited torque 61, 24, and 17 % after three; a unicycle 2.5, 1.8, and after three 1.2 %.
 BATCH, ROUNDS, STEPS, RATE = 2048, 3, 300, 5e-4
 
 
