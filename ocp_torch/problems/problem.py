@@ -6,7 +6,6 @@ minimise  rho E int_0^inf e^{-rho t} (f(x_t) + |u_t|^q / q) dt,   dx = (a(x) + B
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,6 +18,7 @@ from ocp_torch.problems.constant_noise import column_matrix, constant_diffusion
 from ocp_torch.problems.control_limit import Limit, control_cost
 from ocp_torch.problems.physical.measures import Measures
 from ocp_torch.problems.placed import Placed
+from ocp_torch.problems.played import Played
 from ocp_torch.problems.reproducible import Reproducible
 from ocp_torch.problems.samples import Samples
 
@@ -47,7 +47,7 @@ class Lipschitz:
     noise: float | None = None
 
 
-class Problem(Reproducible, Placed):
+class Problem(Reproducible, Placed, Played):
     """Base class: override `state_cost`, and whatever else differs from `dx/dt = u` with a uniform start.
 
     All methods are batched, take states ``(N, d)``, work in the precision and on the device of their argument, and have
@@ -238,16 +238,3 @@ class Problem(Reproducible, Placed):
         """`a(x) + B(x) u`, ``(N, d)``."""
         pushed = torch.einsum("ndm,nm->nd", self.control_matrix(x), u)
         return pushed if self.driftless else self.drift(x) + pushed
-
-    def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
-        """The state ``(d,)`` that an observation of the Gymnasium environment ``env`` shows. Override it, with `to_action`,
-        for the environments the problem is a model of; ours need neither."""
-        raise self._unknown(env)
-
-    def to_action(self, env: str, control: np.ndarray) -> np.ndarray:
-        """The action of ``env`` that applies ``control`` ``(m,)``."""
-        raise self._unknown(env)
-
-    def _unknown(self, env: str) -> InputError:
-        must = "it must define from_observation and to_action"
-        return InputError(f"{type(self).__name__} does not know the environment {env}: {must}.")
