@@ -22,10 +22,11 @@ Weight = Callable[[Tensor, float], Tensor]
 
 # Paths whose increments are drawn together.
 TOGETHER = 512
-# How often steps are halved at most, and on how many paths of each replicate at least.
-MOST_HALVINGS, FEWEST_PATHS = 5, 8
+# How often steps are halved at most; on how many paths of each replicate at least; and how often on these, as each halving
+# of them takes twice as long as the one before.
+MOST_HALVINGS, FEWEST_PATHS, ON_FEWEST = 5, 8, 2
 # How far means on steps and on halved steps may differ, as a part of the standard error, before they are halved again.
-GOOD_PART = 0.25
+GOOD_PART = 0.5
 # What is left after the last halving, as a multiple of what that changed, where the drift jumps and means are of weak order
 # 1/2 only: `1 / (sqrt 2 - 1)`. Where it is smooth a third is left.
 LEFT = 1.0 / (math.sqrt(2.0) - 1.0)
@@ -152,9 +153,10 @@ def expectation(
         return integrals.view_as(few), end
 
     mass = weights.view_as(rows)
+    thinnings = max(1, rows.shape[1] // FEWEST_PATHS).bit_length() - 1
     integrals, end = followed(0)
     mean, coarse, before, bias = (mass * integrals).mean(dim=1), integrals, torch.zeros(()), math.inf
-    for halvings in range(1, MOST_HALVINGS + 1):
+    for halvings in range(1, min(MOST_HALVINGS, thinnings + ON_FEWEST) + 1):
         fine, _ = followed(halvings)
         of = slice(fine.shape[1])
         change = mass[:, of] * (fine - coarse[:, of])

@@ -30,7 +30,7 @@ BUDGETS = (
     Budget(inf, steps=1200, batch=512, good_gap=0.02, stage_steps=800),
 )
 
-# Where no M is known the bound is decided by the worst state: that wants more states at once, and longer.
+# Where no M is known the bound is decided by the worst state: that wants more states at once, and, without noise, longer.
 LARGE_BATCH, MANY_STEPS = 1024, 1200
 # In one dimension with noise, where networks are given more modes.
 NOISY_STEPS = 2000
@@ -57,7 +57,8 @@ def fill(config: dict, problem: Problem) -> dict:
     if problem.noisy and problem.dim == 1:
         budget = replace(budget, steps=NOISY_STEPS)
     if unbounded:
-        budget = replace(budget, batch=max(budget.batch, LARGE_BATCH), steps=max(budget.steps, MANY_STEPS))
+        steps = budget.steps if problem.noisy else max(budget.steps, MANY_STEPS)
+        budget = replace(budget, batch=max(budget.batch, LARGE_BATCH), steps=steps)
     defaults: dict[str, object] = {
         **{f"model.{name}": value for name, value in model.defaults(problem.dim, unbounded, problem.noisy).items()},
         "trainer.rounds": 2 if config["trainer"].get("steps") is None else 1,

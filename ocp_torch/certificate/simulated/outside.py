@@ -16,6 +16,8 @@ from ocp_torch.problems.starts import fits
 
 # A part of the time above this is worth a warning; and how exact the part of one trajectory has to be.
 MUCH, TOLERANCE = 0.01, 2e-3
+# Fewer trajectories of a set leave an interval as wide as the part itself.
+FEWEST = 8
 # The control variate, a number: near to what the clock shows in the box, so that the weights of the starts add little noise.
 LEVEL = 1.05
 
@@ -34,11 +36,12 @@ class _Clock(ClosedLoop):
 
 def time_outside(problem: Problem, policy: Policy, settings: CertificateSettings, seed: int) -> Estimate | None:
     """`E[rho int e^{-rho t} 1[x_t is outside the box] dt]` along the closed loop of ``policy``; `None` where there is no box
-    or nothing is simulated."""
-    if not isinstance(problem, System) or not problem.chart.boxed or not settings.trajectories:
+    or too little is simulated."""
+    few = settings.trajectories // BASELINE_PART
+    if not isinstance(problem, System) or not problem.chart.boxed or few < FEWEST:
         return None
     loop = _Clock(problem, policy)
-    effort = max(2, settings.trajectories // BASELINE_PART), settings.replicates, seed
+    effort = few, settings.replicates, seed
     found = simulate_performance(
         loop,
         zero_policy(loop),

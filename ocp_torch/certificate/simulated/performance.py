@@ -41,7 +41,7 @@ RATE_ROOM = 2.0
 # Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
 # a controller that another one clearly beats; but so few in all as the second number take hardly longer than a part of them.
 # Their steps need not be as fine either: the third is by how many times.
-BASELINE_PART, CHEAP, ROUGH = 4, 256, 10.0
+BASELINE_PART, CHEAP, ROUGH = 4, 256, 200.0
 
 
 @dataclass(frozen=True)

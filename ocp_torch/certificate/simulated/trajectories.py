@@ -41,9 +41,9 @@ PIECE, PIECES, SETTLED = 5.0, 8, 1e-2
 DISCOUNTED, MOVED, FEWEST_STEPS, MOST_STEPS = 0.25, 0.1, 20, 150
 # The logarithm at which the growth of a density is cut off, so that it stays a number: e^60 is unbounded to any check.
 LARGEST_GROWTH = 60.0
-# Paths from each state where there is noise, at first and from the highest: more show a density that is too large for M more
-# surely, and take longer.
-FEW_PATHS, PATHS = 16, 64
+# Evaluations of the closed loop at each state and time where there is noise, at first and from the highest, shared by the
+# paths and the `d + 1` differences on each; and paths at least. More show a density that is too large for M more surely.
+FEW_EVALUATIONS, EVALUATIONS, FEWEST_PATHS = 48, 192, 4
 # Of the states looked at, the highest are looked at again from close by.
 TOP, NEARBY = 6, 48
 # Ascents to the suprema of the a-priori bound, which is shown beside the density itself and decides nothing.
@@ -123,9 +123,9 @@ def backward_flow(problem: Problem, policy: Policy) -> Dynamics:
     return backward
 
 
-def settled_occupation(problem: Problem, policy: Policy, x: Tensor, paths: int = PATHS) -> Tensor:
+def settled_occupation(problem: Problem, policy: Policy, x: Tensor, evaluations: int = EVALUATIONS) -> Tensor:
     """`mu^u` ``(N,)`` along the `backward_flow`, as far back as it takes; infinite where the past adds ever more. With
-    noise the mean over so many ``paths``, less twice its standard error: a lower estimate, which is finite.
+    noise the mean over as many paths as ``evaluations`` allow, less twice its standard error: a lower estimate, and finite.
 
     Where the flow contracts nearly as fast as the discount forgets, the integral settles slowly, and geometrically: what
     is left is extrapolated from the last pieces.
@@ -136,7 +136,7 @@ def settled_occupation(problem: Problem, policy: Policy, x: Tensor, paths: int =
         speed = float(problem.velocity(x, policy(x)).norm(dim=-1).max())
     wanted = math.ceil(horizon * max(rho / DISCOUNTED, speed / MOVED))
     steps = int(min(MOST_STEPS, max(FEWEST_STEPS, wanted)))
-    paths = paths if problem.noisy else 1
+    paths = max(FEWEST_PATHS, evaluations // (problem.dim + 1)) if problem.noisy else 1
     state, pieces = torch.cat([x, x.new_zeros(len(x), 1)], dim=-1).repeat_interleave(paths, dim=0), []
     for k in range(PIECES):
         if problem.noisy:
@@ -176,8 +176,8 @@ def estimated_sup_occupation(problem: Problem, policy: Policy, end_states: Tenso
     generator = fixed_generator()
     uniform = torch.rand(states - len(picked), problem.dim, dtype=picked.dtype, generator=generator)
     x = torch.cat([picked, uniform])
-    met = lambda x, paths: settled_occupation(problem, policy, x, paths).nan_to_num(nan=math.inf, posinf=math.inf)
-    density = met(x, FEW_PATHS)
+    met = lambda x, effort: settled_occupation(problem, policy, x, effort).nan_to_num(nan=math.inf, posinf=math.inf)
+    density = met(x, FEW_EVALUATIONS)
     if not bool(torch.isfinite(density).all()):
         return math.inf
     top = x[density.topk(min(TOP, len(x))).indices]
@@ -185,7 +185,7 @@ def estimated_sup_occupation(problem: Problem, policy: Policy, end_states: Tenso
     steps = torch.randn(around.shape, dtype=x.dtype, generator=generator) / math.sqrt(problem.dim)
     sizes = 10.0 ** (-1.0 - 2.0 * torch.rand(NEARBY, 1, dtype=x.dtype, generator=generator))
     near = torch.cat([top, (around + sizes * steps).remainder(1.0)])
-    return max(float(density.max()), float(met(near, PATHS).max()))
+    return max(float(density.max()), float(met(near, EVALUATIONS).max()))
 
 
 def a_priori_sup_occupation(problem: Problem, policy: Policy, points: Tensor) -> float | None:
