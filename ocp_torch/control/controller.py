@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from ocp_torch.control.described import described, problem_name, require_same
+from ocp_torch.control.exported import about, coordinates_of, example_state, exported_function
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, trained_policies
 from ocp_torch.errors import InputError, notes
+from ocp_torch.export import export
 from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, MODELS, TRAJECTORY_VALUE, VALUE, Fields
 from ocp_torch.files.limits import require_held, require_modest_problem
 from ocp_torch.files.storage import load_tensors, save_tensors
@@ -91,6 +93,22 @@ class Controller:
             **{name: getattr(self, name) for name in PLAIN},
         }
         save_tensors(Path(path), dict(self.fields.state_dict()), metadata)
+
+    def export(self, out: str | Path, format: str | None = None, coordinates: str | None = None) -> list[Path]:
+        """Write it to ``out`` for where there is no PyTorch, and return the files: the control ``(m,)``, the value `V` and
+        its gradient ``(d,)`` at a state ``(d,)``, with certificate, units and configuration inside, as JSON.
+
+        ``format`` is `onnx` (a model of a batch of states, float32), `c` (a header and a C99 source, float or double) or
+        `casadi` (a function of one state, float64); by default what the ending of ``out`` says. ``coordinates`` are `torus`
+        or `physical`, by default physical where the problem is a `System`; beyond its box functions are what they are at the
+        nearest state of it. Raises `InputError` for a wrong choice, a library that is missing, and a problem whose functions
+        cannot be traced.
+        """
+        problem, place = self.problem, coordinates_of(self.problem, coordinates)
+        function = exported_function(problem, self.fields, self.kind, self.occupation, self.constants, place)
+        inside = {"coordinates": place, "problem": described(problem), "policy": self.kind}
+        inside |= {"certificate": self.certificate, "config": self.config}
+        return export(function, example_state(problem, place), Path(out), format, about(problem, place), inside)
 
 
 def load_controller(path: str | Path, problem: Problem | None = None, device: str = "cpu") -> Controller:

@@ -44,7 +44,7 @@ class Chart(Placed):
 
     def to_torus(self, s: Tensor) -> Tensor:
         """States ``(N, d)`` in physical units as states of the torus in [0, 1); raises `InputError` beyond a seam."""
-        turns = (s - self._like(s, "centre", self.centre)) / self.lengths(s)
+        turns = self.turns(s)
         beyond = turns[:, self.boxed].abs() > 0.5 + ROUNDING
         if bool(beyond.any()):
             row, which = beyond.nonzero()[0].tolist()
@@ -54,6 +54,10 @@ class Chart(Placed):
                 + f", beyond the seam of the model at {c.centre - 0.5 * c.length:g} and {c.centre + 0.5 * c.length:g}."
             )
         return turns.remainder(1.0)
+
+    def turns(self, s: Tensor) -> Tensor:
+        """How far states ``(N, d)`` are from the centres, in turns of each coordinate."""
+        return (s - self._like(s, "centre", self.centre)) / self.lengths(s)
 
     def lengths(self, like: Tensor) -> Tensor:
         """What a turn of each coordinate is in its unit, ``(d,)``."""

@@ -1,0 +1,5 @@
+"""Functions of the state for where there is no PyTorch: ONNX, C99 and CasADi."""
+
+from ocp_torch.export.export import CONTROL, FORMATS, export
+
+__all__ = ["CONTROL", "FORMATS", "export"]

@@ -1,0 +1,90 @@
+"""A `Program` as C99: a header and a source without dependencies or allocation, in float or in double."""
+
+import json
+import math
+import textwrap
+from string import Template
+
+import numpy as np
+
+from ocp_torch.export.c_function import Function, number
+from ocp_torch.export.program import Program
+
+# Numbers a line, and characters of a string.
+NUMBERS, CHARACTERS = 8, 100
+
+HEADER = Template("""\
+/* $name: exported by ocp_torch.
+ *
+ * $about
+ * Stack: $space numbers; nothing is allocated. In double, or in float if both files are compiled with -D${NAME}_FLOAT. */
+#ifndef ${NAME}_H
+#define ${NAME}_H
+
+#ifdef ${NAME}_FLOAT
+typedef float ${name}_real;
+#else
+typedef double ${name}_real;
+#endif
+
+$declarations
+
+/* Certificate, units and configuration, as JSON. */
+extern const char ${name}_metadata[];
+
+#endif
+""")
+SOURCE = Template("""\
+#include "$name.h"
+
+#include <tgmath.h>
+
+typedef ${name}_real real;
+#define R(number) ((real)(number))
+
+$constants
+
+$functions
+const char ${name}_metadata[] =
+$metadata;
+""")
+
+
+def c_source(programs: dict[str, Program], name: str, about: str, metadata: dict) -> tuple[str, str]:
+    """Header and source of a function for each of ``programs``, which writes its outputs. ``name`` begins every name in them,
+    ``about`` is for people, ``metadata`` is kept as a string."""
+    functions = [Function(program, name, function) for function, program in programs.items()]
+    pool: dict[bytes, str] = {}
+    bodies = [function.definition(pool) for function in functions]
+    text = json.dumps(metadata)
+    pieces = (text[k : k + CHARACTERS] for k in range(0, len(text), CHARACTERS))
+    parts = dict(
+        name=name,
+        NAME=name.upper(),
+        about="\n * ".join(textwrap.wrap(about.replace("*/", "* /"), 110)),
+        space=max(function.space for function in functions),
+        declarations="\n".join(f"{function.signature};" for function in functions),
+        constants="\n".join(_array(label, np.frombuffer(numbers)) for numbers, label in pool.items()),
+        functions="\n".join(bodies),
+        metadata="\n".join(f"    {_quoted(piece)}" for piece in pieces),
+    )
+    return HEADER.substitute(parts), SOURCE.substitute(parts)
+
+
+def _array(label: str, numbers: np.ndarray) -> str:
+    exact = [_exactly(value) for value in numbers.tolist()]
+    lines = (", ".join(exact[k : k + NUMBERS]) for k in range(0, len(exact), NUMBERS))
+    return f"static const real {label}[{len(exact)}] = {{\n    " + ",\n    ".join(lines) + "\n};"
+
+
+def _exactly(value: float) -> str:
+    """In hexadecimal: shorter than all decimals of a weight in single precision, and exact in both."""
+    if not math.isfinite(value):
+        return number(value)
+    digits, exponent = value.hex().split("p")
+    return f"{digits.rstrip('0').rstrip('.') if '.' in digits else digits}p{exponent}"
+
+
+def _quoted(text: str) -> str:
+    # The second replacement keeps a compiler from reading trigraphs.
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"').replace("?", "\\?") + '"'

@@ -1,0 +1,207 @@
+"""A controller is the same function in ONNX, in C and in CasADi: random networks, every limit and price, wraps included."""
+
+import ctypes
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+
+from ocp_torch import InputError
+from ocp_torch.control.described import described
+from ocp_torch.control.exported import PHYSICAL, TORUS, exported_function
+from support.controllers import METHODS, SMALL, controller_of, controllers
+from support.small import configured
+from support.systems import Cart
+
+pytestmark = pytest.mark.usefixtures("quick_composition")
+
+STATES = 200
+# Of the largest number of an output. What PyTorch itself is off by in single precision is allowed four times.
+DOUBLE, SINGLE, AS_PYTORCH = 1e-12, 1e-5, 4.0
+VARIANTS = {
+    **{name: (name,) for name in METHODS},
+    "gated": ("dual", "problem=manufactured", "problem.dim=5", "model.gated=true", "model.activation=silu"),
+    "gelu": ("dual", "model.activation=gelu"),
+    "softplus": ("dual", "model.activation=softplus"),
+    "sobolev": ("dual", "model=sobolev", "model.modes=3"),
+    "limit": ("dual", "problem.control_limit=0.05"),
+    "limit, q < 2": ("pd", "problem.exponent=1.5", "problem.control_limit=0.05"),
+    "limits": ("dual", "problem=manufactured", "problem.control_limit=[0.05,0.02]"),
+    "varying B": ("pd", "problem.exponent=2", "problem.state_dependent_control=true"),
+    "noise": ("pd", "problem.noise=0.02", "problem.state_dependent_noise=true"),
+    "system": ("dual", "problem=cart_pole"),
+    "walls": ("pd", "problem=dubins", "problem.walls=true"),
+}
+# Quick are those that have the most in them.
+QUICK = ("limit, q < 2", "system")
+EACH = pytest.mark.parametrize(
+    "variant", [v if v in QUICK else pytest.param(v, marks=pytest.mark.nightly) for v in VARIANTS]
+)
+
+
+def controllers_of(variant):
+    method, *rest = VARIANTS[variant]
+    small = () if variant == "sobolev" else SMALL  # which name fields of a perceptron
+    return controller_of(configured(*small, *METHODS[method], *rest))
+
+
+def truth(controller, coordinates):
+    return exported_function(
+        controller.problem, controller.fields, controller.kind, controller.occupation, controller.constants, coordinates
+    )
+
+
+def states_of(controller, coordinates):
+    """Whole turns around the cell on the torus; in units also beyond the box."""
+    x = (
+        4.0
+        * torch.rand(STATES, controller.problem.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+        - 2.0
+    )
+    if coordinates == TORUS:
+        return x
+    chart = controller.problem.chart
+    return chart.centre + 0.4 * x * chart.length
+
+
+def agree(got, wanted, tolerance, rounded=None):
+    """``got`` is ``wanted``; what is ``rounded``, the control in single precision by PyTorch, may be off as that is."""
+    assert list(got) == list(wanted)
+    for name, value in wanted.items():
+        found = torch.as_tensor(np.asarray(got[name], dtype=np.float64)).reshape(value.shape)
+        assert torch.isfinite(value).all()
+        own = 0.0 if rounded is None or name != "control" else AS_PYTORCH * float((rounded - value).abs().max())
+        assert float((found - value).abs().max()) <= tolerance * max(1.0, float(value.abs().max())) + own, name
+
+
+def rounded_by_pytorch(controller, states):
+    return (controller.physical if controller.problem.measures else controller)(states).double()
+
+
+def through_c(folder, name, wanted, states, single):
+    """What the compiled source gives at ``states``."""
+    library = folder / f"{name}{single}.so"
+    flags = [f"-D{name.upper()}_FLOAT"] if single else []
+    strict = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O1", "-shared", "-fPIC"]
+    subprocess.run(["gcc", *strict, *flags, "-o", str(library), str(folder / f"{name}.c"), "-lm"], check=True)
+    compiled, dtype = ctypes.CDLL(str(library)), np.float32 if single else np.float64
+    x = np.ascontiguousarray(states.numpy().astype(dtype))
+    got = {key: np.full((len(x), int(np.prod(value.shape[1:]))), np.nan, dtype) for key, value in wanted.items()}
+    at = lambda array, i: ctypes.c_void_p(array[i].ctypes.data)
+    for i in range(len(x)):
+        getattr(compiled, f"{name}_control")(at(x, i), at(got["control"], i))
+        if "value" in got:
+            getattr(compiled, f"{name}_value")(at(x, i), at(got["value"], i), at(got["gradient"], i))
+    metadata = ctypes.string_at(ctypes.addressof((ctypes.c_char * 1).in_dll(compiled, f"{name}_metadata")))
+    return got, json.loads(metadata)
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler here")
+@EACH
+def test_c(variant, tmp_path):
+    for number, controller in enumerate(controllers_of(variant)):
+        name = f"exported_{number}"
+        files = controller.export(tmp_path / f"{name}.c")
+        assert [file.name for file in files] == [f"{name}.h", f"{name}.c"]
+        place = PHYSICAL if controller.problem.measures else TORUS
+        states = states_of(controller, place)
+        function = truth(controller, place)
+        double, metadata = through_c(tmp_path, name, function(states), states, single=False)
+        agree(double, function(states), DOUBLE)
+        assert metadata["certificate"] == controller.certificate
+        assert metadata["coordinates"] == place
+        single = states.float()
+        found = through_c(tmp_path, name, function(states), single, single=True)[0]
+        agree(found, function(single.double()), SINGLE, rounded_by_pytorch(controller, single))
+
+
+@EACH
+def test_casadi(variant, tmp_path):
+    casadi = pytest.importorskip("casadi")
+    for controller in controllers_of(variant):
+        place = PHYSICAL if controller.problem.measures else TORUS
+        (file,) = controller.export(tmp_path / "u.casadi")
+        u = casadi.Function.load(str(file))
+        states = states_of(controller, place)
+        wanted = truth(controller, place)(states)
+        results = u.map(len(states))(states.numpy().T)
+        results = results if len(wanted) > 1 else [results]
+        agree({u.name_out(i): r.full().T for i, r in enumerate(results)}, wanted, DOUBLE)
+        reader = casadi.FileDeserializer(str(file))
+        reader.unpack()
+        assert json.loads(reader.unpack())["config"] == controller.config
+
+
+def test_derivatives_of_casadi_are_exact(tmp_path):
+    casadi = pytest.importorskip("casadi")
+    controller = controllers("dual")[0]
+    (file,) = controller.export(tmp_path / "u.casadi")
+    state = casadi.MX.sym("x", 2)
+    V = casadi.Function.load(str(file))(state)[1]
+    hessian, gradient = casadi.hessian(V, state)
+    both = casadi.Function("both", [state], [gradient, hessian])
+    function = truth(controller, TORUS)
+    x = torch.rand(2, dtype=torch.float64)
+    slope, bent = (torch.tensor(r.full()) for r in both(x.numpy()))
+    torch.testing.assert_close(slope.squeeze(1), function(x[None])["gradient"][0], rtol=1e-11, atol=1e-11)
+    step = 1e-5 * torch.eye(2, dtype=torch.float64)
+    differences = (function(x + step)["gradient"] - function(x - step)["gradient"]) / 2e-5
+    torch.testing.assert_close(bent, differences, rtol=1e-6, atol=1e-5)
+
+
+@EACH
+def test_onnx(variant, tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnx")
+    for controller in controllers_of(variant):
+        place = PHYSICAL if controller.problem.measures else TORUS
+        (file,) = controller.export(tmp_path / "u.onnx")
+        session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+        metadata = json.loads(session.get_modelmeta().custom_metadata_map["ocp_torch"])
+        assert metadata["problem"]["parameters"].keys() == described(controller.problem)["parameters"].keys()
+        names = [output.name for output in session.get_outputs()]
+        for count in (STATES, 1):
+            states = states_of(controller, place)[:count].float()
+            got = dict(zip(names, session.run(None, {"state": states.numpy()}), strict=True))
+            agree(got, truth(controller, place)(states.double()), SINGLE, rounded_by_pytorch(controller, states))
+
+
+def test_a_system_can_be_exported_on_the_torus(tmp_path):
+    casadi = pytest.importorskip("casadi")
+    controller = controllers("dual", "problem=pendulum")[0]
+    (file,) = controller.export(tmp_path / "u.casadi", coordinates=TORUS)
+    x = states_of(controller, TORUS)
+    got = casadi.Function.load(str(file)).map(len(x))(x.numpy().T)[0].full().T
+    agree({"control": got}, {"control": truth(controller, TORUS)(x)["control"]}, DOUBLE)
+    rounded = controller(x).double()
+    torch.testing.assert_close(torch.tensor(got), rounded, rtol=1e-3, atol=1e-4 * float(rounded.abs().max()))
+
+
+class Branching(Cart):
+    """Its dynamics ask for a number."""
+
+    def dynamics(self, s):
+        a, B = super().dynamics(s)
+        return (a, 2.0 * B) if float(s[0, 0]) > 0.0 else (a, B)
+
+
+def test_what_cannot_be_exported_is_told_in_a_sentence(tmp_path):
+    controller = controllers("dual")[0]
+    for arguments, reason in [
+        (("u.txt",), "out is .*u.txt', but must end in one of .onnx, .c, .casadi, unless format names one"),
+        (("u.onnx", "c"), r"out is .*u.onnx', but format=c writes files that end in .c"),
+        (("u.c", "fortran"), "format is 'fortran', but must be one of"),
+        (("a-b.c",), "its name must be letters, digits and _"),
+        (("u.c", None, "physical"), "coordinates is physical, but the problem torus has no units; choose torus"),
+    ]:
+        with pytest.raises(InputError, match=reason):
+            controller.export(tmp_path / arguments[0], *arguments[1:])
+    branching = controller_of(configured(*SMALL, "problem._target_=support.systems.Cart", "method=dual"), Branching())[
+        0
+    ]
+    with pytest.raises(InputError, match="this controller cannot be exported, as it cannot be traced"):
+        branching.export(tmp_path / "u.c")
+    assert list(tmp_path.iterdir()) == []
