@@ -33,6 +33,7 @@ SAME = {"bitwise_and": "mul", "logical_and": "mul", "bitwise_or": "maximum", "lo
 def lowered(function: Callable[[Tensor], dict[str, Tensor]], example: Tensor) -> Program:
     """The `Program` of ``function`` from states to a result for each name, traced on ``example``, a batch of one ``(1, d)``.
     Raises `InputError` for what branches on numbers, and for an operation that no format knows."""
+    function(example)  # what a problem computes once is no part of it
     names: list[str] = []
 
     def listed(x: Tensor) -> tuple[Tensor, ...]:

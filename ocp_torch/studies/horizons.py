@@ -1,0 +1,102 @@
+"""A short horizon with `V` at its end against a long one without: what each costs from the same starts, and takes."""
+
+import logging
+import math
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ocp_torch.control.receding_horizon import RecedingHorizon
+from ocp_torch.errors import InputError, require_integer, require_number
+from ocp_torch.export.casadi_function import require_casadi
+from ocp_torch.maths.runge_kutta import discounted_integral
+from ocp_torch.problems import Problem
+from ocp_torch.problems.starts import initial_points
+from ocp_torch.runs.evaluate import load_run
+
+log = logging.getLogger(__name__)
+
+# A control is held for that part of a discount time, and the closed loop is followed for so many discount times, unless asked
+# otherwise; integration takes so many steps while it is held.
+STEP, TIME, WITHIN = 0.05, 6.0, 5
+
+
+Control = Callable[[np.ndarray], np.ndarray]  # of one state
+
+
+@dataclass(frozen=True)
+class Played:
+    """What a controller cost from each start ``(n,)``, and the seconds it took for a control."""
+
+    costs: np.ndarray
+    seconds: float
+
+
+def play(problem: Problem, control: Control, x0: np.ndarray, step: float, steps: int) -> Played:
+    """``control``, held for ``step`` and asked ``steps`` times, from each of ``x0`` ``(n, d)``."""
+    costs, spent = [], 0.0
+    for start in torch.as_tensor(x0):
+        if isinstance(control, RecedingHorizon):
+            control.reset()
+        x, total = start.unsqueeze(0), 0.0
+        for k in range(steps):
+            began = time.perf_counter()
+            u = torch.as_tensor(control(x[0].numpy())).unsqueeze(0)
+            spent += time.perf_counter() - began
+            held = lambda y, u=u: (problem.velocity(y, u), problem.state_cost(y) + problem.control_cost.cost(u))
+            part, x = discounted_integral(held, x, problem.discount, step, WITHIN, wrap=False)
+            total += math.exp(-problem.discount * k * step) * float(part)
+        costs.append(total)
+    return Played(np.array(costs), spent / (len(x0) * steps))
+
+
+def horizons(config: dict) -> Callable[[], dict[str, Played]]:
+    """What ``config`` asks for, checked: `play` of a saved controller, of a receding horizon with its `V` at the end, and
+    of one ``longer`` times as long without. Raises `InputError` for a wrong field, and for a run without a `V`."""
+    controller, casadi = load_run(config), require_casadi()
+    problem = controller.problem
+    if controller.fields.value is None:
+        raise InputError(f"run is {str(config['run'])!r}, which holds no V: take one of method=dual or pd.")
+    if not problem.has_simulator or problem.noisy:
+        raise InputError("a receding horizon needs a problem that can be simulated, without noise.")
+    sizes = {name: require_integer(name, config[name], 1, maximum=10_000) for name in ("steps", "longer", "starts")}
+    step = STEP / problem.discount if config["step"] is None else require_number("step", config["step"], above=0.0)
+    asked = config["time"]
+    lasts = TIME / problem.discount if asked is None else require_number("time", asked, above=0.0)
+    seed = require_integer("seed", config["seed"], 0)
+    count = max(1, round(lasts / step))
+
+    def compare() -> dict[str, Played]:
+        with tempfile.TemporaryDirectory() as folder:
+            (file,) = controller.export(Path(folder) / "V.casadi", coordinates="torus")
+            V = casadi.Function.load(str(file))
+        x0 = initial_points(problem, sizes["starts"], 0, seed)[0].double().numpy()
+        with_V = RecedingHorizon(problem, sizes["steps"], step, V)
+        alone = RecedingHorizon(problem, sizes["steps"] * sizes["longer"], step)
+        log.info("%d starts, %g units of time, a control every %g", len(x0), count * step, step)
+        found = {"the controller": play(problem, lambda x: controller(x[None]).astype(np.float64)[0], x0, step, count)}
+        for horizon, end in ((with_V, "V"), (alone, "nothing")):
+            name = f"a horizon of {horizon.steps * horizon.step:g}, {end} at its end"
+            found[name] = play(problem, horizon, x0, step, count)
+        log.info("%s", table(found))
+        return found
+
+    return compare
+
+
+def table(found: dict[str, Played]) -> str:
+    """Mean costs, what each is over the last one with the standard error of that, and milliseconds a control."""
+    *_, last = found.values()
+    width = max(map(len, found))
+    lines = [f"{'':{width}}  {'cost':>10}  {'over the last, %':>18}  {'ms':>8}"]
+    for name, played in found.items():
+        apart = 100.0 * (played.costs - last.costs) / last.costs.mean()
+        error = apart.std(ddof=1) / math.sqrt(len(apart)) if len(apart) > 1 else math.nan
+        difference = f"{apart.mean():.2f} +- {error:.2f}"
+        lines.append(f"{name:{width}}  {played.costs.mean():10.5f}  {difference:>18}  {1e3 * played.seconds:8.2f}")
+    return "\n".join(lines)

@@ -1,0 +1,96 @@
+"""A receding horizon with `V*` at its end is optimal however short it is; its factors are those of the problem."""
+
+import numpy as np
+import pytest
+import torch
+
+from ocp_torch import Circle, InputError, Manufactured
+from ocp_torch.export import lowered
+from ocp_torch.export.casadi_function import casadi_function
+from ocp_torch.studies.horizons import horizons, play
+from support.controllers import controllers
+from support.systems import Swing
+
+pytest.importorskip("casadi")
+from ocp_torch.control.receding_horizon import RecedingHorizon, model  # noqa: E402
+
+STARTS = np.random.default_rng(0).random((2, 2))
+
+
+def terminal(problem):
+    """`V*`, with the optimal control to start from."""
+    exact = lambda x: {"value": problem.exact_value(x)}
+    return casadi_function(lowered(exact, torch.full((1, problem.dim), 0.3, dtype=torch.float64)), "exact")
+
+
+def test_the_model_is_the_problem():
+    problem = Swing(control_limit=2.0)
+    f, a, B = model(problem)(np.array([0.2, 0.7]))
+    x = torch.tensor([[0.2, 0.7]], dtype=torch.float64)
+    np.testing.assert_allclose(f.full().ravel(), problem.state_cost(x), rtol=1e-12)
+    np.testing.assert_allclose(a.full().ravel(), problem.drift(x)[0], rtol=1e-12)
+    np.testing.assert_allclose(B.full().ravel(), problem.control_matrix(x)[0].T.ravel(), rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("exponent", [2.0, pytest.param(1.5, marks=pytest.mark.nightly)])
+def test_with_the_exact_value_two_steps_are_enough(exponent):
+    problem = Manufactured(dim=2, exponent=exponent)
+    step, steps = 0.05, 60
+    V = terminal(problem)
+    short = play(problem, RecedingHorizon(problem, 2, step, V), STARTS, step, steps)
+    best = problem.exact_value(torch.as_tensor(STARTS)).numpy()
+    np.testing.assert_allclose(short.costs, best, rtol=5e-3)  # what is left after three discount times, and steps
+    alone = play(problem, RecedingHorizon(problem, 2, step), STARTS, step, steps)
+    assert (alone.costs > short.costs + 0.01).all()
+
+
+@pytest.mark.parametrize("limit", [0.05, [0.05, 0.02]])
+def test_it_keeps_to_the_limits(limit):
+    problem = Manufactured(dim=2, control_limit=limit)
+    horizon = RecedingHorizon(problem, 5, 0.1)
+    u = np.array([horizon(x) for x in STARTS])
+    size = np.abs(u) if isinstance(limit, list) else np.linalg.norm(u, axis=1)
+    assert (size <= np.array(limit) * (1.0 + 1e-6)).all()
+    assert (size.max(axis=0) > 0.9 * np.array(limit)).any()
+
+
+def test_whole_turns_change_nothing():
+    problem = Circle()
+    controls = []
+    for turns in (0.0, 3.0, -2.0):
+        horizon = RecedingHorizon(problem, 4, 0.1)
+        controls.append([horizon(np.array([x + turns * k])) for k, x in enumerate((0.1, 0.12))])
+    np.testing.assert_allclose(controls[1], controls[0], atol=1e-5)
+    np.testing.assert_allclose(controls[2], controls[0], atol=1e-5)
+
+
+def asked(path, **changes):
+    return {
+        "run": str(path),
+        "problem": {},
+        "steps": 2,
+        "step": None,
+        "longer": 2,
+        "starts": 2,
+        "time": 0.2,
+        "seed": 0,
+    } | changes
+
+
+def test_the_comparison_of_a_run(tmp_path, caplog):
+    file = tmp_path / "controller.safetensors"
+    controllers("dual")[0].save(file)
+    with caplog.at_level("INFO"):
+        found = horizons(asked(file))()
+    assert [len(played.costs) for played in found.values()] == [2, 2, 2]
+    assert all(np.isfinite(played.costs).all() and (played.costs > 0.0).all() for played in found.values())
+    assert all(name in caplog.text for name in found)
+    for changes, reason in [
+        ({"steps": 0}, "steps is 0, but must be at least 1"),
+        ({"time": -1.0}, "time is -1, but must be above 0"),
+    ]:
+        with pytest.raises(InputError, match=reason):
+            horizons(asked(file, **changes))
+    controllers("primal network")[0].save(file)
+    with pytest.raises(InputError, match="holds no V: take one of method=dual or pd"):
+        horizons(asked(file))
