@@ -19,6 +19,7 @@ from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import StepReport
 from ocp_torch.training.observer import Silent
+from ocp_torch.training.running import RunningEstimates
 from ocp_torch.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
@@ -27,6 +28,13 @@ EVENTS = "events.out.tfevents."
 # A full certificate has cost 5 to 10 times a quick one, beside its own fit (measured on the circle, the pendulum and a
 # manufactured problem in four dimensions).
 QUICK_CERTIFICATES = 6.0
+# One chart in which the bracket closes, of running estimates, and one of the looks.
+BRACKET = {
+    "bracket": {
+        "while it trains": ["Multiline", [r"running/.*"]],
+        "looks": ["Multiline", [r"bounds/.*", r"performance/.*"]],
+    }
+}
 TICK = 1.0  # seconds between two movements of the clock
 CLOCK = "{desc}: {elapsed}{postfix}"
 
@@ -47,7 +55,7 @@ def liouville_residual(trainer: Trainer, batch: Samples) -> dict[str, Tensor]:
 
 
 class Monitor(Silent):
-    """Progress bar (terminals only), log lines, and TensorBoard scalars in the groups bounds, performance, loss, lr,
+    """Progress bar (terminals only), log lines, and TensorBoard scalars in the groups running, bounds, performance, loss, lr,
     gradient_norm, violation and throughput."""
 
     def __init__(self, folder: Path, trainer: Trainer) -> None:
@@ -58,6 +66,8 @@ class Monitor(Silent):
         # disable=None: no bar where the output is not a terminal.
         hidden = None if trainer.settings.progress else True
         step = trainer.step
+        self.writer.add_custom_scalars(BRACKET)
+        self.running = RunningEstimates(trainer.problem, trainer.trained, trainer.seed)
         self.bar = tqdm(total=max(trainer.end, step), initial=step, unit="step", dynamic_ncols=True, disable=hidden)
         self.stages = Stages(hidden)
         self._folder = folder
@@ -84,6 +94,9 @@ class Monitor(Silent):
         for group, values in {**shown, "lr": trainer.stepper.learning_rates()}.items():
             for name, value in values.items():
                 self.writer.add_scalar(f"{group}/{name}", float(value), step)
+        if self.running.due(trainer.state.elapsed):
+            for name, value in self.running(trainer.constants).items():
+                self.writer.add_scalar(f"running/{name}", value, step)
         now, (then, before) = time.perf_counter(), self._mark
         speed = (trainer.samples - before) / max(now - then, 1e-9)
         self._mark = (now, trainer.samples)

@@ -9,6 +9,7 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.run import run_to_end
 from ocp_torch.training.monitor import Monitor, Stages, liouville_residual
+from ocp_torch.training.running import RunningEstimates
 from support.small import METHODS, small
 
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
@@ -18,7 +19,8 @@ WAYS = {**METHODS, "saddle with drift": ("method=pd", "method.augmentation=0", *
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_the_game_is_shown_at_every_phase(way, tmp_path):
+def test_the_game_is_shown_at_every_phase(way, tmp_path, monkeypatch):
+    monkeypatch.setattr("ocp_torch.training.running.SECONDS", 1e9)  # the clock is no part of this
     trainer = small(*WAYS[way], "trainer.log_every=5")
     with Monitor(tmp_path, trainer) as monitor:
         trainer.fit(monitor)
@@ -32,6 +34,33 @@ def test_the_game_is_shown_at_every_phase(way, tmp_path):
         assert shown["violation/slack_mean_positive"] == shown["violation/slack_maximum"] == [5, 10, 15, 20]
     if trainer.fields.control_density is not None:
         assert shown["violation/residual_mean_absolute"] == [5, 10, 15, 20]
+        assert shown["running/J"] == [5, 10, 15, 20]
+    assert shown["running/Perf"] == [5, 10, 15, 20]
+    layout = events.Tensors("custom_scalars__config__")[0].tensor_proto.string_val[0]
+    assert b"running/.*" in layout
+
+
+@pytest.mark.parametrize(("method", "noise"), [("dual", "0.0"), ("primal", "0.0"), ("pd", "0.05")])
+def test_running_estimates_are_those_of_a_certificate(method, noise):
+    trainer = small(f"method={method}", "problem=manufactured", f"problem.noise={noise}", "model.width=16")
+    found = RunningEstimates(trainer.problem, trainer.trained, 0)(trainer.constants)
+    certificate = trainer.evaluator.evaluate(trainer.run)
+    assert found["OPT"] == certificate.exact
+    name = "density" if method == "primal" else "value"
+    assert found["Perf"] == pytest.approx(certificate.perf[name].value, rel=0.1)
+    for bound, side, off in (("F_M", certificate.lower, 0.1), ("J", certificate.upper, 0.25)):
+        assert (bound in found) == (bound in side and side[bound] is not None)
+        if bound in found:
+            assert found[bound] == pytest.approx(side[bound].value, rel=off)
+
+
+def test_running_estimates_take_a_small_part_of_the_time():
+    trainer = small("problem=circle")
+    running = RunningEstimates(trainer.problem, trainer.trained, 0)
+    assert running.due(0.0)
+    running._spent = 3.0
+    assert not running.due(90.0)
+    assert running.due(110.0)
 
 
 @pytest.mark.parametrize("way", ["saddle with drift", "pd with drift"])
