@@ -1,0 +1,152 @@
+"""What a report says of a certificate in words: what is certified, which number to trust, what each bound is and rests on."""
+
+import math
+
+from ocp_torch.certificate import bounds
+from ocp_torch.certificate.bound import LOWER, UPPER
+from ocp_torch.certificate.report import in_words
+from ocp_torch.errors import visible
+from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED
+
+# From so many times the simulated gap on, the certified one says little of the controller.
+FAR = 2.0
+PERFORMANCES = {
+    "value": "controller from V",
+    "density": "controller w / mu",
+    "trajectories": "controller from V of trajectories",
+    "given": "this controller",
+}
+BOUNDS = {
+    "F_M": "the dual value of `V`, each violation of its inequality charged `M` times; needs no controller",
+    "shifted": "`E[V mu0]` less the largest violation of the inequality of `V`; needs neither a controller nor an `M`",
+    "rigorous": "the shifted bound with its supremum proved by interval arithmetic",
+    "J": "the cost of `(w, mu)`, each violation of the equation of `mu` charged `C_V` times",
+    "G": "`J` with the best `mu` for each `w`, in closed form",
+    "lagrangian": "the controller's own Bellman equation, weighed by its occupation density; nothing is simulated",
+    "evaluation": "`E[V mu0]` and the largest violation of the controller's own Bellman equation",
+}
+NEEDS = {
+    "M": "`M` is at least `sup mu*`, the largest density of where an optimal controller spends its discounted time",
+    "C_V": "`C_V` is at least the largest cost from any state on",
+    "f": "the state cost `f` is nowhere negative",
+    "regular": "neither `a`, `B` nor the controller jumps",
+    "sup Q": "no state violates the inequality of `V` by more than the worst that was found",
+    "sup |Q_u|": "no state violates the controller's Bellman equation by more than the worst that was found",
+}
+BASES = {
+    GIVEN: "the problem declares it, or the user did; nothing that was observed speaks against it",
+    PROVED: "by a theorem or interval arithmetic",
+    SEARCHED: "the largest value that samples and local ascents met: an estimate from below, which more effort may raise",
+    GUESSED: "a multiple of something seen; what rests on it enters no gap that counts",
+}
+
+
+def number(value) -> float:
+    """``value`` of a file as a number that can be drawn; `ValueError` or `TypeError` otherwise."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{visible(value, 80)} is not a number")
+    return float(value)
+
+
+def percent(part) -> str:
+    return f"{100.0 * number(part):.3g} %"
+
+
+def label(side: str, name: str) -> str:
+    """What the entry ``name`` of a ``side`` of a certificate is called."""
+    if side == "perf":
+        return f"Perf: {PERFORMANCES.get(name, name)}"
+    listed = bounds.on(side).get(name)
+    named = listed.label if listed else name
+    return {LOWER: f"{named} ≤ OPT", UPPER: f"Perf ≤ {named}"}.get(side, named)
+
+
+def sentence(words: str) -> str:
+    return f"{words[:1].upper()}{words[1:].rstrip('.')}."
+
+
+def certified(certificate: dict) -> bool:
+    """Whether anything says how far from optimal the controller can be at most."""
+    most = (certificate.get("suboptimality") or {}).get("at_most")
+    return certificate["contradiction"] is None and (most is not None or certificate["gap"]["certified"] is not None)
+
+
+def lead(certificate: dict) -> str:
+    """The first sentence: what is certified of the controller, or that nothing is, and why."""
+    if certificate["contradiction"] is not None:
+        return sentence(str(certificate["contradiction"]))
+    said, gap = in_words(certificate), certificate["gap"]
+    if (certificate.get("suboptimality") or {}).get("at_most") is not None:
+        return sentence(said[0])
+    if gap["certified"] is not None:
+        needs = [*_rests(certificate, "lower"), *_rests(certificate, "upper")]
+        taken = "".join(f", taking that {need}" for need in dict.fromkeys(needs))
+        most = f"at most {percent(gap['certified'])} worse than the optimum, with nothing simulated"
+        return f"The controller is {most} ({percent(certificate['confidence'])} sure of the sampling{taken})."
+    if gap["lower_from"] is None:
+        why = "no lower bound on the optimum counts"
+    elif number(certificate["lower"][gap["lower_from"]]["value"]) <= 0.0:
+        why = "the lower bound on the optimum is not above 0, so that nothing can be said relative to it"
+    elif gap["upper_from"] is not None:
+        why = "its bounds cross, though by less than would refute one of them"
+    else:
+        why = "there is no upper bound that counts, and no simulation"
+    return f"Nothing is certified of how far from optimal the controller is: {why}." + "".join(
+        f" {sentence(words)}" for words in said
+    )
+
+
+def _rests(certificate: dict, side: str) -> list[str]:
+    bound = certificate[side].get(certificate["gap"][f"{side}_from"]) or {}
+    return [NEEDS.get(name, str(name)).replace("`", "") for name in bound.get("rests_on", {})]
+
+
+def trust(certificate: dict) -> list[str]:
+    """Which number to trust, and why, a sentence each."""
+    gap, found = certificate["gap"], list[str]()
+    sides = {side: label(side, str(gap[f"{side}_from"])) for side in (LOWER, UPPER) if gap[f"{side}_from"]}
+    proved, seen = gap["certified"], gap["simulated"]
+    if certificate["contradiction"] is not None:
+        return ["Trust none of the numbers below until the contradiction is resolved: one of them is wrong."]
+    if proved is not None and number(proved) > 1.0:
+        found.append(
+            f"The bounds without simulation are far apart: `{sides[UPPER]}` is {1.0 + proved:.2g} times `{sides[LOWER]}`."
+        )
+    elif proved is not None:
+        found.append(
+            f"The certified gap, {percent(proved)}, lies between `{sides[LOWER]}` and `{sides[UPPER]}`. Both are averages "
+            "over sampled states: no trajectory is simulated."
+        )
+    if seen is not None:
+        found.append(
+            f"The simulated gap, {percent(seen)}, lies between `{sides[LOWER]}` and the cost of simulated trajectories: as "
+            "good as the simulation, whose time steps were halved until they no longer mattered."
+        )
+    if proved is not None and seen is not None:
+        wide = number(proved) > FAR * number(seen)
+        found.append(
+            "Trust the simulated one: the certified one is true, but so wide that it says little of this controller."
+            if wide
+            else "Trust the certified one: it needs less, and is about as narrow."
+        )
+    if gap.get("conditional") is not None:
+        guesses = [str(b["if"]) for b in certificate["lower"].values() if b and "if" in b]
+        told = " and ".join(dict.fromkeys(guesses)) or "a guess is right"
+        found.append(
+            f"If {told}, the gap is {percent(gap['conditional'])}: a guess, so rely on it only if you know that."
+        )
+    if (exact := certificate["exact"]) is not None and number(exact) > 0.0:
+        found.append(
+            f"The optimum of this problem is known, {exact:.8g}: the table says how far each number is from it."
+        )
+    shares = [number(s) for s in certificate["share"].values() if s is not None]
+    if shares:
+        had = f"{100.0 * max(shares):.4g} % of what control can gain over doing nothing is certainly had."
+        found.append(
+            had if max(shares) > 0.0 else "It is not certain that the controller gains anything over doing nothing."
+        )
+    if (outside := certificate.get("outside_box")) is not None:
+        found.append(
+            f"{percent(outside['value'])} of the discounted time is spent outside the box, where the model ends."
+        )
+    return found
