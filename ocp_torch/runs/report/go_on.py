@@ -9,29 +9,31 @@ from ocp_torch.problems.simulator.simulator import Simulator
 from ocp_torch.runs.report.page import code, section
 
 
-def going_on(folder: Path, problem: Problem, config: dict) -> str:
-    """What to type for the run in ``folder``, of ``problem`` and its ``config``."""
+def going_on(folder: Path, problem: Problem, config: dict, step: int) -> str:
+    """What to type for the run in ``folder``, of ``problem`` and its ``config``, which ended at ``step``."""
     return section(
-        "How to go on", *(f"<h3>{name}</h3>{code(lines)}" for name, lines in commands(folder, problem, config))
+        "How to go on", *(f"<h3>{name}</h3>{code(lines)}" for name, lines in commands(folder, problem, config, step))
     )
 
 
-def commands(folder: Path, problem: Problem, config: dict) -> list[tuple[str, str]]:
+def commands(folder: Path, problem: Problem, config: dict, step: int) -> list[tuple[str, str]]:
     """What each is for, and its lines."""
     made = config.get("problem") or {}
     ours = type(problem) in PROBLEMS.values()
     # What only the command line may name: a resume has the arguments of a class already, but not those of a function.
     own = [] if ours else naming(made)
     again = own[:1] if not isinstance(problem, Simulator) else ["problem=callable", *own[1:]]
-    run, steps = as_typed(str(folder)), config.get("trainer", {}).get("steps")
+    run = as_typed(str(folder))
     typed = lambda script, *rest: shlex.join(["python", f"scripts/{script}.py", *rest])
     certified = [typed("evaluate", f"run={run}", "seed=7", *own)]
-    if problem.dim <= 2 and problem.has_simulator:
+    if ours and problem.dim <= 2 and problem.has_simulator:
         certified.append(typed("evaluate", f"run={run}", "certificate.rigorous=true", *own))
-    more = f"trainer.steps={2 * steps}" if isinstance(steps, int) else "trainer.max_seconds=3600"
     found = [
         ("Certify again: on other states, or with a proof", "\n".join(certified)),
-        ("Train on", typed("train", f"resume={run}", more, *(word.lstrip("+") for word in again))),
+        (
+            "Train on",
+            typed("train", f"resume={run}", f"trainer.steps={2 * step}", *(word.lstrip("+") for word in again)),
+        ),
         ("Use the controller in Python", _python(folder, problem, made, ours)),
     ]
     if problem.has_simulator:

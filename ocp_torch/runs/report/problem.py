@@ -64,4 +64,4 @@ def _noisy(problem: Problem) -> bool:
 def _range(coordinate) -> str:
     if hasattr(coordinate, "high"):
         return f"{coordinate.label} from {coordinate.low:g} to {coordinate.high:g}"
-    return f"{coordinate.label}, an angle of period {coordinate.length:.6g}"
+    return f"{coordinate.label}, of period {coordinate.length:.6g}"

@@ -52,10 +52,10 @@ def report(folder: Path, certificate: dict, metrics: dict | None, problem: Probl
         *sections.closed(certificate),
         sections.what_bounds_say(certificate),
         sections.warnings(certificate),
-        sections.figures(drawn(folder)),
+        sections.figures(drawn(folder), problem.dim),
         sections.numbers(metrics),
         sections.learning(history.curves(folder), certificate),
-        going_on(folder, problem, config),
+        going_on(folder, problem, config, steps),
         sections.configuration(config),
     ]
     return page(f"{name}, {method}", parts)

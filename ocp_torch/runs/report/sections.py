@@ -92,13 +92,15 @@ def learning(found: history.Curves, certificate: dict) -> str:
     return section("Learning curves", *(f"<h3>{name}</h3>{drawn}" for name, drawn in charts.items() if drawn))
 
 
-def figures(drawn: dict[str, bytes]) -> str:
-    """Those that the run drew, PNG by name."""
+def figures(drawn: dict[str, bytes], dim: int) -> str:
+    """Those that the run drew in ``dim`` dimensions, PNG by name."""
     known = [(k, name) for name in drawn if name != DRAWN for k, start in enumerate(FIGURES) if name.startswith(start)]
     first = [(name, list(FIGURES.values())[k]) for k, name in sorted(known)]
     rest = [(name, name) for name in sorted(drawn) if name != DRAWN and name not in dict(first)]
     shown = [image(drawn[name], caption) for name, caption in [*first, *rest]]
-    return section("V, u, mu and motion", f'<div class="figures">{"".join(shown)}</div>') if shown else ""
+    cut = "Maps are cuts along the first two coordinates, through the middle of the others." if dim > 2 else ""
+    inner = f'<div class="figures">{"".join(shown)}</div>'
+    return section("V, u, mu and motion", paragraph(cut, "soft") if cut else "", inner) if shown else ""
 
 
 def numbers(metrics: dict | None) -> str:

@@ -4,12 +4,14 @@ import math
 
 from ocp_torch.certificate import bounds
 from ocp_torch.certificate.bound import LOWER, UPPER
-from ocp_torch.certificate.report import in_words
+from ocp_torch.certificate.report import in_words, taking
 from ocp_torch.errors import visible
 from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED
 
 # From so many times the simulated gap on, the certified one says little of the controller.
 FAR = 2.0
+# A gap above this means nothing as a percentage.
+MEANS = 1.0
 PERFORMANCES = {
     "value": "controller from V",
     "density": "controller w / mu",
@@ -66,9 +68,10 @@ def sentence(words: str) -> str:
 
 
 def certified(certificate: dict) -> bool:
-    """Whether anything says how far from optimal the controller can be at most."""
-    most = (certificate.get("suboptimality") or {}).get("at_most")
-    return certificate["contradiction"] is None and (most is not None or certificate["gap"]["certified"] is not None)
+    """Whether anything worth saying bounds how far from optimal the controller can be."""
+    most = _most(certificate)
+    most = certificate["gap"]["certified"] if most is None else most
+    return certificate["contradiction"] is None and most is not None and number(most) <= MEANS
 
 
 def lead(certificate: dict) -> str:
@@ -76,8 +79,12 @@ def lead(certificate: dict) -> str:
     if certificate["contradiction"] is not None:
         return sentence(str(certificate["contradiction"]))
     said, gap = in_words(certificate), certificate["gap"]
-    if (certificate.get("suboptimality") or {}).get("at_most") is not None:
-        return sentence(said[0])
+    if (most := _most(certificate)) is not None:
+        times = f"{math.ceil(10.0 * (1.0 + number(most))) / 10.0:,g}"
+        little = (
+            f"hardly anything is certified: the controller may cost {times} times the optimum ({taking(certificate)})"
+        )
+        return sentence(said[0] if most <= MEANS else little)
     if gap["certified"] is not None:
         needs = [*_rests(certificate, "lower"), *_rests(certificate, "upper")]
         taken = "".join(f", taking that {need}" for need in dict.fromkeys(needs))
@@ -96,6 +103,10 @@ def lead(certificate: dict) -> str:
     )
 
 
+def _most(certificate: dict):
+    return (certificate.get("suboptimality") or {}).get("at_most")
+
+
 def _rests(certificate: dict, side: str) -> list[str]:
     bound = certificate[side].get(certificate["gap"][f"{side}_from"]) or {}
     return [NEEDS.get(name, str(name)).replace("`", "") for name in bound.get("rests_on", {})]
@@ -108,7 +119,7 @@ def trust(certificate: dict) -> list[str]:
     proved, seen = gap["certified"], gap["simulated"]
     if certificate["contradiction"] is not None:
         return ["Trust none of the numbers below until the contradiction is resolved: one of them is wrong."]
-    if proved is not None and number(proved) > 1.0:
+    if proved is not None and number(proved) > MEANS:
         found.append(
             f"The bounds without simulation are far apart: `{sides[UPPER]}` is {1.0 + proved:.2g} times `{sides[LOWER]}`."
         )
