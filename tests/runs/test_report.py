@@ -161,7 +161,7 @@ def test_the_band_of_the_bracket_holds_the_optimum_and_dots_stand_in_order(finis
 @pytest.mark.parametrize(
     ("gap", "above", "said"),
     [
-        (None, None, "Nothing is certified of how far from optimal the controller is: no lower bound"),
+        (None, None, "Nothing is certified of how far from optimal the controller is: there is no lower bound"),
         (-0.5, 0.2, "Nothing is certified: F_M = 0.05, a lower bound, contradicts"),
         (4.0, 5.0, "Hardly anything is certified: the controller may cost 5 times the optimum (95 % sure"),
         (0.1, 0.2, f"{in_words(certificate(Run('circle', 'pd'), 0.1).to_dict())[0]}."),
@@ -179,7 +179,9 @@ def test_it_says_what_is_certified_and_no_more(gap, above, said, tmp_path):
 def test_without_simulation_the_certified_gap_is_the_sentence(tmp_path):
     made = replace(certificate(Run("circle", "pd"), 0.1, 0.2), perf={"value": None, "density": None})
     said = looked(tmp_path / "run", made).lead
-    assert said.startswith("The controller is at most 20 % worse than the optimum, with nothing simulated")
+    assert said.startswith(
+        "The controller is at most 20 % worse than the optimum (nothing is simulated, each bound 95 %"
+    )
     assert "M is at least sup mu*" in said
     negative = replace(made, lower={"F_M": replace(made.lower["F_M"], value=-1.0)})
     assert "is not above 0" in looked(tmp_path / "other", negative).lead

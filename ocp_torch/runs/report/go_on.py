@@ -9,14 +9,15 @@ from ocp_torch.problems.simulator.simulator import Simulator
 from ocp_torch.runs.report.page import code, section
 
 
-def going_on(folder: Path, problem: Problem, config: dict, step: int) -> str:
-    """What to type for the run in ``folder``, of ``problem`` and its ``config``, which ended at ``step``."""
+def going_on(folder: Path, problem: Problem, config: dict, certificate: dict) -> str:
+    """What to type for the run in ``folder``, of ``problem`` and its ``config``, which ended with ``certificate``."""
     return section(
-        "How to go on", *(f"<h3>{name}</h3>{code(lines)}" for name, lines in commands(folder, problem, config, step))
+        "How to go on",
+        *(f"<h3>{name}</h3>{code(lines)}" for name, lines in commands(folder, problem, config, certificate)),
     )
 
 
-def commands(folder: Path, problem: Problem, config: dict, step: int) -> list[tuple[str, str]]:
+def commands(folder: Path, problem: Problem, config: dict, certificate: dict) -> list[tuple[str, str]]:
     """What each is for, and its lines."""
     made = config.get("problem") or {}
     ours = type(problem) in PROBLEMS.values()
@@ -26,14 +27,12 @@ def commands(folder: Path, problem: Problem, config: dict, step: int) -> list[tu
     run = as_typed(str(folder))
     typed = lambda script, *rest: shlex.join(["python", f"scripts/{script}.py", *rest])
     certified = [typed("evaluate", f"run={run}", "seed=7", *own)]
-    if ours and problem.dim <= 2 and problem.has_simulator:
+    if ours and problem.dim <= 2 and certificate["lower"].get("shifted"):
         certified.append(typed("evaluate", f"run={run}", "certificate.rigorous=true", *own))
+    more = (f"trainer.steps={2 * certificate['step']}", *(word.lstrip("+") for word in again))
     found = [
-        ("Certify again: on other states, or with a proof", "\n".join(certified)),
-        (
-            "Train on",
-            typed("train", f"resume={run}", f"trainer.steps={2 * step}", *(word.lstrip("+") for word in again)),
-        ),
+        ("Certify again, on other states", "\n".join(certified)),
+        ("Train on", typed("train", f"resume={run}", *more)),
         ("Use the controller in Python", _python(folder, problem, made, ours)),
     ]
     if problem.has_simulator:

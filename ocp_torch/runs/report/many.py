@@ -9,9 +9,10 @@ from ocp_torch.files.reading import FILE, kind, read_json
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.runs.compare import COLUMNS, LARGEST_CERTIFICATE, Comparison
 from ocp_torch.runs.report.bracket import bracket, gaps
+from ocp_torch.runs.report.lead import lead
 from ocp_torch.runs.report.page import page, paragraph, section, table, text
 from ocp_torch.runs.report.report import DAMAGE, REPORT, reason
-from ocp_torch.runs.report.words import lead, percent
+from ocp_torch.runs.report.words import percent
 
 FIRST = ("run", "gap_certified", "gap_simulated", "share")
 

@@ -55,7 +55,7 @@ def report(folder: Path, certificate: dict, metrics: dict | None, problem: Probl
         sections.figures(drawn(folder), problem.dim),
         sections.numbers(metrics),
         sections.learning(history.curves(folder), certificate),
-        going_on(folder, problem, config, steps),
+        going_on(folder, problem, config, certificate),
         sections.configuration(config),
     ]
     return page(f"{name}, {method}", parts)

@@ -8,6 +8,7 @@ from ocp_torch.runs.report import history, words
 from ocp_torch.runs.report.advice import advice
 from ocp_torch.runs.report.bracket import bracket
 from ocp_torch.runs.report.charts import chart
+from ocp_torch.runs.report.lead import certified, lead
 from ocp_torch.runs.report.page import code, folded, image, listing, paragraph, prose, section, table, text
 from ocp_torch.runs.report.problem import BRACKET
 
@@ -26,7 +27,7 @@ ROWS = {"controller": "this controller", "zero": "no control", "classical": "a c
 
 def first(certificate: dict) -> str:
     """The sentence that matters most."""
-    return paragraph(text(words.lead(certificate)), "lead" if words.certified(certificate) else "lead alert")
+    return paragraph(text(lead(certificate)), "lead" if certified(certificate) else "lead alert")
 
 
 def closed(certificate: dict) -> list[str]:

@@ -1,10 +1,9 @@
-"""What a report says of a certificate in words: what is certified, which number to trust, what each bound is and rests on."""
+"""What a report says of a certificate in words: which number to trust, what each bound is, and what it rests on."""
 
 import math
 
 from ocp_torch.certificate import bounds
 from ocp_torch.certificate.bound import LOWER, UPPER
-from ocp_torch.certificate.report import in_words, taking
 from ocp_torch.errors import visible
 from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED
 
@@ -67,51 +66,6 @@ def sentence(words: str) -> str:
     return f"{words[:1].upper()}{words[1:].rstrip('.')}."
 
 
-def certified(certificate: dict) -> bool:
-    """Whether anything worth saying bounds how far from optimal the controller can be."""
-    most = _most(certificate)
-    most = certificate["gap"]["certified"] if most is None else most
-    return certificate["contradiction"] is None and most is not None and number(most) <= MEANS
-
-
-def lead(certificate: dict) -> str:
-    """The first sentence: what is certified of the controller, or that nothing is, and why."""
-    if certificate["contradiction"] is not None:
-        return sentence(str(certificate["contradiction"]))
-    said, gap = in_words(certificate), certificate["gap"]
-    if (most := _most(certificate)) is not None:
-        times = f"{math.ceil(10.0 * (1.0 + number(most))) / 10.0:,g}"
-        little = (
-            f"hardly anything is certified: the controller may cost {times} times the optimum ({taking(certificate)})"
-        )
-        return sentence(said[0] if most <= MEANS else little)
-    if gap["certified"] is not None:
-        needs = [*_rests(certificate, "lower"), *_rests(certificate, "upper")]
-        taken = "".join(f", taking that {need}" for need in dict.fromkeys(needs))
-        most = f"at most {percent(gap['certified'])} worse than the optimum, with nothing simulated"
-        return f"The controller is {most} ({percent(certificate['confidence'])} sure of the sampling{taken})."
-    if gap["lower_from"] is None:
-        why = "no lower bound on the optimum counts"
-    elif number(certificate["lower"][gap["lower_from"]]["value"]) <= 0.0:
-        why = "the lower bound on the optimum is not above 0, so that nothing can be said relative to it"
-    elif gap["upper_from"] is not None:
-        why = "its bounds cross, though by less than would refute one of them"
-    else:
-        why = "there is no upper bound that counts, and no simulation"
-    return f"Nothing is certified of how far from optimal the controller is: {why}." + "".join(
-        f" {sentence(words)}" for words in said
-    )
-
-
-def _most(certificate: dict):
-    return (certificate.get("suboptimality") or {}).get("at_most")
-
-
-def _rests(certificate: dict, side: str) -> list[str]:
-    bound = certificate[side].get(certificate["gap"][f"{side}_from"]) or {}
-    return [NEEDS.get(name, str(name)).replace("`", "") for name in bound.get("rests_on", {})]
-
-
 def trust(certificate: dict) -> list[str]:
     """Which number to trust, and why, a sentence each."""
     gap, found = certificate["gap"], list[str]()
@@ -140,6 +94,8 @@ def trust(certificate: dict) -> list[str]:
             if wide
             else "Trust the certified one: it needs less, and is about as narrow."
         )
+    if not found:
+        found.append("There is no gap: each number of the table stands for itself alone.")
     if gap.get("conditional") is not None:
         guesses = [str(b["if"]) for b in certificate["lower"].values() if b and "if" in b]
         told = " and ".join(dict.fromkeys(guesses)) or "a guess is right"
