@@ -77,11 +77,12 @@ def learning(found: history.Curves, certificate: dict) -> str:
     """Bounds, gaps, losses and violations along the steps."""
     group = lambda name: history.group(found, name)
     perf = {n: points for n, points in group("performance").items() if n == certificate.get("controller")}
-    bounds, lower = group("bounds"), certificate["lower"]
+    bounds, lower, best = group("bounds"), certificate["lower"], certificate["gap"]["lower_from"]
+    # The axis holds what the gap is between, in the second half of the looks: at first bounds are anywhere.
+    held = [bounds[name] for name in ([best] if best else lower) if name in bounds] + list(perf.values())
+    tight = [y for points in held for _, y in points[(len(points) - 1) // 2 :]]
     curves = {words.label("lower", name): bounds.pop(name) for name in lower if name in bounds}
     curves |= {words.label("perf", name): points for name, points in perf.items()}
-    # The axis holds what these were in the second half: at first bounds are anywhere.
-    tight = [y for points in curves.values() for _, y in points[(len(points) - 1) // 2 :]]
     curves |= {"OPT": bounds.pop("exact")} if "exact" in bounds else {}
     curves |= {words.label("upper", name): bounds[name] for name in reversed(bounds)}
     charts = {

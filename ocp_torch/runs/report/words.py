@@ -7,8 +7,8 @@ from ocp_torch.certificate.bound import LOWER, UPPER
 from ocp_torch.errors import visible
 from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED
 
-# From so many times the simulated gap on, the certified one says little of the controller.
-FAR = 2.0
+# A certified gap up to this, or up to so many times the simulated one, says enough of the controller.
+NARROW, FAR = 0.01, 2.0
 # A gap above this means nothing as a percentage.
 MEANS = 1.0
 PERFORMANCES = {
@@ -88,11 +88,11 @@ def trust(certificate: dict) -> list[str]:
             "good as the simulation, whose time steps were halved until they no longer mattered."
         )
     if proved is not None and seen is not None:
-        wide = number(proved) > FAR * number(seen)
+        wide = number(proved) > max(NARROW, FAR * number(seen))
         found.append(
-            "Trust the simulated one: the certified one is true, but so wide that it says little of this controller."
+            "Trust the simulated one: the certified one is true, but says little of this controller."
             if wide
-            else "Trust the certified one: it needs less, and is about as narrow."
+            else "Trust the certified one: it takes less on trust, and is narrow."
         )
     if not found:
         found.append("There is no gap: each number of the table stands for itself alone.")
