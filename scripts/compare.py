@@ -1,6 +1,7 @@
-"""Runs side by side: python scripts/compare.py outputs/circle_pd outputs/sweeps/... [csv=FILE] [plot=FILE.png]
+"""Runs side by side: python scripts/compare.py outputs/circle_pd outputs/sweeps/... [csv=FILE] [plot=FILE.png] [html=FILE]
 
-With against=problem.noise (or any other number of the configuration) the plot shows gaps against that."""
+The page html=runs.html has table, gaps and what each run says, and links to the runs' own reports. With
+against=problem.noise (or any other number of the configuration) the plot shows gaps against that."""
 
 import sys
 from pathlib import Path
@@ -9,9 +10,10 @@ from ocp_torch.cli.outcome import fail
 from ocp_torch.errors import InputError, nearest, shown
 from ocp_torch.files.reading import kind
 from ocp_torch.runs.compare import compare
+from ocp_torch.runs.report.many import save_page
 from ocp_torch.runs.trend import save_trend
 
-OPTIONS = ("csv", "plot", "against")
+OPTIONS = ("csv", "plot", "html", "against")
 
 
 def main(arguments: list[str]) -> None:
@@ -22,7 +24,7 @@ def main(arguments: list[str]) -> None:
     for name, value in options.items():
         if name not in OPTIONS:
             told = f"{name} is not an option{nearest(name, OPTIONS)}"
-            raise InputError(f"{told}; it takes csv=FILE, plot=FILE and, with a plot, against=FIELD.")
+            raise InputError(f"{told}; it takes csv=FILE, plot=FILE, html=FILE and, with a plot, against=FIELD.")
         if not value:
             raise InputError(f"{name} is empty, but must be the file to write, or a field to plot against.")
     if "against" in options and "plot" not in options:
@@ -35,6 +37,8 @@ def main(arguments: list[str]) -> None:
     print(comparison.table())
     if "csv" in options:
         comparison.save_csv(Path(options["csv"]))
+    if "html" in options:
+        save_page(comparison, Path(options["html"]))
     if "against" in options:
         save_trend(comparison, options["against"], Path(options["plot"]))
     elif "plot" in options:

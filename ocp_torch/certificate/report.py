@@ -119,6 +119,11 @@ def in_words(certificate: dict) -> list[str]:
         parts.append(f"at least {percent(least)}")
     if not parts:
         return []
+    return [f"the controller is {' and '.join(parts)} worse than the optimum ({taking(certificate)})"]
+
+
+def taking(certificate: dict) -> str:
+    """How sure such a sentence is, and what else it takes."""
+    found = certificate.get("suboptimality") or {}
     taken = "".join(f", taking {sentence}" for sentence in map(visible, found.get("takes", ())))
-    sure = percent(certificate["confidence"])
-    return [f"the controller is {' and '.join(parts)} worse than the optimum ({sure} sure of the sampling{taken})"]
+    return f"{100.0 * certificate['confidence']:.3g} % sure of the sampling{taken}"

@@ -20,7 +20,7 @@ LARGEST_JSON, LARGEST_YAML = 2**26, 2**20
 # Bytes of a ZIP archive that are read at once, at most; its list of parts, which is read at once, has 50 or more for each.
 LARGEST_PIECE = 2**20
 # What a run writes in its folder.
-WRITTEN = (".hydra", "checkpoints", "figures", "*.log", "*.json", "*.safetensors", "events.*")
+WRITTEN = (".hydra", "checkpoints", "figures", "*.log", "*.json", "*.html", "*.safetensors", "events.*")
 
 
 def kind(path: str | Path) -> str | None:

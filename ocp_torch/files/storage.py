@@ -65,7 +65,7 @@ def sync(path: Path) -> None:
 def sweep_temporaries(folder: Path) -> None:
     """Remove the temporary files in ``folder`` of processes that were killed in `write_atomically`."""
     for leftover in folder.glob(".*"):
-        if re.fullmatch(r"\..+\.(pt|json|safetensors|yaml)\.[a-z0-9_]{8}", leftover.name):
+        if re.fullmatch(r"\..+\.(pt|json|html|safetensors|yaml)\.[a-z0-9_]{8}", leftover.name):
             with contextlib.suppress(OSError):
                 leftover.unlink()
 

@@ -49,9 +49,14 @@ class Comparison:
     unfinished: dict[str, str]
     folders: dict[str, Path]
 
+    @property
+    def cells(self) -> list[list[str]]:
+        """Each row as its columns are shown."""
+        return [[_shown(row[c], form) for c, form in COLUMNS.items()] for row in self.rows]
+
     def table(self) -> str:
         """For the terminal."""
-        cells = [list(COLUMNS), *([_shown(row[c], form) for c, form in COLUMNS.items()] for row in self.rows)]
+        cells = [list(COLUMNS), *self.cells]
         widths = [max(len(line[k]) for line in cells) for k in range(len(COLUMNS))]
         lines = ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in cells]
         lines.insert(1, "-" * max(map(len, lines)))

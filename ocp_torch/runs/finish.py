@@ -18,6 +18,7 @@ from ocp_torch.runs.metrics.measures import has_metrics
 from ocp_torch.runs.metrics.trial import METRICS
 from ocp_torch.runs.pictures.picture import motion
 from ocp_torch.runs.pictures.scenes import scene
+from ocp_torch.runs.report.report import REPORT
 from ocp_torch.steppers import NonFiniteError
 from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM
 from ocp_torch.training.health import sanity_warnings
@@ -146,9 +147,10 @@ def missing(folder: Path, trainer: Trainer, settings: CertificateSettings) -> st
     files = ["certificate.json", "controller.safetensors"]
     if trainer.settings.figures:
         files += ["figures/certificate.png", *(["figures/motion.png"] if scene(trainer.problem) is not None else [])]
+        files.append(REPORT)
     if settings.trajectories and has_metrics(trainer.problem):
         files.append(METRICS)
     absent = [file for file in files if not (folder / file).is_file()]
-    if absent:
-        return ", ".join(absent)
-    return "some of its last files" if (folder / MARK).exists() else None
+    if absent in ([], [REPORT]) and (folder / MARK).exists():
+        return "some of its last files"
+    return ", ".join(absent) or None

@@ -20,6 +20,7 @@ from ocp_torch.runs.configuration import keep_configuration, load_state, starts
 from ocp_torch.runs.finish import complete, failure_of, hand_out, missing, salvaged, unless_it_failed, with_warnings
 from ocp_torch.runs.loading import policy_of
 from ocp_torch.runs.metrics.trial import write_metrics
+from ocp_torch.runs.report.report import REPORT, write_report
 from ocp_torch.runs.resume import filled_from, require_same_run, result_of
 from ocp_torch.training.checkpoint import LAST
 from ocp_torch.training.monitor import Monitor
@@ -82,15 +83,18 @@ def train(run: TrainingRun, folder: Path) -> None:
         lacking = missing(folder, run.trainer, run.settings)
         if result is not None and lacking is not None:
             log.info("%s lacks %s; what is missing is made.", folder, lacking)
-        elif result is not None:
+        if result is not None and lacking == REPORT:  # made of the other files
+            write_report(folder, run.trainer.problem, run.trainer.config)
+            lacking = None
+        if result is not None and lacking is None:
             log.info("\n%s\n%s is finished; a larger trainer.steps would go on.", result, folder)
             return
     run_to_end(run.trainer, run.settings, folder)
 
 
 def run_to_end(trainer: Trainer, settings: CertificateSettings, folder: Path) -> Certificate:
-    """Fill ``folder`` with a run: events, `checkpoints/`, `certificate.json`, `controller.safetensors`, figures, and
-    `metrics.json` for problems with numbers of their own.
+    """Fill ``folder`` with a run: events, `checkpoints/`, `certificate.json`, `controller.safetensors`, figures,
+    `metrics.json` for problems with numbers of their own, and `report.html`.
 
     A trainer that was resumed goes on where it is. SIGTERM and Ctrl-C raise `Preempted` once the state is saved. Raises
     `InputError` when a loss stops being finite or the user's problem fails (what the best look so far gives is handed out
@@ -120,8 +124,12 @@ def run_to_end(trainer: Trainer, settings: CertificateSettings, folder: Path) ->
     if settings.trajectories:
         with unless_it_failed(failure, trainer):
             write_metrics(trainer.problem, policy_of(controller), trainer.seed, folder)
+    if trainer.settings.figures:
+        write_report(folder, trainer.problem, trainer.config)
     complete(folder)
     log.info("controller from %s, %.0f s in all, in %s", controller.kind, time.perf_counter() - started, folder)
+    if trainer.settings.figures:
+        log.info("to look at: %s", folder / REPORT)
     if failure is not None:
         which = "the best look before" if trainer.health.best else f"step {trainer.step}, without any look"
         raise InputError(f"{failure.rstrip('.')}; the controller in {folder} is that of {which}.")

@@ -90,6 +90,7 @@ def test_a_debug_run_prints_its_certificate_and_leaves_its_files(finished):
         "checkpoints/best.pt",
         "controller.safetensors",
         "certificate.json",
+        "report.html",
     }
     assert documented <= names
     others = names - documented

@@ -18,11 +18,13 @@ from ocp_torch.errors import InputError
 from ocp_torch.files.plain import NotPlain, json_object, looked_up, require_plain, yaml_mapping
 from ocp_torch.files.reading import read_json
 from ocp_torch.files.storage import load_tensors, save_tensors
-from ocp_torch.problems import Kuramoto
+from ocp_torch.problems import Circle, Kuramoto
 from ocp_torch.problems.recorded.recording import read
 from ocp_torch.runs.compare import compare
 from ocp_torch.runs.configuration import read_configuration
 from ocp_torch.runs.evaluate import settings_for
+from ocp_torch.runs.report.many import save_page
+from ocp_torch.runs.report.report import write_report
 from ocp_torch.runs.resume import result_of
 from ocp_torch.training.checkpoint import load_checkpoint
 from support.strangers import make_run, seal, signed
@@ -223,6 +225,9 @@ def test_any_field_of_a_certificate_replaced_by_anything_is_shown_or_named(run, 
         certificate = json.loads(json.dumps(good))
         put(certificate, where, value)
         (folder / "certificate.json").write_text(json.dumps(certificate))
+        save_page(compare([folder]), tmp_path / "runs.html")
+        with contextlib.suppress(InputError):
+            write_report(folder, Circle(), {})
         shown = compare([folder]).table()
         assert all(line.isprintable() for line in shown.split("\n"))
         assert all(len(line) < 800 for line in shown.split("\n"))

@@ -89,7 +89,7 @@ def piped(run, name, elsewhere):
 
 
 ENTRIES = [
-    *((linked, n) for n in ("train.log", "figures", "checkpoints", ".hydra", "certificate.json", "metrics.json")),
+    *((linked, n) for n in ("train.log", "figures", "checkpoints", ".hydra", "certificate.json", "report.html")),
     *(
         (linked, n)
         for n in ("controller.safetensors", "checkpoints/last.pt", ".hydra/config.yaml", "events.out.tfevents.1")

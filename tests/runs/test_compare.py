@@ -86,8 +86,8 @@ def test_names_in_files_cannot_steer_the_terminal(tmp_path):
 
 
 def test_the_script_prints_and_writes_what_it_is_asked_for(outputs, tmp_path):
-    table, picture = tmp_path / "runs.csv", tmp_path / "runs.png"
-    ended = command("compare", str(outputs), f"csv={table}", f"plot={picture}", cwd=tmp_path)
+    table, picture, page = tmp_path / "runs.csv", tmp_path / "runs.png", tmp_path / "runs.html"
+    ended = command("compare", str(outputs), f"csv={table}", f"plot={picture}", f"html={page}", cwd=tmp_path)
     assert ended.status == 0, ended
     assert ended.stdout.splitlines()[0].startswith("run ")
     with table.open() as stream:
@@ -95,9 +95,12 @@ def test_the_script_prints_and_writes_what_it_is_asked_for(outputs, tmp_path):
     assert [float(row["gap_certified"] or "inf") for row in rows] == pytest.approx([0.02, 0.3, 0.6, float("inf")])
     assert rows[3]["upper"] == ""
     assert imread(picture).std() > 0
+    assert "killed" in page.read_text()
 
 
-@pytest.mark.parametrize("arguments", [("nowhere",), (".", "cvs=a.csv"), (".", "plot=a.txt"), (".", "csv=")])
+@pytest.mark.parametrize(
+    "arguments", [("nowhere",), (".", "cvs=a.csv"), (".", "plot=a.txt"), (".", "html=a.txt"), (".", "csv=")]
+)
 def test_a_slip_is_told_in_one_sentence(arguments, tmp_path):
     assert command("compare", *arguments, cwd=tmp_path).sentence
     assert list(tmp_path.iterdir()) == []

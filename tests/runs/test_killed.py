@@ -145,7 +145,7 @@ def test_killed_while_its_last_files_are_written_a_resume_makes_what_is_missing(
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("lost", ["figures/motion.png", "controller.safetensors"])
+@pytest.mark.parametrize("lost", ["figures/motion.png", "controller.safetensors", "report.html"])
 def test_what_was_lost_of_a_finished_run_is_made_again(lost, wholes, tmp_path):
     whole, _ = wholes("numbers of its own")
     before = (whole / lost).stat().st_size

@@ -26,7 +26,7 @@ def left_in(folder: Path) -> dict:
         "weights": load_file(folder / "controller.safetensors"),
         "certificate": certificate_in(folder) | {"train_seconds": None},
         "metrics": json.loads(metrics.read_text()) if metrics.exists() else None,
-        "figures": sorted(p.name for p in folder.glob("figures/*")),
+        "figures": sorted(p.name for p in (*folder.glob("figures/*"), *folder.glob("*.html"))),
         "scalars": {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in scalars},
         "images": {tag: [e.step for e in events.Images(tag)] for tag in events.Tags()["images"]},
         "unfinished": (folder / "checkpoints" / "unfinished").exists(),

@@ -140,7 +140,8 @@ def test_a_run_leaves_exactly_the_documented_files(run):
     assert events
     assert figures
     looks = {"checkpoints/best.pt"} if config["trainer"]["evaluate_every"] else set()
-    assert files - events - figures == {"checkpoints/last.pt", "certificate.json", "controller.safetensors"} | looks
+    documented = {"checkpoints/last.pt", "certificate.json", "controller.safetensors", "report.html"}
+    assert files - events - figures == documented | looks
     for name in figures:
         assert imread(folder / name).std() > 0, f"{name} is blank"
     assert load_checkpoint(folder / "checkpoints" / "last.pt")["step"] == 20

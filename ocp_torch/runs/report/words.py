@@ -1,0 +1,119 @@
+"""What a report says of a certificate in words: which number to trust, what each bound is, and what it rests on."""
+
+import math
+
+from ocp_torch.certificate import bounds
+from ocp_torch.certificate.bound import LOWER, UPPER
+from ocp_torch.errors import visible
+from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED
+
+# A certified gap up to this, or up to so many times the simulated one, says enough of the controller.
+NARROW, FAR = 0.01, 2.0
+# A gap above this means nothing as a percentage.
+MEANS = 1.0
+PERFORMANCES = {
+    "value": "controller from V",
+    "density": "controller w / mu",
+    "trajectories": "controller from V of trajectories",
+    "given": "this controller",
+}
+BOUNDS = {
+    "F_M": "the dual value of `V`, each violation of its inequality charged `M` times; needs no controller",
+    "shifted": "`E[V mu0]` less the largest violation of the inequality of `V`; needs neither a controller nor an `M`",
+    "rigorous": "the shifted bound with its supremum proved by interval arithmetic",
+    "J": "the cost of `(w, mu)`, each violation of the equation of `mu` charged `C_V` times",
+    "G": "`J` with the best `mu` for each `w`, in closed form",
+    "lagrangian": "the controller's own Bellman equation, weighed by its occupation density; nothing is simulated",
+    "evaluation": "`E[V mu0]` and the largest violation of the controller's own Bellman equation",
+}
+NEEDS = {
+    "M": "`M` is at least `sup mu*`, the largest density of where an optimal controller spends its discounted time",
+    "C_V": "`C_V` is at least the largest cost from any state on",
+    "f": "the state cost `f` is nowhere negative",
+    "regular": "neither `a`, `B` nor the controller jumps",
+    "sup Q": "no state violates the inequality of `V` by more than the worst that was found",
+    "sup |Q_u|": "no state violates the controller's Bellman equation by more than the worst that was found",
+}
+BASES = {
+    GIVEN: "the problem declares it, or the user did; nothing that was observed speaks against it",
+    PROVED: "by a theorem or interval arithmetic",
+    SEARCHED: "the largest value that samples and local ascents met: an estimate from below, which more effort may raise",
+    GUESSED: "a multiple of something seen; what rests on it enters no gap that counts",
+}
+
+
+def number(value) -> float:
+    """``value`` of a file as a number that can be drawn; `ValueError` or `TypeError` otherwise."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{visible(value, 80)} is not a number")
+    return float(value)
+
+
+def percent(part) -> str:
+    return f"{100.0 * number(part):.3g} %"
+
+
+def label(side: str, name: str) -> str:
+    """What the entry ``name`` of a ``side`` of a certificate is called."""
+    if side == "perf":
+        return f"Perf: {PERFORMANCES.get(name, name)}"
+    listed = bounds.on(side).get(name)
+    named = listed.label if listed else name
+    return {LOWER: f"{named} ≤ OPT", UPPER: f"Perf ≤ {named}"}.get(side, named)
+
+
+def sentence(words: str) -> str:
+    return f"{words[:1].upper()}{words[1:].rstrip('.')}."
+
+
+def trust(certificate: dict) -> list[str]:
+    """Which number to trust, and why, a sentence each."""
+    gap, found = certificate["gap"], list[str]()
+    sides = {side: label(side, str(gap[f"{side}_from"])) for side in (LOWER, UPPER) if gap[f"{side}_from"]}
+    proved, seen = gap["certified"], gap["simulated"]
+    if certificate["contradiction"] is not None:
+        return ["Trust none of the numbers below until the contradiction is resolved: one of them is wrong."]
+    if proved is not None and number(proved) > MEANS:
+        found.append(
+            f"The bounds without simulation are far apart: `{sides[UPPER]}` is {1.0 + proved:.2g} times `{sides[LOWER]}`."
+        )
+    elif proved is not None:
+        found.append(
+            f"The certified gap, {percent(proved)}, lies between `{sides[LOWER]}` and `{sides[UPPER]}`. Both are averages "
+            "over sampled states: no trajectory is simulated."
+        )
+    if seen is not None:
+        found.append(
+            f"The simulated gap, {percent(seen)}, lies between `{sides[LOWER]}` and the cost of simulated trajectories: as "
+            "good as the simulation, whose time steps were halved until they no longer mattered."
+        )
+    if proved is not None and seen is not None:
+        wide = number(proved) > max(NARROW, FAR * number(seen))
+        found.append(
+            "Trust the simulated one: the certified one is true, but says little of this controller."
+            if wide
+            else "Trust the certified one: it takes less on trust, and is narrow."
+        )
+    if not found:
+        found.append("There is no gap: each number of the table stands for itself alone.")
+    if gap.get("conditional") is not None:
+        guesses = [str(b["if"]) for b in certificate["lower"].values() if b and "if" in b]
+        told = " and ".join(dict.fromkeys(guesses)) or "a guess is right"
+        found.append(
+            f"If {told}, the gap is {percent(gap['conditional'])}: a guess, so rely on it only if you know that."
+        )
+    if (exact := certificate["exact"]) is not None and number(exact) > 0.0:
+        found.append(
+            f"The optimum of this problem is known, {exact:.8g}: the table says how far each number is from it."
+        )
+    shares = [number(s) for s in certificate["share"].values() if s is not None]
+    if shares:
+        had = f"{100.0 * max(shares):.4g} % of what control can gain over doing nothing is certainly had."
+        found.append(
+            had if max(shares) > 0.0 else "It is not certain that the controller gains anything over doing nothing."
+        )
+    if (outside := certificate.get("outside_box")) is not None:
+        found.append(
+            f"{percent(outside['value'])} of the discounted time is spent outside the box, where the model ends."
+        )
+    return found
