@@ -113,6 +113,23 @@ def test_the_stage_takes_another_round_only_while_the_residual_costs_too_much():
     assert not torch.equal(weights(fit(good_excess=1e-12)), once)
 
 
+def test_a_fit_whose_first_steps_lose_all_mass_is_begun_anew_more_slowly(monkeypatch):
+    problem = zoo.build("manufactured 2-d q=2")
+    network = partial(PeriodicMLP, modes=1, width=16, depth=2)
+    fields = Fields.build(problem, ("value",), network, 0)
+    policy, settings = ValuePolicy(problem, problem.exact_value), StageSettings(steps=200, rounds=1, batch=64, lr=1.0)
+    x = torch.rand(4096, 2, generator=torch.Generator().manual_seed(0))
+
+    def mass():
+        constants = resolve_constants(problem)
+        fitted = fit_closed_loop(problem, policy, fields, network, constants, settings, seed=0)
+        return float(fitted.log_occupation(x).exp().mean())
+
+    assert 0.5 < mass() < 2.0
+    monkeypatch.setattr("ocp_torch.certificate.upper.policy_evaluation.LEAST_MASS", -1.0)
+    assert mass() < 1e-6
+
+
 def test_the_excess_is_what_the_bound_adds_to_its_integral():
     problem = zoo.build("manufactured 2-d q=2")
     loop = ClosedLoop(problem, problem.exact_control)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -28,6 +28,10 @@ from ocp_torch.steppers.fitting import LARGEST_RATE
 POOL = 2**16
 # Beyond that ratio of the two suprema of the slack the residual is not weighed any more lopsidedly.
 MOST_LOPSIDED = 16.0
+# Where `mu` is nearly 0 so is every gradient of the fit, and large first steps may lead there (dubins with noise: two seeds of
+# three, one for good). A fit is begun anew at so many times its rate, no slower than the last number, if after so many
+# steps `mu` has less mass than this.
+LOOKED_AT, LEAST_MASS, SLOWER, SLOWEST = 40, 0.01, 0.3, 1e-3
 # States at which the excess is computed after a round: what decides on a next one need not be exact.
 EXCESS_STATES = 4096
 
@@ -82,13 +86,22 @@ def fit_closed_loop(
     for k in range(settings.rounds):
         steps = settings.steps * 2**k
         pool.grow(min(POOL, steps * settings.batch))
-        for _ in range(steps):
+        for step in range(steps):
             advance(stepper, average, draw, phase)
+            if k == 0 and step == LOOKED_AT and settings.lr > SLOWEST and vanished(fitted.log_occupation, pool.samples.x):
+                slower = replace(settings, lr=SLOWER * settings.lr)
+                return fit_closed_loop(problem, policy, fields, network, constants, slower, seed, pool)
         value = average.module.value if trained is None else trained
         excess = relative_excess(loop, value, average.module.log_occupation, pool.samples.take(slice(EXCESS_STATES)))
         if excess <= settings.good_excess:
             break
     return average.module
+
+
+@torch.no_grad()
+def vanished(log_occupation: Field, x: torch.Tensor) -> bool:
+    """Whether hardly any mass of `mu` is left at the uniform states ``x``."""
+    return float(log_occupation(x[:EXCESS_STATES]).exp().mean()) < LEAST_MASS
 
 
 class Pool:
