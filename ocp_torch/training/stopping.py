@@ -11,6 +11,7 @@ from ocp_torch.training.state import TrainState
 
 STEPS, TARGET_GAP, MAX_SECONDS = "steps", "target_gap", "max_seconds"
 NOT_FINITE, FAILED = "not_finite", "failed"
+ASKED = "callback"  # whoever watches asked for it
 # After a certificate that did not reach the target gap, the next is tried at so many times the step: there are then few of
 # them, also in a long run, and it stops at most a quarter later than it could.
 RETRY = 1.25
@@ -30,6 +31,8 @@ def in_words(reason: str, settings: TrainerSettings, state: TrainState) -> str:
     at = f"step {state.step:,}"
     if reason == MAX_SECONDS:
         return f"trainer.max_seconds = {settings.max_seconds:g} are over, at {at} of {settings.end(state.round):,}"
+    if reason == ASKED:
+        return f"the callback asked for it, at {at} of {settings.end(state.round):,}"
     if reason == TARGET_GAP:
         return f"a quick evaluation at {at} finds trainer.target_gap = {settings.target_gap:g} reached"
     met = f", and trainer.good_gap = {settings.good_gap:g} is met" if state.round + 1 < settings.rounds else ""
