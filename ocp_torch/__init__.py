@@ -1,6 +1,6 @@
 """Controllers for control-affine problems on the torus, with a certificate of how far from optimal they can be."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.errors import InputError
@@ -41,14 +41,15 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    # Imported once they are asked for: they bring the command line with them.
-    if name not in ("compare", "reference", "train"):
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from ocp_torch.cli import python
+if not TYPE_CHECKING:
 
-    return getattr(python, name)
+    def __getattr__(name):
+        # Imported once they are asked for: they bring the command line with them.
+        if name not in ("compare", "reference", "train"):
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from ocp_torch.cli import python
 
+        return getattr(python, name)
 
-def __dir__() -> list[str]:
-    return [*globals(), "compare", "reference", "train"]
+    def __dir__():
+        return sorted({*globals(), *__all__})

@@ -87,9 +87,7 @@ def section_of(problem: Problem) -> dict:
         "_target_": f"{PACKAGE}.{type(problem).__name__}" if name in PROBLEMS else named(problem)
     }
     for key, value in problem.parameters.items():
-        with contextlib.suppress(
-            InputError
-        ):  # what only a user's own problem has, which is given again to load a controller
+        with contextlib.suppress(InputError):  # what no file can hold is given again to load a controller
             section[key] = plain(key, value)
     return section
 

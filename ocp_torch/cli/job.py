@@ -125,7 +125,9 @@ def isolated():
     states = np.random.get_state(), random.getstate()  # noqa: NPY002
     gradients = torch.set_grad_enabled(torch.is_grad_enabled())
     try:
-        with torch.random.fork_rng(devices=()), gradients:
+        # A job on a GPU seeds its generators; where nobody has used one yet there is none to keep.
+        used = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
+        with torch.random.fork_rng(devices=used), gradients:
             yield
     finally:
         torch.set_default_dtype(dtype)

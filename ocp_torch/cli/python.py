@@ -63,8 +63,8 @@ def train(
     run by returning `True`; it is then certified as it is.
 
     Raises `InputError` where the command line would refuse, `TrainingFailed` where a run under way fails, and what a callback
-    raises. Ctrl-C ends the step in hand, saves what has a folder, and raises `KeyboardInterrupt`. Random generators, threads,
-    signal handlers and Hydra are left as they were.
+    raises. Ctrl-C ends the step in hand, saves what has a folder, and raises `KeyboardInterrupt`; a second one does so at
+    once. Random generators, threads, signal handlers and Hydra are left as they were.
     """
     short = {"method": method, "trainer.steps": steps, "seed": seed, "resume": resume, "trainer.progress": progress}
     fields = {name: value for name, value in short.items() if value is not None}
@@ -95,7 +95,7 @@ def _trained(run: TrainingRun, place: Path | None, history: History, watch: Call
         log.warning("warning: %s", note)
     with _kept(run, place) as where:
         try:
-            end = ending(run.trainer, run.settings, where, watch)
+            end = ending(run.trainer, run.settings, where, watch, exits=False)
         except (Exception, SystemExit) as error:
             raise blamed(error) or error from None
     made = TrainedRun(end.controller, end.controller.certificate, history, end.metrics, place)

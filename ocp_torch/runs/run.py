@@ -120,10 +120,15 @@ def handed_out(trainer: Trainer) -> str:
 
 
 def ending(
-    trainer: Trainer, settings: CertificateSettings, folder: Path, watch: Callable[[Path, Trainer], Monitor] = Monitor
+    trainer: Trainer,
+    settings: CertificateSettings,
+    folder: Path,
+    watch: Callable[[Path, Trainer], Monitor] = Monitor,
+    exits: bool = True,
 ) -> Ending:
     """Fill ``folder`` with a run: events, `checkpoints/`, `certificate.json`, `controller.safetensors`, figures, and
-    `metrics.json` for problems with numbers of their own; what it hands out. ``watch`` makes what it is told to.
+    `metrics.json` for problems with numbers of their own; what it hands out. ``watch`` makes what it is
+    told to; a second signal ends the process, unless it is not the run's own (``exits``).
 
     A trainer that was resumed goes on where it is. SIGTERM and Ctrl-C raise `Preempted` once the state is saved. Raises
     `InputError` when there is nothing to hand out, and `StorageError` when a file cannot be written.
@@ -135,7 +140,7 @@ def ending(
         seed_generators(trainer.seed)
     log.info(summary(trainer))
     try:
-        with Signals() as signals, watch(folder, trainer) as monitor:
+        with Signals(exits) as signals, watch(folder, trainer) as monitor:
             trainer.tell, failure = lambda stage: monitor.stages(f"certifying: {stage}"), None
             try:
                 certificate, fields = _trained(trainer, settings, monitor, last, signals)

@@ -59,9 +59,11 @@ class Preempted(BaseException):
 
 class Signals:
     """While it is entered, holds back the first signal for the trainer to `take`; where no step is in hand and the state is
-    saved (``saved = True``) the first one already raises `Preempted`."""
+    saved (``saved = True``) the first one already raises `Preempted`. The second ends the process, if it is the run's own
+    (``exits``), and else raises `Preempted` too."""
 
-    def __init__(self) -> None:
+    def __init__(self, exits: bool = True) -> None:
+        self._exits = exits
         self.received: int | None = None
         self.saved = False
         self._before: dict = {}
@@ -77,10 +79,11 @@ class Signals:
             signal.signal(number, handler)
 
     def _caught(self, number: int, frame: FrameType | None) -> None:
-        if self.received is not None:
+        again = self.received is not None
+        if again and self._exits:
             os._exit(128 + number)  # every file is replaced in one step, so there is nothing to tidy
         self.received = number
-        if self.saved:
+        if again or self.saved:
             raise Preempted(number)
 
     def take(self) -> None:

@@ -227,6 +227,16 @@ def test_a_signal_lets_the_step_finish_saves_and_then_does_what_it_did_before(nu
     assert state["step"] == SETTINGS["trainer.log_every"]
 
 
+def test_an_impatient_second_ctrl_c_ends_the_run_and_not_the_process():
+    def twice(moment):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("it went on")
+
+    with pytest.raises(KeyboardInterrupt):
+        train("circle", settings=SHORT, callback=twice)
+
+
 @pytest.mark.nightly
 def test_a_noisy_system_trained_by_pd_with_looks_and_figures_is_the_scripts_to_the_bit(tmp_path):
     given = {"experiment": "debug", "problem.torque_noise": 0.3, "method.occupation_bound": 30, "trainer.steps": 20}
