@@ -1,4 +1,4 @@
-"""Runs side by side: compare.py outputs/circle_pd outputs/sweeps/... [csv=FILE] [plot=FILE.png]
+"""Runs side by side: scripts/compare.py or ocp-compare, outputs/circle_pd outputs/sweeps/... [csv=FILE] [plot=FILE.png]
 
 With against=problem.noise (or any other number of the configuration) the plot shows gaps against that."""
 
