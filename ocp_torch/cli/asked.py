@@ -14,7 +14,7 @@ from hydra.core.singleton import Singleton
 from hydra.version import VersionBase
 
 from ocp_torch.cli.compose import configuration, run_data, with_own_defaults
-from ocp_torch.control.described import problem_name
+from ocp_torch.control.described import plain_parameters, problem_name
 from ocp_torch.errors import InputError, shown
 from ocp_torch.problems import PROBLEMS, Problem
 from ocp_torch.problems.blame import named
@@ -86,7 +86,7 @@ def section_of(problem: Problem) -> dict:
     section: dict[str, Any] = {
         "_target_": f"{PACKAGE}.{type(problem).__name__}" if name in PROBLEMS else named(problem)
     }
-    for key, value in problem.parameters.items():
+    for key, value in plain_parameters(problem.parameters).items():
         with contextlib.suppress(InputError):  # what no file can hold is given again to load a controller
             section[key] = plain(key, value)
     return section

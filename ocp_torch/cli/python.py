@@ -58,9 +58,9 @@ def train(
     ``settings`` sets any field by its name on the command line: `{"trainer.batch": 256, "optimizer": "adam"}`; ``method``,
     ``steps`` and ``progress`` (of the trainer) and ``seed`` are short for such. What is left out is as in `configs/`.
 
-    ``folder`` is a new one for all that a run leaves; without it nothing is kept, nor figures drawn. ``resume`` goes on with
-    the run of a folder, in it. ``callback`` is given a `Moment` at every logged step and look at the bounds, and stops the
-    run by returning `True`; it is then certified as it is.
+    ``folder`` is a new one for all that a run leaves but its log, which Python's `logging` has; without it nothing is kept,
+    nor figures drawn. ``resume`` goes on with the run of a folder, in it. ``callback`` is given a `Moment` at every logged
+    step and look at the bounds, and stops the run by returning `True`; it is then certified as it is.
 
     Raises `InputError` where the command line would refuse, `TrainingFailed` where a run under way fails, and what a callback
     raises. Ctrl-C ends the step in hand, saves what has a folder, and raises `KeyboardInterrupt`; a second one does so at
