@@ -81,8 +81,8 @@ def installed(wheel, tmp_path_factory):
     venv.create(folder, symlinks=True)
     # Paths that a .pth file adds come last, and bring no editable installs of their own.
     paths = sysconfig.get_paths(vars={"base": str(folder), "platbase": str(folder)})
-    outer = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
-    (Path(paths["purelib"]) / "outer.pth").write_text("\n".join(sorted(outer)) + "\n")
+    outer = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
+    (Path(paths["purelib"]) / "outer.pth").write_text("\n".join(outer) + "\n")
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", folder / "bin" / "python")
     run(*pip, "install", "--no-deps", "--no-index", "--ignore-installed", wheel, cwd=folder)
     return folder / "bin"
