@@ -12,21 +12,25 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ocp_torch.cli.explain import CHECKOUT, CONFIGS, explain
+from ocp_torch.cli.explain import CHECKOUT, CONFIGS, INSTALLED, explain
 from ocp_torch.errors import InputError
 from ocp_torch.runs.configuration import next_subfolder
 from ocp_torch.runs.resume import find_run, resumed_configuration
 
-OUTPUTS = CHECKOUT / "outputs"
 # No choice of a problem, whose fields would be mixed with those of a user's own class.
 NO_CHOICE = "~problem"
 
 
+def place(part: str) -> Path:
+    """The folder ``part`` of the checkout wherever a run starts, or, where there is no checkout, of the current folder."""
+    return (Path.cwd() if INSTALLED else CHECKOUT) / part
+
+
 def register_resolvers() -> None:
-    """`${checkout:outputs}`: a folder of the checkout wherever a run starts; `${problem_name:a.b.Circle}`: circle;
-    `${start_folder:dir}`: where in a run's folder this start's configuration goes."""
+    """`${checkout:outputs}`: the `place` of outputs; `${problem_name:a.b.Circle}`: circle; `${start_folder:dir}`: where in a
+    run's folder this start's configuration goes."""
     resolvers = {
-        "checkout": lambda part: str(CHECKOUT / part),
+        "checkout": lambda part: str(place(part)),
         "problem_name": lambda target: str(target).rpartition(".")[2].lower(),
         "start_folder": lambda folder: next_subfolder(Path(folder)),
     }
@@ -128,6 +132,6 @@ def run_data(data: dict, overrides: list[str], roots: tuple[Path, ...] = ()) -> 
         mine = {name.split(".")[1] for name in named if name.startswith("problem.")}
         data = {**data, "problem": {k: v for k, v in data["problem"].items() if k in mine}}
     if data.get("resume") == "auto":
-        run = find_run(data, (*roots, OUTPUTS))
+        run = find_run(data, (*roots, place("outputs")))
         data = {**data, "resume": str(run) if run else None}
     return data if data.get("resume") is None else resumed_configuration(data, named)

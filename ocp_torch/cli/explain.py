@@ -12,8 +12,11 @@ from omegaconf import OmegaConf
 
 from ocp_torch.errors import nearest
 
-CHECKOUT = Path(__file__).resolve().parents[2]
-CONFIGS = CHECKOUT / "configs"
+PACKAGE = Path(__file__).resolve().parents[1]
+CHECKOUT = PACKAGE.parent
+# A wheel holds them within the package.
+INSTALLED = (PACKAGE / "configs").is_dir()
+CONFIGS = (PACKAGE if INSTALLED else CHECKOUT) / "configs"
 
 
 def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -> str:

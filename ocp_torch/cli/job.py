@@ -21,7 +21,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from ocp_torch.cli.compose import resolved, run_data
-from ocp_torch.cli.outcome import Record, fail, failed
+from ocp_torch.cli.outcome import Record, fail, failed, typed
 from ocp_torch.errors import InputError
 from ocp_torch.files.reading import require_unlinked
 from ocp_torch.problems.blame import blamed
@@ -114,7 +114,7 @@ class Job:
         mine = "problem." if "problem=callable" in task else "problem._target_="
         own = [o.lstrip("+") for o in task if o == "problem=callable" or o.lstrip("+").startswith(mine)]
         path = str(self.folder) if re.fullmatch(r"[\w./+-]+", str(self.folder)) else quoted(self.folder)
-        return shlex.join(["python", sys.argv[0], f"resume={path}", *own])
+        return shlex.join([*typed(sys.argv[0]), f"resume={path}", *own])
 
 
 @contextlib.contextmanager
@@ -125,7 +125,9 @@ def isolated():
     states = np.random.get_state(), random.getstate()  # noqa: NPY002
     gradients = torch.set_grad_enabled(torch.is_grad_enabled())
     try:
-        with torch.random.fork_rng(devices=()), gradients:
+        # A job on a GPU seeds its generators; where nobody has used one yet there is none to keep.
+        used = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
+        with torch.random.fork_rng(devices=used), gradients:
             yield
     finally:
         torch.set_default_dtype(dtype)

@@ -16,7 +16,7 @@ from torch.optim import Optimizer
 from ocp_torch.cli.compose import composed, configuration, parsed, register_resolvers, run_data, with_own_defaults
 from ocp_torch.cli.explain import CHECKOUT, CONFIGS, explain, is_choice, known_fields
 from ocp_torch.cli.job import isolated, job
-from ocp_torch.cli.outcome import INTERRUPTED, Record, fail, failures
+from ocp_torch.cli.outcome import INTERRUPTED, Record, fail, failures, typed
 from ocp_torch.cli.single import carry_out, checked, require_places_to_write
 from ocp_torch.errors import InputError, require_flag, require_section, shown
 from ocp_torch.files.reading import require_unlinked
@@ -48,7 +48,7 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
     logging.raiseExceptions = False  # a full disk is told once, not at every line of a log
     # A user's module is found where the command was given, as `python -m` would find it.
     sys.path.insert(0, os.getcwd())
-    typed = list(sys.argv)
+    command = [*typed(sys.argv[0]), *sys.argv[1:]]
     sys.argv[1:] = with_own_defaults(config_name, sys.argv[1:])
     options = [a for a in sys.argv[1:] if a.startswith("-")]
     overrides = [a for a in sys.argv[1:] if not a.startswith("-")]
@@ -63,7 +63,7 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
         else:
             carry_out(checked(overrides, config_name, check), work)
     except ForeignProblem as error:
-        fail(f"{str(error).rstrip('.')}; if it is yours: {shlex.join(['python', *typed, *error.arguments])}")
+        fail(f"{str(error).rstrip('.')}; if it is yours: {shlex.join([*command, *error.arguments])}")
     except InputError as error:
         fail(str(error))
     except Preempted as stop:

@@ -20,6 +20,11 @@ FAILURES = "OCP_TORCH_FAILURES"
 LONGEST_MESSAGE = 2**20
 
 
+def typed(command: str) -> list[str]:
+    """What was typed to start ``command``, the first of `sys.argv`: a script, or a command that was installed."""
+    return ["python", command] if command.endswith(".py") else [Path(command).name]
+
+
 class Record(logging.LogRecord):
     """A message of the log, fit for a terminal whatever names and notes of strangers are in it."""
 

@@ -47,21 +47,13 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
     given = {o.key_or_group: o.value() for o in parsed(arguments) if not o.is_sweep_override() and not o.is_delete()}
     own = Path(str(given["hydra.run.dir"])) if "hydra.run.dir" in given else None
     config, data = configuration(config_name, arguments)
-    try:
+    with told():
         data = run_data(data, arguments, roots=(own,) if own else ())
         going_on = data.get("resume") is not None
         folder = locate(Path(data["resume"]))[0] if going_on else own
         if folder is not None:
             require_unlinked(folder)
         made = check(data)
-    except OSError as error:  # a name that no file can have, a device that gives nothing
-        named = f"{shown(str(error.filename))} cannot be used" if error.filename else "a file cannot be used"
-        raise blamed(error) or InputError(f"{named}: {error.strerror or error}.") from None
-    except (Exception, SystemExit) as error:
-        told: InputError | None = blamed(error)
-        if told is None and isinstance(error, SystemExit):  # somebody's module would end the run without a word
-            told = InputError(f"the code that the command line names asks Python to exit (status {error.code}).")
-        raise told or error from None
     if own is not None and "resume" in data and not going_on:
         require_fresh(own)
     if going_on:
@@ -72,28 +64,47 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
     return Checked(config_name, config, made)
 
 
+@contextlib.contextmanager
+def told():
+    """What goes wrong within for a reason that is a user's becomes one sentence."""
+    try:
+        yield
+    except OSError as error:  # a name that no file can have, a device that gives nothing
+        named = f"{shown(str(error.filename))} cannot be used" if error.filename else "a file cannot be used"
+        raise blamed(error) or InputError(f"{named}: {error.strerror or error}.") from None
+    except (Exception, SystemExit) as error:
+        sentence: InputError | None = blamed(error)
+        if sentence is None and isinstance(error, SystemExit):  # somebody's module would end the run without a word
+            sentence = InputError(f"the code that the command line names asks Python to exit (status {error.code}).")
+        raise sentence or error from None
+
+
 def require_places_to_write(arguments: list[str], name: str) -> None:
-    """Raise `InputError` unless files can be written to the folder that ``name`` is given as; leaves nothing behind."""
+    """`require_writable` of the folders that ``name`` is given as."""
     for value in (o.value() for o in parsed(arguments) if o.key_or_group == name and not o.is_sweep_override()):
         # What is only known later, such as the time, is below what can be looked at now.
-        folder = Path(re.split(r"[^/]*\$\{", str(value))[0])
-        made: list[Path] = []
-        try:
-            if len(os.fsencode(folder.absolute())) >= os.pathconf("/", "PC_PATH_MAX"):
-                raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
-            for part in (*reversed(folder.absolute().parents), folder.absolute()):
-                if not part.exists():
-                    part.mkdir()
-                    made.append(part)
-            with tempfile.TemporaryFile(dir=folder):
-                pass
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise InputError(f"{name} is {shown(str(folder))}, where nothing can be written: {reason}.") from None
-        finally:
-            for part in reversed(made):
-                with contextlib.suppress(OSError):
-                    part.rmdir()
+        require_writable(Path(re.split(r"[^/]*\$\{", str(value))[0]), name)
+
+
+def require_writable(folder: Path, name: str) -> None:
+    """Raise `InputError` unless files can be written to ``folder``, which ``name`` was given as; leaves nothing behind."""
+    made: list[Path] = []
+    try:
+        if len(os.fsencode(folder.absolute())) >= os.pathconf("/", "PC_PATH_MAX"):
+            raise OSError(errno.ENAMETOOLONG, os.strerror(errno.ENAMETOOLONG))
+        for part in (*reversed(folder.absolute().parents), folder.absolute()):
+            if not part.exists():
+                part.mkdir()
+                made.append(part)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{name} is {shown(str(folder))}, where nothing can be written: {reason}.") from None
+    finally:
+        for part in reversed(made):
+            with contextlib.suppress(OSError):
+                part.rmdir()
 
 
 def carry_out(command: Checked, work: Callable[..., object]) -> None:

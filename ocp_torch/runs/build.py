@@ -22,7 +22,7 @@ from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives import METHODS, Objective
 from ocp_torch.problems import Dataset, Problem
 from ocp_torch.problems.blame import in_their_words, origin, words
-from ocp_torch.problems.checks.check import check_once
+from ocp_torch.problems.checks.check import check_once, require_made
 from ocp_torch.problems.commands import current_target
 from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.problems.problem import MOST_COORDINATES
@@ -63,6 +63,14 @@ def problem_class(target: object) -> type[Problem]:
     return getattr(module, class_name)
 
 
+def checked_problem(problem: Problem) -> Problem:
+    """``problem``, if it is what `Problem` says one is and no larger than the memory; raises `InputError` otherwise."""
+    require_made(problem)
+    _require_room(problem.dim, problem.control_dim)
+    check_once(problem)
+    return problem
+
+
 def build_problem(section: object) -> Problem:
     """The problem ``_target_`` names, made with the other fields as arguments and checked; any `Problem` subclass will do."""
     options = require_section("problem", section)
@@ -70,10 +78,7 @@ def build_problem(section: object) -> Problem:
     dim = options.get("dim")
     if isinstance(dim, int) and 1 <= dim <= MOST_COORDINATES:  # a problem that large may take long to be made
         _require_room(dim, options.get("control_dim"))
-    problem = in_their_words(lambda: call(cls, "problem", options), cls.__name__, cls)
-    _require_room(problem.dim, problem.control_dim)
-    check_once(problem)
-    return problem
+    return checked_problem(in_their_words(lambda: call(cls, "problem", options), cls.__name__, cls))
 
 
 def _require_room(dim: int, control_dim: object) -> None:
@@ -97,10 +102,11 @@ def _chosen(group: str, section: object, table: dict) -> tuple[str, dict]:
     return require_choice(f"{group}.name", fields.pop("name", None), table), fields
 
 
-def build_trainer(config: dict) -> Trainer:
-    """Everything a run needs, in the order in which data flows. Raises `InputError` for any wrong field."""
+def build_trainer(config: dict, problem: Problem | None = None) -> Trainer:
+    """Everything a run needs, in the order in which data flows; of ``problem``, where that has been made already. Raises
+    `InputError` for any wrong field."""
     seed = require_integer("seed", config["seed"], 0)
-    problem = build_problem(config["problem"])
+    problem = build_problem(config["problem"]) if problem is None else checked_problem(problem)
     config = fill(config, problem)
     settings = call(TrainerSettings, "trainer", require_section("trainer", config["trainer"]))
     use_threads(settings.threads)

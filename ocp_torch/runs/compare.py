@@ -63,6 +63,9 @@ class Comparison:
         lines += [f"not in the table: {run}: {why}" for run, why in self.unfinished.items()]
         return "\n".join(lines)
 
+    def __str__(self) -> str:
+        return self.table()
+
     def save_csv(self, file: Path) -> None:
         """Numbers in full precision, empty where they do not apply."""
         text = io.StringIO(newline="")
@@ -109,8 +112,13 @@ def compare(paths: Iterable[Path]) -> Comparison:
             rows.append(row_of(folder, name))
         except InputError as error:
             unfinished[name] = str(error)
-    rows.sort(key=lambda row: [math.inf if row[c] is None else row[c] for c in ("gap_certified", "gap_simulated")])
-    return Comparison(rows, unfinished, {name: folder for folder, name in places.items()})
+    return Comparison(ranked(rows), unfinished, {name: folder for folder, name in places.items()})
+
+
+def ranked(rows: list[dict]) -> list[dict]:
+    """``rows``, the smallest gap first."""
+    size = lambda gap: math.inf if gap is None else gap
+    return sorted(rows, key=lambda row: (size(row["gap_certified"]), size(row["gap_simulated"])))
 
 
 def run_folders(path: Path) -> list[Path]:
@@ -137,29 +145,33 @@ def row_of(folder: Path, name: str) -> dict:
     if kind(file) is None:
         raise InputError(progress_of(folder))
     try:
-        certificate = read_json(file, LARGEST_CERTIFICATE)
-        gap, bounds = certificate["gap"], {}
-        for side in ("lower", "upper"):  # the bounds that the gap was taken from
-            source = gap[f"{side}_from"]
-            bounds[side] = None if source is None else number(certificate[side][source]["value"])
-        gaps = {f"gap_{kind}": number(gap[kind]) for kind in ("certified", "simulated")}
-        return {
-            "run": name,
-            **{k: printable(certificate[k]) for k in ("problem", "method")},
-            **{k: int(number(certificate[k], given=True)) for k in ("seed", "step")},
-            "train_seconds": number(certificate["train_seconds"]),
-            "perf": performance(certificate),
-            **bounds,
-            "exact": number(certificate["exact"]),
-            # None to rank by where the bounds cross, as older versions wrote them: one of them is then wrong.
-            **{k: None if value is not None and value < 0.0 else value for k, value in gaps.items()},
-            "share": number(certificate["share"]["certified"]),
-            "stopped": printable(certificate.get("stopped", "steps")),
-            "warnings": len(list(certificate["warnings"])),
-        }
+        return row_from(read_json(file, LARGEST_CERTIFICATE), name)
     except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
         reason = visible(error if isinstance(error, InputError) else f"{type(error).__name__}: {error}", 200)
         raise InputError(f"its certificate.json is damaged ({reason}).") from None
+
+
+def row_from(certificate: dict, name: str) -> dict:
+    """The row of a run with this ``certificate``; one that is damaged raises whatever its odd part leads to."""
+    gap, bounds = certificate["gap"], {}
+    for side in ("lower", "upper"):  # the bounds that the gap was taken from
+        source = gap[f"{side}_from"]
+        bounds[side] = None if source is None else number(certificate[side][source]["value"])
+    gaps = {f"gap_{kind}": number(gap[kind]) for kind in ("certified", "simulated")}
+    return {
+        "run": name,
+        **{k: printable(certificate[k]) for k in ("problem", "method")},
+        **{k: int(number(certificate[k], given=True)) for k in ("seed", "step")},
+        "train_seconds": number(certificate["train_seconds"]),
+        "perf": performance(certificate),
+        **bounds,
+        "exact": number(certificate["exact"]),
+        # None to rank by where the bounds cross, as older versions wrote them: one of them is then wrong.
+        **{k: None if value is not None and value < 0.0 else value for k, value in gaps.items()},
+        "share": number(certificate["share"]["certified"]),
+        "stopped": printable(certificate.get("stopped", "steps")),
+        "warnings": len(list(certificate["warnings"])),
+    }
 
 
 def performance(certificate: dict) -> float | None:

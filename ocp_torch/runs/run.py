@@ -3,6 +3,7 @@
 import logging
 import shutil
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,11 +11,13 @@ from torch import Tensor
 
 from ocp_torch.certificate import Certificate, CertificateSettings, table
 from ocp_torch.certificate.settings import require_possible
+from ocp_torch.control.controller import Controller
 from ocp_torch.errors import InputError, StorageError, require_integer
 from ocp_torch.fields import Fields
 from ocp_torch.files.limits import require_held
 from ocp_torch.files.reading import require_unlinked
 from ocp_torch.files.storage import sweep_temporaries
+from ocp_torch.problems import Problem
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.runs.configuration import keep_configuration, load_state, starts
 from ocp_torch.runs.finish import complete, failure_of, hand_out, missing, salvaged, unless_it_failed, with_warnings
@@ -43,8 +46,20 @@ class TrainingRun:
     notes: tuple[str, ...] = ()
 
 
-def training_run(config: dict) -> TrainingRun:
-    """The run that the plain ``config`` describes, at the checkpoint that its ``resume`` names, which is read once.
+@dataclass(frozen=True)
+class Ending:
+    """What a run hands out: ``controller`` with its ``certificate``, ``metrics`` where its problem has some; and, where a
+    loss or the problem ``failed``, why it could not go on, in a sentence."""
+
+    certificate: Certificate
+    controller: Controller
+    metrics: dict | None
+    failed: str | None
+
+
+def training_run(config: dict, problem: Problem | None = None) -> TrainingRun:
+    """The run that the plain ``config`` describes, at the checkpoint that its ``resume`` names, which is read once; of
+    ``problem``, where that has been made already.
 
     Raises `InputError` for any wrong field, damaged file, or change that a resume cannot make; writes nothing.
     """
@@ -61,7 +76,7 @@ def training_run(config: dict) -> TrainingRun:
         require_held(checkpoint, own.get("model"), sum(held))
     # A problem that draws random numbers while it is made draws the same ones in every process.
     seed_generators(require_integer("seed", own["seed"], 0))
-    trainer = build_trainer(own)
+    trainer = build_trainer(own, problem)
     if state is not None:
         require_same_run(trainer.config, made)
         trainer.resume(checkpoint, state)
@@ -93,14 +108,37 @@ def train(run: TrainingRun, folder: Path) -> None:
 
 
 def run_to_end(trainer: Trainer, settings: CertificateSettings, folder: Path) -> Certificate:
+    """`ending` of a run that nobody else watches. Raises `InputError` when a loss stops being finite or the user's problem
+    fails, once what the best look so far gives is handed out."""
+    started = time.perf_counter()
+    end = ending(trainer, settings, folder)
+    log.info("controller from %s, %.0f s in all, in %s", end.controller.kind, time.perf_counter() - started, folder)
+    if trainer.settings.figures:
+        log.info("to look at: %s", folder / REPORT)
+    if end.failed is not None:
+        raise InputError(f"{end.failed.rstrip('.')}; the controller in {folder} is that of {handed_out(trainer)}.")
+    return end.certificate
+
+
+def handed_out(trainer: Trainer) -> str:
+    """Which controller a run that could not go on hands out, in words."""
+    return "the best look before" if trainer.health.best else f"step {trainer.step}, without any look"
+
+
+def ending(
+    trainer: Trainer,
+    settings: CertificateSettings,
+    folder: Path,
+    watch: Callable[[Path, Trainer], Monitor] = Monitor,
+    exits: bool = True,
+) -> Ending:
     """Fill ``folder`` with a run: events, `checkpoints/`, `certificate.json`, `controller.safetensors`, figures,
-    `metrics.json` for problems with numbers of their own, and `report.html`.
+    `metrics.json` for problems with numbers of their own, and `report.html`; what it hands out. ``watch`` makes what it is
+    told to; a second signal ends the process, unless it is not the run's own (``exits``).
 
     A trainer that was resumed goes on where it is. SIGTERM and Ctrl-C raise `Preempted` once the state is saved. Raises
-    `InputError` when a loss stops being finite or the user's problem fails (what the best look so far gives is handed out
-    first), and `StorageError` when a file cannot be written.
+    `InputError` when there is nothing to hand out, and `StorageError` when a file cannot be written.
     """
-    started = time.perf_counter()
     last = folder / "checkpoints" / LAST
     for place in (folder, last.parent, *folder.glob(".hydra/resume_*")):
         sweep_temporaries(place)
@@ -108,7 +146,7 @@ def run_to_end(trainer: Trainer, settings: CertificateSettings, folder: Path) ->
         seed_generators(trainer.seed)
     log.info(summary(trainer))
     try:
-        with Signals() as signals, Monitor(folder, trainer) as monitor:
+        with Signals(exits) as signals, watch(folder, trainer) as monitor:
             trainer.tell, failure = lambda stage: monitor.stages(f"certifying: {stage}"), None
             try:
                 certificate, fields = _trained(trainer, settings, monitor, last, signals)
@@ -121,19 +159,14 @@ def run_to_end(trainer: Trainer, settings: CertificateSettings, folder: Path) ->
     except OSError as error:
         raise StorageError(f"{folder} cannot be written to: {error.strerror or error}.") from None
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
+    found = None
     if settings.trajectories:
         with unless_it_failed(failure, trainer):
-            write_metrics(trainer.problem, policy_of(controller), trainer.seed, folder)
+            found = write_metrics(trainer.problem, policy_of(controller), trainer.seed, folder)
     if trainer.settings.figures:
         write_report(folder, trainer.problem, trainer.config)
     complete(folder)
-    log.info("controller from %s, %.0f s in all, in %s", controller.kind, time.perf_counter() - started, folder)
-    if trainer.settings.figures:
-        log.info("to look at: %s", folder / REPORT)
-    if failure is not None:
-        which = "the best look before" if trainer.health.best else f"step {trainer.step}, without any look"
-        raise InputError(f"{failure.rstrip('.')}; the controller in {folder} is that of {which}.")
-    return certificate
+    return Ending(certificate, controller, found, failure)
 
 
 def _trained(

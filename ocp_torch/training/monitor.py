@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
-from tqdm import tqdm
+from tqdm.asyncio import tqdm as terminal_bar
+from tqdm.auto import tqdm
 
 from ocp_torch.certificate import Certificate, CertificateSettings
 from ocp_torch.certificate.estimate import known_of
@@ -63,8 +64,9 @@ class Monitor(Silent):
         done = trainer.step or (0 if warm is None else warm.round)
         # What a killed start still wrote beyond its last checkpoint is not shown twice.
         self.writer = SummaryWriter(str(folder), purge_step=done + 1 if done else None)
-        # disable=None: no bar where the output is not a terminal.
-        hidden = None if trainer.settings.progress else True
+        # disable=None: no bar where the output is not a terminal; a notebook is none, and has bars of its own.
+        shown = False if tqdm is not terminal_bar else None
+        hidden = shown if trainer.settings.progress else True
         step = trainer.step
         self.writer.add_custom_scalars(BRACKET)
         self.running = RunningEstimates(trainer.problem, trainer.trained, trainer.seed)

@@ -11,6 +11,7 @@ from ocp_torch.training.state import TrainState
 
 STEPS, TARGET_GAP, MAX_SECONDS = "steps", "target_gap", "max_seconds"
 NOT_FINITE, FAILED = "not_finite", "failed"
+ASKED = "callback"  # whoever watches asked for it
 # After a certificate that did not reach the target gap, the next is tried at so many times the step: there are then few of
 # them, also in a long run, and it stops at most a quarter later than it could.
 RETRY = 1.25
@@ -30,6 +31,8 @@ def in_words(reason: str, settings: TrainerSettings, state: TrainState) -> str:
     at = f"step {state.step:,}"
     if reason == MAX_SECONDS:
         return f"trainer.max_seconds = {settings.max_seconds:g} are over, at {at} of {settings.end(state.round):,}"
+    if reason == ASKED:
+        return f"the callback asked for it, at {at} of {settings.end(state.round):,}"
     if reason == TARGET_GAP:
         return f"a quick evaluation at {at} finds trainer.target_gap = {settings.target_gap:g} reached"
     met = f", and trainer.good_gap = {settings.good_gap:g} is met" if state.round + 1 < settings.rounds else ""
@@ -56,9 +59,11 @@ class Preempted(BaseException):
 
 class Signals:
     """While it is entered, holds back the first signal for the trainer to `take`; where no step is in hand and the state is
-    saved (``saved = True``) the first one already raises `Preempted`."""
+    saved (``saved = True``) the first one already raises `Preempted`. The second ends the process, if it is the run's own
+    (``exits``), and else raises `Preempted` too."""
 
-    def __init__(self) -> None:
+    def __init__(self, exits: bool = True) -> None:
+        self._exits = exits
         self.received: int | None = None
         self.saved = False
         self._before: dict = {}
@@ -74,10 +79,11 @@ class Signals:
             signal.signal(number, handler)
 
     def _caught(self, number: int, frame: FrameType | None) -> None:
-        if self.received is not None:
+        again = self.received is not None
+        if again and self._exits:
             os._exit(128 + number)  # every file is replaced in one step, so there is nothing to tidy
         self.received = number
-        if self.saved:
+        if again or self.saved:
             raise Preempted(number)
 
     def take(self) -> None:

@@ -23,7 +23,7 @@ from ocp_torch.training.health import Evaluation, sanity_warnings
 from ocp_torch.training.observer import Silent
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.state import TrainState
-from ocp_torch.training.stopping import STEPS, Signals, in_words, reason_to_stop
+from ocp_torch.training.stopping import ASKED, STEPS, Signals, in_words, reason_to_stop
 
 
 @dataclass(eq=False)
@@ -38,6 +38,7 @@ class Trainer:
     state: TrainState
     tell: Progress = silent  # is given the name of each stage of the full certificate
     stopped: str = STEPS  # why
+    asked: bool = False  # to stop after the step in hand
 
     def __post_init__(self) -> None:
         state = self.state
@@ -86,14 +87,14 @@ class Trainer:
     def fit(self, monitor: Silent, checkpoint: Path | None = None, signals: Signals | None = None) -> str:
         """Train until there is a reason to stop, and return it; save to ``checkpoint`` on the way and at the end.
 
-        The reasons: `steps` (all rounds that `settings` allow), `max_seconds`, and `target_gap`, when a quick certificate is
-        good enough that a full one should decide: where it decides against, `postpone` and call again. A signal that
-        ``signals`` caught raises `Preempted` after the step in hand, with the state saved. Raises `NonFiniteError` before
-        an update that is not finite.
+        The reasons: `steps` (all rounds that `settings` allow), `max_seconds`, `callback` (it was ``asked`` to), and
+        `target_gap`, when a quick certificate is good enough that a full one should decide: where it decides against,
+        `postpone` and call again. A signal that ``signals`` caught raises `Preempted` after the step in hand, with the state
+        saved. Raises `NonFiniteError` before an update that is not finite.
         """
         self.state.ended = False
         self._warm_up(monitor, checkpoint, signals)
-        while reason_to_stop(self.settings, self.state) is None:
+        while self._reason is None:
             if self.step < self.end:
                 self._advance(monitor, checkpoint)
             elif self._wants_another_round():
@@ -104,7 +105,8 @@ class Trainer:
             if signals is not None and signals.received is not None:
                 self.save(checkpoint)
                 signals.take()
-        self.stopped, self.state.ended = reason_to_stop(self.settings, self.state) or STEPS, True
+        self.stopped = self._reason or STEPS
+        self.state.ended = self.stopped != ASKED  # a resume then goes on
         self.save(checkpoint)
         return self.stopped
 
@@ -113,10 +115,14 @@ class Trainer:
         """The reason for which `fit` stopped, in words."""
         return in_words(self.stopped, self.settings, self.state)
 
+    @property
+    def _reason(self) -> str | None:
+        return ASKED if self.asked else reason_to_stop(self.settings, self.state)
+
     def _warm_up(self, monitor: Silent, checkpoint: Path | None, signals: Signals | None) -> None:
         """What is left of the warm start; `V` then begins as its best one, which itself stays a candidate."""
         state, warm = self.state, self.state.warm
-        while warm is not None and not warm.done and reason_to_stop(self.settings, state) is None:
+        while warm is not None and not warm.done and self._reason is None:
             started = time.perf_counter()
             looked = warm.advance()
             if looked:

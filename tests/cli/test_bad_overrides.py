@@ -7,13 +7,13 @@ import stat
 import pytest
 
 from ocp_torch.cli.compose import composed, register_resolvers
-from support.scripted import CHECKS, entered, leaves
+from support.scripted import CHECKED, entered, leaves
 from support.small import session, small
 
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
 # Of each script; `OCP_TORCH_EXAMPLES` asks for more, the quick tests try a few.
 MANY = int(os.environ.get("OCP_TORCH_EXAMPLES", "0"))
-EXAMPLES = dict.fromkeys([*CHECKS, "compare"], max(100, MANY)) | {"train": max(500, MANY)}
+EXAMPLES = dict.fromkeys([*CHECKED, "compare"], max(100, MANY)) | {"train": max(500, MANY)}
 FEW = 12
 # No field takes any of these.
 NUMBERS = [

@@ -124,8 +124,6 @@ def test_evaluate_on_another_seed_takes_other_states(finished, tmp_path):
 
 
 MISTAKES = {
-    "problem=circel": ("problem", "circel", "did you mean 'circle'?"),
-    "trainer.stepz=10": ("trainer.stepz", "did you mean 'trainer.steps'?"),
     "trainer.steps=abc": ("trainer.steps", "'abc'", "whole number"),
     "problem=manufactured problem.exponent=3": ("problem.exponent", "3", "at most 2"),
     "method=primal problem=manufactured method.occupation=closed": ("method.occupation", "closed", "drift"),

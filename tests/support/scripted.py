@@ -3,38 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
+import importlib
 import io
 import sys
-from functools import cache
 from unittest import mock
 
 import torch
 
 from ocp_torch.cli import launch as launching
-from ocp_torch.cli.launch import CHECKOUT, fail
+from ocp_torch.cli.launch import fail
 from ocp_torch.errors import InputError
 
-# Script -> the name of its check, where it has one of Hydra's configurations.
-CHECKS = {
-    "train": "training_run",
-    "certify": "arguments",
-    "evaluate": "recertification",
-    "reference": "ReferenceJob",
-    "record": "arguments",
-    "rollout": "RolloutJob",
-    "benchmark": "Contest",
-    "reproduce_paper": "check",
-}
+# What takes one of Hydra's configurations, as a command beside `compare`.
+CHECKED = ("train", "certify", "evaluate", "reference", "record", "rollout", "benchmark", "reproduce_paper")
 
 
-@cache
-def script(name: str):
-    """The module of `scripts/<name>.py`."""
-    spec = importlib.util.spec_from_file_location(f"script_{name}", CHECKOUT / "scripts" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def command(name: str):
+    """The module behind `scripts/<name>.py`."""
+    return importlib.import_module(f"ocp_torch.cli.commands.{name}")
 
 
 def entered(name: str, *arguments: str) -> tuple[int, str, str]:
@@ -46,12 +32,12 @@ def entered(name: str, *arguments: str) -> tuple[int, str, str]:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             if name == "compare":
                 try:
-                    script(name).main(list(arguments))
+                    command(name).compared(list(arguments))
                 except InputError as error:
                     fail(str(error))
             else:
                 with mock.patch.object(launching, "carry_out", side_effect=lambda *_: print("begun")):
-                    launching.launch(lambda: print("begun"), name, getattr(script(name), CHECKS[name]), print)
+                    launching.launch(lambda: print("begun"), name, command(name).main.check, print)
         return 0, out.getvalue(), err.getvalue()
     except SystemExit as end:
         return end.code, out.getvalue(), err.getvalue()

@@ -88,7 +88,12 @@ def fit_closed_loop(
         pool.grow(min(POOL, steps * settings.batch))
         for step in range(steps):
             advance(stepper, average, draw, phase)
-            if k == 0 and step == LOOKED_AT and settings.lr > SLOWEST and vanished(fitted.log_occupation, pool.samples.x):
+            if (
+                k == 0
+                and step == LOOKED_AT
+                and settings.lr > SLOWEST
+                and vanished(fitted.log_occupation, pool.samples.x)
+            ):
                 slower = replace(settings, lr=SLOWER * settings.lr)
                 return fit_closed_loop(problem, policy, fields, network, constants, slower, seed, pool)
         value = average.module.value if trained is None else trained

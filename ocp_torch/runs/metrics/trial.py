@@ -30,14 +30,15 @@ TRIAL = 8.0
 CANDIDATES, DRAWN = 64, 4
 
 
-def write_metrics(problem: Problem, policy: Policy, seed: int, folder: Path | None) -> None:
-    """Print the numbers of ``policy`` and write them as `metrics.json` in ``folder``, where the problem has any."""
+def write_metrics(problem: Problem, policy: Policy, seed: int, folder: Path | None) -> dict | None:
+    """Print the numbers of ``policy``, write them as `metrics.json` in ``folder``, return them; where the problem has any."""
     found = metrics(problem, policy, derive_seed(seed, Branch.METRICS))
     if found is None:
-        return
+        return None
     log.info("\n%s", metrics_table(found))
     if folder is not None:
         write_atomically(folder / METRICS, lambda path: path.write_text(json.dumps(found, indent=2) + "\n"))
+    return found
 
 
 def metrics(problem: Problem, policy: Policy, seed: int = 0, starts: int = STARTS) -> dict | None:

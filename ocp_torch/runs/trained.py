@@ -1,0 +1,47 @@
+"""What a run that was trained from Python gives."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ocp_torch.certificate import table
+from ocp_torch.control.controller import Controller
+from ocp_torch.errors import InputError
+
+
+@dataclass(frozen=True)
+class History:
+    """One dict for each moment, made for `pandas.DataFrame(history.looks)`: ``step``, ``samples`` drawn, ``seconds`` of the
+    run, and the scalars of a `Moment`. The last of the ``looks`` is the final certificate."""
+
+    steps: list[dict[str, float]] = field(default_factory=list)
+    looks: list[dict[str, float]] = field(default_factory=list)
+    warm_start: list[dict[str, float]] = field(default_factory=list)
+
+
+@dataclass(frozen=True, repr=False)
+class TrainedRun:
+    """What `train` gives. ``certificate`` is the dict of `certificate.json`, printed as a table by `print(run)`; ``metrics``
+    that of `metrics.json`, for problems with numbers of their own; ``folder`` where the run was written, `None` for nowhere.
+    """
+
+    controller: Controller
+    certificate: dict
+    history: History = field(default_factory=History)
+    metrics: dict | None = None
+    folder: Path | None = None
+
+    def __str__(self) -> str:
+        return table(self.certificate)
+
+    def __repr__(self) -> str:
+        name, gap = "{problem}/{method}, seed {seed}, step {step}".format(**self.certificate), self.certificate["gap"]
+        shown = ", ".join(f"{k} {100 * gap[k]:.3g} %" for k in ("certified", "simulated") if gap[k] is not None)
+        return f"<TrainedRun {name}; gap {shown or 'unknown'}; {self.folder or 'in no folder'}>"
+
+
+class TrainingFailed(InputError):
+    """A loss stopped being finite, or the problem failed, under way; ``run`` is what there is of it all the same."""
+
+    def __init__(self, sentence: str, run: TrainedRun) -> None:
+        super().__init__(sentence)
+        self.run = run

@@ -1,0 +1,107 @@
+"""A run that is watched from Python: the numbers it shows are kept, and told to a callback that may stop it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from torch.utils.tensorboard import SummaryWriter
+
+from ocp_torch.certificate import Certificate
+from ocp_torch.runs.trained import History
+from ocp_torch.steppers import StepReport
+from ocp_torch.training.monitor import Monitor, record
+from ocp_torch.training.trainer import Trainer
+
+STEP, LOOK, WARM_START = "step", "look", "warm start"
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What a callback is told.
+
+    ``kind`` is `step` (one of every `trainer.log_every`), `look` (a quick certificate, every `trainer.evaluate_every`) or
+    `warm start` (a try of its controller). ``step`` counts training steps, of a warm start its rounds. ``scalars`` are named
+    as in TensorBoard (`loss/value`, `bounds/F_M`, `gap/certified`), in the units of the problem's cost; ``certificate`` is
+    that of a look, as in `certificate.json`, from few samples, and `None` elsewhere.
+    """
+
+    kind: str
+    step: int
+    scalars: dict[str, float]
+    certificate: dict | None = None
+
+
+# Returns `True` to stop the run after the step in hand, with a certificate.
+Callback = Callable[[Moment], object]
+
+
+class CallbackFailed(BaseException):
+    """A callback raised, as its cause tells. No `Exception`: it is not the problem that failed."""
+
+
+class Scalars:
+    """Stands before TensorBoard's ``writer``, where there is one, and keeps the scalars that pass."""
+
+    def __init__(self, writer: SummaryWriter | None = None) -> None:
+        self._writer, self._new = writer, dict[str, float]()
+
+    def add_scalar(self, name: str, value: Any, step: int) -> None:
+        self._new[name] = float(value)
+        if self._writer is not None:
+            self._writer.add_scalar(name, value, step)
+
+    def take(self) -> dict[str, float]:
+        """Those since it was asked last."""
+        new, self._new = self._new, {}
+        return new
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._writer, name)
+
+
+class Watch(Monitor):
+    """A monitor that also fills a ``history`` and tells a ``callback``."""
+
+    def __init__(self, folder: Path, trainer: Trainer, history: History, callback: Callback | None = None) -> None:
+        super().__init__(folder, trainer)
+        self._scalars = Scalars(self.writer)
+        self.writer = cast(SummaryWriter, self._scalars)
+        self._history, self._callback, self._trainer = history, callback, trainer
+
+    def stepped(self, trainer: Trainer, report: StepReport, log: bool) -> None:
+        super().stepped(trainer, report, log)
+        if log:
+            self._tell(self._history.steps, Moment(STEP, trainer.step, self._scalars.take()))
+
+    def evaluated(self, trainer: Trainer, certificate: Certificate) -> None:
+        super().evaluated(trainer, certificate)
+        self._tell(self._history.looks, Moment(LOOK, trainer.step, self._scalars.take(), certificate.to_dict()))
+
+    def warmed(self, trainer: Trainer, looked: bool) -> None:
+        super().warmed(trainer, looked)
+        warm, scalars = trainer.state.warm, self._scalars.take()
+        if looked and warm is not None:
+            self._tell(self._history.warm_start, Moment(WARM_START, warm.round, scalars))
+
+    def finish(self, certificate: Certificate, figures: dict, settings: dict, step: int) -> None:
+        super().finish(certificate, figures, settings, step)
+        last = Scalars()
+        record(cast(SummaryWriter, last), certificate, step)
+        self._keep(self._history.looks, step, last.take())
+
+    def _tell(self, rows: list[dict], moment: Moment) -> None:
+        self._keep(rows, moment.step, moment.scalars)
+        if self._callback is None:
+            return
+        try:
+            answer = self._callback(moment)
+        except Exception as error:  # whatever a user's code may raise
+            raise CallbackFailed from error
+        # What a callback that draws or appends happens to return is no answer.
+        self._trainer.asked |= isinstance(answer, bool | np.bool_) and bool(answer)
+
+    def _keep(self, rows: list[dict], step: int, scalars: dict[str, float]) -> None:
+        state = self._trainer.state
+        rows.append({"step": step, "samples": state.samples, "seconds": state.seconds, **scalars})
