@@ -42,6 +42,7 @@ class Branch(IntEnum):
     START_MASS = 29  # states for the mass of a start; below, the replicate
     TIGHTENING = 30  # states on which V is trained on for the shifted bound
     WARM_START = 31  # pieces of trajectory of the warm start; below, their starts, those of trials, the noise of these
+    RUNNING = 32  # states and paths of the running estimates
     AUDIT = 1000  # which trajectories are simulated again with finer steps
 
 

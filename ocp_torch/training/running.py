@@ -37,7 +37,7 @@ class RunningEstimates:
     """Estimates of ``trained`` fields on ``problem``, always on the same states and the same noise."""
 
     def __init__(self, problem: Problem, trained: Trained, seed: int) -> None:
-        self.problem, self.trained, self.seed = problem, trained, derive_seed(seed, Branch.VALIDATION)
+        self.problem, self.trained, self.seed = problem, trained, derive_seed(seed, Branch.RUNNING)
         self._spent = 0.0
 
     def due(self, elapsed: float) -> bool:

@@ -17,7 +17,7 @@ def left_in(folder: Path) -> dict:
     """Everything a run leaves, but for the clock."""
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0, "images": 0})
     events.Reload()
-    timed = ("throughput/", "hparam/")
+    timed = ("throughput/", "hparam/", "running/")  # running estimates are made while there is time
     scalars = [tag for tag in events.Tags()["scalars"] if not tag.startswith(timed)]
     metrics = folder / "metrics.json"
     saved = load_checkpoint(folder / "checkpoints" / "last.pt")

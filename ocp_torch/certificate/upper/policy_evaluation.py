@@ -28,8 +28,8 @@ from ocp_torch.steppers.fitting import LARGEST_RATE
 POOL = 2**16
 # Beyond that ratio of the two suprema of the slack the residual is not weighed any more lopsidedly.
 MOST_LOPSIDED = 16.0
-# Where `mu` is nearly 0 so is every gradient of the fit, and large first steps may lead there (dubins with noise: two seeds of
-# three, one for good). A fit is begun anew at so many times its rate, no slower than the last number, if after so many
+# Where `mu` is nearly 0 so is every gradient of the fit, and large first steps may lead there (dubins with noise: two seeds
+# of three, one for good). A fit is begun anew at so many times its rate, no slower than the last number, if after so many
 # steps `mu` has less mass than this.
 LOOKED_AT, LEAST_MASS, SLOWER, SLOWEST = 40, 0.01, 0.3, 1e-3
 # States at which the excess is computed after a round: what decides on a next one need not be exact.
