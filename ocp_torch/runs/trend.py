@@ -45,8 +45,9 @@ def save_trend(comparison: Comparison, field: str, file: Path) -> None:
             xs = sorted({x for x, _ in known})
             means = [100.0 * sum(g for at, g in known if at == x) / sum(at == x for at, _ in known) for x in xs]
             axis.plot(xs, means, color=f"C{k}", label=f"{problem}, {method}, {gap[4:]}", **look)
-    if points and all(x > 0.0 for x, _ in points):
-        axis.set_xscale("log")
+    above = [x for x, _ in points if x > 0.0]
+    if above and all(x >= 0.0 for x, _ in points):  # a logarithmic axis, and 0 a step before its first number
+        axis.set_xscale("symlog", linthresh=min(above), linscale=0.5)
     axis.set(yscale="log", ylabel="gap, %")
     axis.set_xlabel(field, parse_math=False)
     axis.legend(fontsize="small")

@@ -35,8 +35,8 @@ VARIANTS = {
     "system": ("dual", "problem=cart_pole"),
     "walls": ("pd", "problem=dubins", "problem.walls=true"),
 }
-# Quick are those that have the most in them.
-QUICK = ("limit, q < 2", "system")
+# Quick is the one that has the most in it.
+QUICK = ("system",)
 EACH = pytest.mark.parametrize(
     "variant", [v if v in QUICK else pytest.param(v, marks=pytest.mark.nightly) for v in VARIANTS]
 )

@@ -32,7 +32,8 @@ def test_the_model_is_the_problem():
     np.testing.assert_allclose(B.full().ravel(), problem.control_matrix(x)[0].T.ravel(), rtol=1e-12, atol=1e-15)
 
 
-@pytest.mark.parametrize("exponent", [2.0, pytest.param(1.5, marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("exponent", [2.0, 1.5])
 def test_with_the_exact_value_two_steps_are_enough(exponent):
     problem = Manufactured(dim=2, exponent=exponent)
     step, steps = 0.05, 60

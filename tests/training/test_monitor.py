@@ -14,6 +14,7 @@ from support.small import METHODS, small
 
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
 
+NIGHTLY = pytest.mark.nightly
 DRIFTING = ("problem=manufactured", "problem.dim=2")
 WAYS = {**METHODS, "saddle with drift": ("method=pd", "method.augmentation=0", *DRIFTING), "pd with drift": DRIFTING}
 
@@ -40,7 +41,10 @@ def test_the_game_is_shown_at_every_phase(way, tmp_path, monkeypatch):
     assert b"running/.*" in layout
 
 
-@pytest.mark.parametrize(("method", "noise"), [("dual", "0.0"), ("primal", "0.0"), ("pd", "0.05")])
+@pytest.mark.parametrize(
+    ("method", "noise"),
+    [("dual", "0.0"), pytest.param("primal", "0.0", marks=NIGHTLY), pytest.param("pd", "0.05", marks=NIGHTLY)],
+)
 def test_running_estimates_are_those_of_a_certificate(method, noise):
     trainer = small(f"method={method}", "problem=manufactured", f"problem.noise={noise}", "model.width=16")
     found = RunningEstimates(trainer.problem, trainer.trained, 0)(trainer.constants)
