@@ -122,7 +122,7 @@ def test_a_run_leaves_one_page_that_is_whole_and_needs_nothing_else(finished):
     assert [w for w in wanted if not any(w in title for title in titles)] == []
     figures = [p for p in folder.glob("figures/*.png") if p.stem != "certificate"]
     assert len([1 for name, _ in found.attributes if name == "src"]) == len(figures) > 2
-    assert {"The bracket closes", "Losses", "Violations"} <= set(found.words["h3"])
+    assert {"The bracket closes: running estimates", "Losses", "Violations"} <= set(found.words["h3"])
     told = json.loads((folder / "certificate.json").read_text())
     assert all(found.html.count(advice(w)) or f"What to do: {advice(w)[:10]}" in found.html for w in told["warnings"])
     assert "batch: 16" in " ".join(found.words["pre"])

@@ -85,8 +85,12 @@ def learning(found: history.Curves, certificate: dict) -> str:
     curves |= {words.label("perf", name): points for name, points in perf.items()}
     curves |= {"OPT": bounds.pop("exact")} if "exact" in bounds else {}
     curves |= {words.label("upper", name): bounds[name] for name in reversed(bounds)}
+    running = group("running")
+    shown = (running.get(name, []) for name in ("F_M", "OPT", "Perf"))
+    late = [y for points in shown for _, y in points[len(points) // 2 :]]
     charts = {
-        "The bracket closes": chart(curves, span=tight),
+        "The bracket closes: running estimates": chart(running, span=late),
+        "The bracket closes: looks": chart(curves, span=tight),
         "Gap": chart(group("gap"), log=True),
         "Losses": chart(group("loss")),
         "Violations": chart(group("violation"), log=True),
