@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lower.mollified import DIRECTIONS, EVALUATIONS, Mollified
-from ocp_torch.certificate.lower.sampled import SampledValue
+from ocp_torch.certificate.lower.sampled import SampledValue, to_gain
 from ocp_torch.certificate.lower.shifted import TOP, SlackParts, climbed, scaled_by, slack_function
 from ocp_torch.certificate.lower.tightened import tightened
 from ocp_torch.certificate.settings import CertificateSettings
@@ -213,6 +213,7 @@ def test_a_value_trained_on_for_the_bound_comes_closer_to_the_optimum_from_below
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.ROUNDS", 1)
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.RATE", 2e-2)
     monkeypatch.setattr("ocp_torch.certificate.lower.mollified.RADII", (1.0 / 64.0,))
+    monkeypatch.setattr("ocp_torch.certificate.lower.sampled.WORTH", 0.0)
     problem = zoo.build(name)
     value = perturbed(problem)
     weights = copy.deepcopy(value.state_dict())
@@ -230,3 +231,39 @@ def test_what_cannot_be_trained_on_stays_as_it_is():
     broken = perturbed(Circle())
     broken.head.bias.fill_(math.nan)
     assert not list(tightened(Circle(), broken, seed=0))
+
+
+def test_rounds_go_on_while_there_is_something_to_gain(monkeypatch):
+    """A spike on the exact `V` is to be gained. A first round that gives nothing is no reason to stop, a second one that
+    takes the spike off is."""
+    problem = Circle()
+    grid = torch.linspace(0.0, 1.0, 1001, dtype=torch.float64).unsqueeze(1)
+    place = float(grid[problem.state_cost(grid).argmin()])  # where no multiple of V makes up for it
+    spike = lambda x: torch.where((x[:, 0] - place).abs() < 1e-3, 1.0, 0.0)
+
+    class Spiked(torch.nn.Module):
+        def __init__(self, height):
+            super().__init__()
+            self.height = torch.nn.Parameter(torch.tensor(height, dtype=torch.float64))
+
+        def forward(self, x):
+            return problem.exact_value(x) + self.height * spike(x)
+
+    sets = replicated_samples(problem, 2048, 2, 0, divergences=False)
+    V, worse, good, never = (Spiked(h) for h in (0.02, 0.03, 0.0, 0.01))
+    asked = []
+
+    def rounds(*_):
+        for W in (worse, good, never):
+            asked.append(W)
+            yield W
+
+    monkeypatch.setattr("ocp_torch.certificate.lower.sampled.tightened", rounds)
+    monkeypatch.setattr("ocp_torch.certificate.lower.sampled.mollified_shift", lambda best: best)
+    found = SampledValue(problem, V, sets, ascents=2, search=True)
+    lost = problem.exact_optimum - found.own.bound
+    assert lost > 0.01
+    assert to_gain(found.own) == pytest.approx(lost, rel=0.4)  # the mean of the tail has a part of the spike
+    assert found.best.value is good
+    assert asked == [worse, good]
+    assert abs(to_gain(found.best)) < 1e-3

@@ -15,10 +15,9 @@ from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.checks.tails import rarity
 from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate, integral
+from ocp_torch.certificate.lower.levels import best_level
 from ocp_torch.certificate.lower.sampled import SampledValue
-from ocp_torch.certificate.lower.shifted import TOP, Shift, SlackParts
-from ocp_torch.maths.quantiles import upper_quantile
-from ocp_torch.maths.supremum import minimiser
+from ocp_torch.certificate.lower.shifted import Shift, SlackParts
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.needs import Need
 from ocp_torch.problems.samples import Samples
@@ -78,25 +77,11 @@ def levelled(shift: Shift, M: float) -> Estimate:
         return shift.estimate
     weights = [samples.weight for samples in shift.sets]
     mean = sum(shift.initial) / len(shift.initial)
-    found = [_best(SlackParts.join(shift.parts[k::2]), torch.cat(weights[k::2]), mean, M) for k in (0, 1)]
-    thetas, levels = zip(*(found[1 - i % 2] for i in range(len(shift.sets))), strict=True)
+    found = [best_level(SlackParts.join(shift.parts[k::2]), torch.cat(weights[k::2]), mean, M) for k in (0, 1)]
+    thetas, levels, _ = zip(*(found[1 - i % 2] for i in range(len(shift.sets))), strict=True)
     slacks = [part.slack(theta) for part, theta in zip(shift.parts, thetas, strict=True)]
     initial = [theta * e for theta, e in zip(thetas, shift.initial, strict=True)]
     return _penalised(initial, shift.sets, slacks, list(levels), M)
-
-
-def _best(parts: SlackParts, weights: Tensor, initial: float, M: float) -> tuple[float, float]:
-    """The `theta` in `[0, TOP]` and the `c` that maximise `F_M(theta W - c)`, concave in both, on sampled states."""
-
-    def level(theta: float) -> float:
-        return upper_quantile(parts.slack(theta), weights, 1.0 / M)
-
-    def loss(theta: float) -> float:
-        c = level(theta)
-        return c + M * float((weights * (parts.slack(theta) - c).clamp_min(0.0)).mean()) - theta * initial
-
-    theta = minimiser(loss, 0.0, TOP)
-    return theta, level(theta)
 
 
 def _penalised(

@@ -6,11 +6,11 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from ocp_torch.certificate.lower.levels import best_level
 from ocp_torch.certificate.lower.mollified import mollified_shift
-from ocp_torch.certificate.lower.shifted import Shift
+from ocp_torch.certificate.lower.shifted import Shift, SlackParts
 from ocp_torch.certificate.lower.tightened import PHASE, tightened
 from ocp_torch.maths.jets import Field
-from ocp_torch.maths.quantiles import upper_quantile
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
@@ -63,10 +63,8 @@ class SampledValue:
 
 
 def to_gain(shift: Shift) -> float:
-    """How far the supremum of the slack is above the mean of its largest values, which training for the bound lowers: where
-    that is nothing, a flat top is left and no spike."""
-    M = PHASE.constants.M
-    slack = torch.cat([part.slack(shift.theta) for part in shift.parts])
+    """By how much the bound that training maximises, with the mean of the largest slacks for their supremum, is above the
+    bound: where that is nothing, no spike is left to take off."""
     weights = torch.cat([samples.weight for samples in shift.sets])
-    level = upper_quantile(slack, weights, 1.0 / M)
-    return shift.largest.value - level - M * float((weights * (slack - level).clamp_min(0.0)).mean())
+    mean = sum(shift.initial) / len(shift.initial)
+    return best_level(SlackParts.join(shift.parts), weights, mean, PHASE.constants.M)[2] - shift.bound
