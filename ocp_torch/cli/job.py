@@ -4,7 +4,6 @@ import contextlib
 import logging
 import multiprocessing
 import os
-import random
 import re
 import shlex
 import sys
@@ -14,7 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -24,6 +22,7 @@ from ocp_torch.cli.compose import resolved, run_data
 from ocp_torch.cli.outcome import Record, fail, failed, typed
 from ocp_torch.errors import InputError
 from ocp_torch.files.reading import require_unlinked
+from ocp_torch.maths.seeds import generators_kept
 from ocp_torch.problems.blame import blamed
 from ocp_torch.problems.commands import quoted
 from ocp_torch.runs.configuration import adopt, locate
@@ -122,17 +121,12 @@ def isolated():
     """Leave the process as it was: no job of a sweep finds another one's threads, precision or random numbers."""
     dtype, threads = torch.get_default_dtype(), torch.get_num_threads()
     path, folder = list(sys.path), os.getcwd()
-    states = np.random.get_state(), random.getstate()  # noqa: NPY002
     gradients = torch.set_grad_enabled(torch.is_grad_enabled())
     try:
-        # A job on a GPU seeds its generators; where nobody has used one yet there is none to keep.
-        used = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
-        with torch.random.fork_rng(devices=used), gradients:
+        with generators_kept(), gradients:
             yield
     finally:
         torch.set_default_dtype(dtype)
         torch.set_num_threads(threads)
-        np.random.set_state(states[0])  # noqa: NPY002
-        random.setstate(states[1])
         sys.path[:] = path
         os.chdir(folder)

@@ -62,7 +62,7 @@ def _c(program: Program, out: Path, about: str, metadata: dict) -> list[Path]:
     header, source = c_source(functions, out.stem, about, metadata)
     files = {out.with_suffix(".h"): header, out: source}
     for file, text in files.items():
-        write_atomically(file, lambda path, text=text: path.write_text(text))  # type: ignore[misc]
+        write_atomically(file, lambda path, text=text: path.write_text(text, encoding="utf-8"))  # type: ignore[misc]
     return list(files)
 
 

@@ -4,6 +4,9 @@
 of one kind changes no other, and no set of states is used twice without that being meant.
 """
 
+import contextlib
+import random
+from collections.abc import Iterator
 from enum import IntEnum, unique
 
 import numpy as np
@@ -55,3 +58,17 @@ def derive_seed(seed: int, branch: Branch, *path: int) -> int:
 def fixed_generator(number: int = 0) -> torch.Generator:
     """A generator that begins in the same place in every run: for probes and designs that shall not vary with its seed."""
     return torch.Generator().manual_seed(number)
+
+
+@contextlib.contextmanager
+def generators_kept() -> Iterator[None]:
+    """The process's own generators afterwards are as they were: of PyTorch, NumPy and Python."""
+    states = np.random.get_state(), random.getstate()  # noqa: NPY002
+    # Where nobody has used a GPU yet it has no generator to keep.
+    used = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
+    try:
+        with torch.random.fork_rng(devices=used):
+            yield
+    finally:
+        np.random.set_state(states[0])  # noqa: NPY002
+        random.setstate(states[1])

@@ -18,7 +18,7 @@ from ocp_torch.control.policies import admissible_density, occupation_density, t
 from ocp_torch.maths.brownian import Grid, discounted, increments, path_integral
 from ocp_torch.maths.quantiles import upper_quantile
 from ocp_torch.maths.runge_kutta import discounted_integral
-from ocp_torch.maths.seeds import Branch, derive_seed
+from ocp_torch.maths.seeds import Branch, derive_seed, generators_kept
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.generator import Generator
@@ -44,10 +44,17 @@ class RunningEstimates:
         """Whether a run that has taken so many seconds has time for them; recorded samples are for training alone."""
         return self.problem.has_simulator and self._spent <= SECONDS + PART * elapsed
 
-    @torch.no_grad()
     def __call__(self, constants: Constants) -> dict[str, float]:
-        """Estimates by name, in the order of the bracket."""
-        started, fields = time.perf_counter(), self.trained.fields
+        """Estimates by name, in the order of the bracket. A problem that draws random numbers goes on as if it had not been
+        asked: whether it is depends on the clock."""
+        started = time.perf_counter()
+        with torch.no_grad(), generators_kept():
+            found = self._estimates(constants)
+        self._spent += time.perf_counter() - started
+        return {name: value for name, value in found.items() if math.isfinite(value)}
+
+    def _estimates(self, constants: Constants) -> dict[str, float]:
+        fields = self.trained.fields
         found: dict[str, float] = {}
         mean = 0.0
         if fields.value is not None:
@@ -62,8 +69,7 @@ class RunningEstimates:
         found["Perf"] = mean + self._simulated(constants)
         if fields.control_density is not None and self.problem.gives_divergences:
             found["J"] = self._penalised(constants)
-        self._spent += time.perf_counter() - started
-        return {name: value for name, value in found.items() if math.isfinite(value)}
+        return found
 
     def _penalised(self, constants: Constants) -> float:
         """`J(w, mu)`."""

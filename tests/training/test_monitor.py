@@ -1,5 +1,8 @@
 """What TensorBoard shows of the game: both players, both constraint violations, whatever the method and its phase."""
 
+import random
+
+import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -56,6 +59,17 @@ def test_running_estimates_are_those_of_a_certificate(method, noise):
         assert (bound in found) == (bound in side and side[bound] is not None)
         if bound in found:
             assert found[bound] == pytest.approx(side[bound].value, rel=off)
+
+
+def test_running_estimates_leave_the_generators_of_a_problem_that_draws_alone(monkeypatch):
+    trainer = small("problem=circle")
+    cost = trainer.problem.state_cost
+    noisy = lambda x: cost(x) + 1e-3 * torch.rand(len(x)).to(x) + 1e-3 * random.random() + 1e-3 * np.random.rand()  # noqa: NPY002
+    monkeypatch.setattr(trainer.problem, "state_cost", noisy)
+    states = lambda: (torch.get_rng_state().tolist(), random.getstate(), str(np.random.get_state()))  # noqa: NPY002
+    before = states()
+    assert RunningEstimates(trainer.problem, trainer.trained, 0)(trainer.constants)
+    assert states() == before
 
 
 def test_running_estimates_take_a_small_part_of_the_time():
