@@ -88,12 +88,8 @@ def fit_closed_loop(
         pool.grow(min(POOL, steps * settings.batch))
         for step in range(steps):
             advance(stepper, average, draw, phase)
-            if (
-                k == 0
-                and step == LOOKED_AT
-                and settings.lr > SLOWEST
-                and vanished(fitted.log_occupation, pool.samples.x)
-            ):
+            looked_at = k == 0 and step == LOOKED_AT and settings.lr > SLOWEST
+            if looked_at and vanished(fitted.log_occupation, pool.samples.take(slice(EXCESS_STATES))):
                 slower = replace(settings, lr=SLOWER * settings.lr)
                 return fit_closed_loop(problem, policy, fields, network, constants, slower, seed, pool)
         value = average.module.value if trained is None else trained
@@ -104,9 +100,9 @@ def fit_closed_loop(
 
 
 @torch.no_grad()
-def vanished(log_occupation: Field, x: torch.Tensor) -> bool:
-    """Whether hardly any mass of `mu` is left at the uniform states ``x``."""
-    return float(log_occupation(x[:EXCESS_STATES]).exp().mean()) < LEAST_MASS
+def vanished(log_occupation: Field, samples: Samples) -> bool:
+    """Whether hardly any mass of `mu` is left at the states of ``samples``."""
+    return float(samples.mean(log_occupation(samples.x).exp())) < LEAST_MASS
 
 
 class Pool:
