@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.control.described import described, problem_name, require_same
-from ocp_torch.control.exported import about, coordinates_of, example_state, exported_function
+from ocp_torch.control.exported import about, coordinates_of, example_states, exported_function
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, trained_policies
 from ocp_torch.errors import InputError, notes
 from ocp_torch.export import export
@@ -108,7 +108,7 @@ class Controller:
         function = exported_function(problem, self.fields, self.kind, self.occupation, self.constants, place)
         inside = {"coordinates": place, "problem": described(problem), "policy": self.kind}
         inside |= {"certificate": self.certificate, "config": self.config}
-        return export(function, example_state(problem, place), Path(out), format, about(problem, place), inside)
+        return export(function, example_states(problem, place), Path(out), format, about(problem, place), inside)
 
 
 def load_controller(path: str | Path, problem: Problem | None = None, device: str = "cpu") -> Controller:

@@ -12,14 +12,15 @@ from ocp_torch.errors import InputError, require_choice
 from ocp_torch.export import CONTROL
 from ocp_torch.fields import Fields
 from ocp_torch.maths import jets
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.physical.system import System
 
 VALUE, GRADIENT = "value", "gradient"
 TORUS, PHYSICAL = "torus", "physical"
-# A state in the unit cell, and in the box, off every symmetry: by it functions are traced.
-EXAMPLE = 0.37
+# States by which functions are traced.
+EXAMPLES = 16
 
 Outputs = dict[str, Tensor]
 
@@ -37,9 +38,9 @@ def coordinates_of(problem: Problem, asked: str | None) -> str:
     return chosen
 
 
-def example_state(problem: Problem, coordinates: str) -> Tensor:
-    """A state ``(1, d)`` in ``coordinates``."""
-    x = torch.full((1, problem.dim), EXAMPLE, dtype=torch.float64)
+def example_states(problem: Problem, coordinates: str) -> Tensor:
+    """States ``(K, d)`` in ``coordinates``, always the same."""
+    x = torch.rand(EXAMPLES, problem.dim, dtype=torch.float64, generator=fixed_generator())
     return problem.from_torus(x) if coordinates == PHYSICAL and isinstance(problem, System) else x
 
 

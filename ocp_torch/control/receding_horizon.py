@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.control.exported import EXAMPLE
+from ocp_torch.control.exported import TORUS, example_states
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.export import lowered
 from ocp_torch.export.casadi_function import casadi_function, require_casadi
@@ -124,4 +124,4 @@ def model(problem: Problem) -> Any:
         B = problem.control_matrix(x).transpose(1, 2)
         return {"f": problem.state_cost(x), "a": problem.drift(x), "B": B.expand(len(x), *B.shape[1:])}
 
-    return casadi_function(lowered(data, torch.full((1, problem.dim), EXAMPLE, dtype=torch.float64)), "model")
+    return casadi_function(lowered(data, example_states(problem, TORUS)), "model")

@@ -22,7 +22,7 @@ CONTROL = "control"
 
 def export(
     function: Callable[[Tensor], dict[str, Tensor]],
-    example: Tensor,
+    examples: Tensor,
     out: Path,
     format: str | None,
     about: str,
@@ -30,9 +30,9 @@ def export(
 ) -> list[Path]:
     """Write ``function``, of states ``(N, d)`` to a batch for each name, to ``out``, and return the files.
 
-    It is traced on ``example`` ``(1, d)``, float64. ``format`` is one of `FORMATS`, by default what the ending of ``out``
-    says. ``about`` is for people, ``metadata`` goes inside as JSON. Raises `InputError` for a wrong choice, a library that is
-    missing, and a function that cannot be traced.
+    It is traced on the first of ``examples`` ``(K, d)``, float64, and held against the others. ``format`` is one of `FORMATS`,
+    by default what the ending of ``out`` says. ``about`` is for people, ``metadata`` goes inside as JSON. Raises `InputError`
+    for a wrong choice, a library that is missing, and a function that cannot be traced.
     """
     known = [name for name, (ending, _) in FORMATS.items() if out.suffix == ending]
     if format is None and not known:
@@ -45,7 +45,7 @@ def export(
     name = out.stem
     if not (name.isascii() and name.isidentifier()):
         raise InputError(f"out is {str(out)!r}, but its name must be letters, digits and _, as functions bear it.")
-    return write(lowered(function, example), out, about, metadata)
+    return write(lowered(function, examples), out, about, metadata)
 
 
 def _onnx(program: Program, out: Path, about: str, metadata: dict) -> list[Path]:

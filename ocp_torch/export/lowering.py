@@ -30,10 +30,15 @@ REDUCTIONS = {"sum": "sum", "amax": "max", "amin": "min"}
 SAME = {"bitwise_and": "mul", "logical_and": "mul", "bitwise_or": "maximum", "logical_or": "maximum"}
 
 
-def lowered(function: Callable[[Tensor], dict[str, Tensor]], example: Tensor) -> Program:
-    """The `Program` of ``function`` from states to a result for each name, traced on ``example``, a batch of one ``(1, d)``.
-    Raises `InputError` for what branches on numbers, and for an operation that no format knows."""
-    function(example)  # what a problem computes once is no part of it
+# How far what was traced may be off the function at other states, relative to its largest number.
+ROUNDING = 1e-9
+
+
+def lowered(function: Callable[[Tensor], dict[str, Tensor]], examples: Tensor) -> Program:
+    """The `Program` of ``function`` from states to a result for each name, traced on the first of ``examples`` ``(K, d)``,
+    and held against it at the others. Raises `InputError` for what is not of PyTorch's operations alone, as NumPy or a
+    branch, and for an operation that no format knows."""
+    wanted = function(examples)  # what a problem computes once is no part of it
     names: list[str] = []
 
     def listed(x: Tensor) -> tuple[Tensor, ...]:
@@ -42,12 +47,19 @@ def lowered(function: Callable[[Tensor], dict[str, Tensor]], example: Tensor) ->
         return tuple(results.values())
 
     try:
-        traced = make_fx(listed, decomposition_table=dict(core_aten_decompositions().items()))(example)
-    except RuntimeError as error:
-        reason = str(error).split("\n")[0]
-        raise InputError(f"this controller cannot be exported, as it cannot be traced: {reason}") from None
+        traced = make_fx(listed, decomposition_table=dict(core_aten_decompositions().items()))(examples[:1])
+    except Exception as error:  # whatever the functions of a problem do that a tracer does not follow
+        reason = next(iter(str(error).splitlines()), type(error).__name__).rstrip(".")
+        raise InputError(f"this controller cannot be exported, as it cannot be traced: {reason}.") from None
     traced.graph.eliminate_dead_code()
-    lowering = Lowering(traced, Program(example.shape[1]))
+    found = zip(*(traced(x) for x in examples.split(1)), strict=True)
+    for name, parts, value in zip(names, found, wanted.values(), strict=True):
+        if not bool((torch.cat(parts) - value).abs().max() <= ROUNDING * value.abs().max().clamp_min(1.0)):
+            raise InputError(
+                f"this controller cannot be exported: its {name} is not what was traced at other states, as where a function "
+                "of the problem goes through NumPy, or branches on numbers."
+            )
+    lowering = Lowering(traced, Program(examples.shape[1]))
     outputs = lowering.run()
     lowering.program.outputs = dict(zip(names, outputs, strict=True))
     return lowering.program.pruned()
@@ -92,7 +104,7 @@ class Lowering:
             return node.target(*filled[0], **filled[1])  # type: ignore[operator]
         if name in COPIES and options.get("dtype") not in WHOLE:
             return args[0]
-        if name in MOVES:
+        if name in MOVES and len(views) == 1:
             return self._moved(node, args, options)
         if name in REDUCTIONS:
             return self._reduced(REDUCTIONS[name], *args, **options)

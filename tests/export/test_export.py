@@ -188,6 +188,14 @@ class Branching(Cart):
         return (a, 2.0 * B) if float(s[0, 0]) > 0.0 else (a, B)
 
 
+class Numbers(Cart):
+    """Its dynamics go through NumPy, where no tracer follows."""
+
+    def dynamics(self, s):
+        a, B = super().dynamics(s)
+        return a, B * torch.from_numpy(1.5 + np.sin(s.detach().numpy()[:, :1, None]))
+
+
 def test_what_cannot_be_exported_is_told_in_a_sentence(tmp_path):
     controller = controllers("dual")[0]
     for arguments, reason in [
@@ -204,4 +212,9 @@ def test_what_cannot_be_exported_is_told_in_a_sentence(tmp_path):
     ]
     with pytest.raises(InputError, match="this controller cannot be exported, as it cannot be traced"):
         branching.export(tmp_path / "u.c")
+    through_numpy = controller_of(
+        configured(*SMALL, "problem._target_=support.systems.Cart", "method=dual"), Numbers()
+    )[0]
+    with pytest.raises(InputError, match="its control is not what was traced at other states"):
+        through_numpy.export(tmp_path / "u.c")
     assert list(tmp_path.iterdir()) == []
