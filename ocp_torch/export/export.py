@@ -30,9 +30,9 @@ def export(
 ) -> list[Path]:
     """Write ``function``, of states ``(N, d)`` to a batch for each name, to ``out``, and return the files.
 
-    It is traced on the first of ``examples`` ``(K, d)``, float64, and held against the others. ``format`` is one of `FORMATS`,
-    by default what the ending of ``out`` says. ``about`` is for people, ``metadata`` goes inside as JSON. Raises `InputError`
-    for a wrong choice, a library that is missing, and a function that cannot be traced.
+    It is traced on the first of ``examples`` ``(K, d)``, float64, and held against the others. ``format`` is one of
+    `FORMATS`, by default what the ending of ``out`` says. ``about`` is for people, ``metadata`` goes inside as JSON. Raises
+    `InputError` for a wrong choice, a library that is missing, and a function that cannot be traced.
     """
     known = [name for name, (ending, _) in FORMATS.items() if out.suffix == ending]
     if format is None and not known:
