@@ -77,6 +77,7 @@ def old(tmp_path_factory):
     return place / "run", simulated
 
 
+@pytest.mark.nightly
 def test_an_old_run_on_a_simulator_is_found_and_goes_on(old, tmp_path):
     folder, simulated = old
     register_resolvers()

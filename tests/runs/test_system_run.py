@@ -20,7 +20,12 @@ from support.systems import Cart, Conveyor, Swing
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     cheap = ("certificate.mollify=false", "certificate.occupation_states=0", "certificate.stage.steps=0")
-    own = ("certificate.trajectories=32", "problem._target_=support.systems.Swing", "problem.control_limit=2.0")
+    own = (
+        "certificate.trajectories=32",
+        "certificate.replicates=2",
+        "problem._target_=support.systems.Swing",
+        "problem.control_limit=2.0",
+    )
     trainer = small(*own, *cheap, "trainer.figures=true")
     session(trainer, folder)
     return folder, trainer
