@@ -19,7 +19,7 @@ from ocp_torch.problems.physical.system import System
 
 VALUE, GRADIENT = "value", "gradient"
 TORUS, PHYSICAL = "torus", "physical"
-# States by which functions are traced.
+# States: a function is traced on the first, and what was traced is held against it at the others.
 EXAMPLES = 16
 
 Outputs = dict[str, Tensor]

@@ -32,8 +32,8 @@ class RecedingHorizon:
 
     ``terminal`` is a `casadi.Function` of a state of the torus whose output `value` is `V`, such as
     `controller.export("V.casadi", coordinates="torus")` writes; its output `control` gives the first plan. `None` for no cost
-    after the horizon. Raises `InputError` for
-    a wrong size, without CasADi, and for a problem whose functions cannot be traced.
+    after the horizon. ``failed`` counts the states at which IPOPT did not converge; the control is then its last iterate's.
+    Raises `InputError` for a wrong size, without CasADi, and for a problem whose functions cannot be traced.
     """
 
     def __init__(self, problem: Problem, steps: int, step: float, terminal: Any = None) -> None:
@@ -62,6 +62,7 @@ class RecedingHorizon:
         self._bounds["ubg"] = np.r_[np.zeros(d * steps), np.full(squares.shape[0], cost.reach**2)]
         self._advance, self._terminal = advanced, terminal
         self._plan: np.ndarray | None = None
+        self.failed = 0
 
     def reset(self) -> None:
         """Forget the last plan, which the next one starts from."""
@@ -77,6 +78,7 @@ class RecedingHorizon:
         states = states - np.round(states[0] - x)
         guess = np.concatenate([states.ravel(), self._plan[d * steps :]])
         found = self._solver(x0=guess, p=x, **self._bounds)["x"].full().ravel()
+        self.failed += not self._solver.stats()["success"]
         states, controls = found[: d * steps].reshape(steps, d), found[d * steps :].reshape(steps, m)
         shifted = np.concatenate([states[1:], states[-1:]]), np.concatenate([controls[1:], controls[-1:]])
         self._plan = np.concatenate([part.ravel() for part in shifted])

@@ -1,7 +1,7 @@
-"""From a PyTorch function of a batch of states to the `Program` of one state.
+"""From the graph of a PyTorch function of a batch of states to the `Program` of one state.
 
-The function is traced, derivatives by autograd included, into a graph of ATen operations; those are few once PyTorch has
-taken the others apart. What moves numbers about is applied to the places of a view instead.
+The operations of the graph are few, as PyTorch has taken the others apart. What moves numbers about is applied to the places
+of a view instead.
 """
 
 import math
@@ -11,11 +11,10 @@ from typing import Any
 
 import torch
 from torch import Tensor, fx
-from torch._decomp import core_aten_decompositions
-from torch.fx.experimental.proxy_tensor import make_fx
 
 from ocp_torch.errors import InputError
 from ocp_torch.export.program import Operand, Program, View
+from ocp_torch.export.tracing import traced
 
 # Move entries about.
 MOVES = """view _unsafe_view reshape permute transpose t expand unsqueeze squeeze slice select flip repeat diagonal index
@@ -30,36 +29,11 @@ REDUCTIONS = {"sum": "sum", "amax": "max", "amin": "min"}
 SAME = {"bitwise_and": "mul", "logical_and": "mul", "bitwise_or": "maximum", "logical_or": "maximum"}
 
 
-# How far what was traced may be off the function at other states, relative to its largest number.
-ROUNDING = 1e-9
-
-
 def lowered(function: Callable[[Tensor], dict[str, Tensor]], examples: Tensor) -> Program:
-    """The `Program` of ``function`` from states to a result for each name, traced on the first of ``examples`` ``(K, d)``,
-    and held against it at the others. Raises `InputError` for what is not of PyTorch's operations alone, as NumPy or a
-    branch, and for an operation that no format knows."""
-    wanted = function(examples)  # what a problem computes once is no part of it
-    names: list[str] = []
-
-    def listed(x: Tensor) -> tuple[Tensor, ...]:
-        results = function(x)
-        names[:] = results
-        return tuple(results.values())
-
-    try:
-        traced = make_fx(listed, decomposition_table=dict(core_aten_decompositions().items()))(examples[:1])
-    except Exception as error:  # whatever the functions of a problem do that a tracer does not follow
-        reason = next(iter(str(error).splitlines()), type(error).__name__).rstrip(".")
-        raise InputError(f"this controller cannot be exported, as it cannot be traced: {reason}.") from None
-    traced.graph.eliminate_dead_code()
-    found = zip(*(traced(x) for x in examples.split(1)), strict=True)
-    for name, parts, value in zip(names, found, wanted.values(), strict=True):
-        if not bool((torch.cat(parts) - value).abs().max() <= ROUNDING * value.abs().max().clamp_min(1.0)):
-            raise InputError(
-                f"this controller cannot be exported: its {name} is not what was traced at other states, as where a function "
-                "of the problem goes through NumPy, or branches on numbers."
-            )
-    lowering = Lowering(traced, Program(examples.shape[1]))
+    """The `Program` of ``function`` from states to a result for each name, by way of its graph (`traced`, on ``examples``
+    ``(K, d)``). Raises `InputError` for a function that cannot be traced, and for an operation that no format knows."""
+    graph, names = traced(function, examples)
+    lowering = Lowering(graph, Program(examples.shape[1]))
     outputs = lowering.run()
     lowering.program.outputs = dict(zip(names, outputs, strict=True))
     return lowering.program.pruned()
@@ -68,16 +42,16 @@ def lowered(function: Callable[[Tensor], dict[str, Tensor]], examples: Tensor) -
 class Lowering:
     """The walk through the graph: every node becomes a view, or a plain value."""
 
-    def __init__(self, traced: fx.GraphModule, program: Program) -> None:
-        self.traced, self.program = traced, program
+    def __init__(self, graph: fx.GraphModule, program: Program) -> None:
+        self.graph, self.program = graph, program
         self.known: dict[fx.Node, Any] = {}
 
     def run(self) -> list[View]:
-        for node in self.traced.graph.nodes:
+        for node in self.graph.graph.nodes:
             if node.op == "placeholder":
                 self.known[node] = self.program.state
             elif node.op == "get_attr":
-                self.known[node] = getattr(self.traced, node.target)
+                self.known[node] = getattr(self.graph, node.target)
             elif node.op == "output":
                 return [self.view(value) for value in self._resolved(node.args[0])]
             else:

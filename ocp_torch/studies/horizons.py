@@ -83,6 +83,10 @@ def horizons(config: dict) -> Callable[[], dict[str, Played]]:
         for horizon, end in ((with_V, "V"), (alone, "nothing")):
             name = f"a horizon of {horizon.steps * horizon.step:g}, {end} at its end"
             found[name] = play(problem, horizon, x0, step, count)
+            if horizon.failed:
+                log.warning(
+                    "warning: %s: IPOPT did not converge at %d of %d states.", name, horizon.failed, len(x0) * count
+                )
         log.info("%s", table(found))
         return found
 

@@ -30,7 +30,8 @@ BUDGETS = (
     Budget(inf, steps=1200, batch=512, good_gap=0.02, stage_steps=800),
 )
 
-# Where no M is known the bound is decided by the worst state: that wants more states at once, and, without noise, longer.
+# Where no M is known the bound is decided by the worst state: that wants more states at once, and, without noise, longer
+# (with noise of 1e-3 a pendulum's gap is .33 % after these steps and .37 % after the 900 of its dimension).
 LARGE_BATCH, MANY_STEPS = 1024, 1200
 # In one dimension with noise, where networks are given more modes.
 NOISY_STEPS = 2000

@@ -12,7 +12,7 @@ from support.controllers import controllers
 from support.systems import Swing
 
 pytest.importorskip("casadi")
-from ocp_torch.control.receding_horizon import RecedingHorizon, model  # noqa: E402
+from ocp_torch.control.receding_horizon import QUIET, RecedingHorizon, model  # noqa: E402
 
 STARTS = np.random.default_rng(0).random((2, 2))
 
@@ -53,6 +53,16 @@ def test_it_keeps_to_the_limits(limit):
     size = np.abs(u) if isinstance(limit, list) else np.linalg.norm(u, axis=1)
     assert (size <= np.array(limit) * (1.0 + 1e-6)).all()
     assert (size.max(axis=0) > 0.9 * np.array(limit)).any()
+
+
+def test_states_at_which_no_plan_was_found_are_counted(monkeypatch):
+    problem = Manufactured(dim=2)
+    assert [RecedingHorizon(problem, 5, 0.1)(x).shape for x in STARTS] == [(2,), (2,)]
+    monkeypatch.setattr("ocp_torch.control.receding_horizon.QUIET", QUIET | {"ipopt.max_iter": 0})
+    hasty = RecedingHorizon(problem, 5, 0.1)
+    for x in STARTS:
+        hasty(x)
+    assert hasty.failed == len(STARTS)
 
 
 def test_whole_turns_change_nothing():
