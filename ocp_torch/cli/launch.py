@@ -15,6 +15,7 @@ from torch.optim import Optimizer
 
 from ocp_torch.cli.compose import composed, configuration, parsed, register_resolvers, run_data, with_own_defaults
 from ocp_torch.cli.explain import CHECKOUT, CONFIGS, explain, is_choice, known_fields
+from ocp_torch.cli.help import help_text
 from ocp_torch.cli.job import isolated, job
 from ocp_torch.cli.outcome import INTERRUPTED, Record, fail, failures, typed
 from ocp_torch.cli.single import carry_out, checked, require_places_to_write
@@ -25,7 +26,8 @@ from ocp_torch.training.stopping import Preempted
 
 __all__ = ["CHECKOUT", "CONFIGS", "composed", "fail", "isolated", "job", "known_fields", "launch", "register_resolvers"]
 
-ASKS = ("--help", "-h", "--info", "-i", "--cfg", "-c", "--hydra-help", "--version", "--shell-completion", "-sc")
+HELP = ("--help", "-h")
+ASKS = ("--info", "-i", "--cfg", "-c", "--hydra-help", "--version", "--shell-completion", "-sc")
 SWEEPS = ("-m", "--multirun", "hydra.mode=MULTIRUN")
 MOST_TRIED = 8  # jobs of a sweep that are tried for one value
 # The first optimiser of a process imports PyTorch's compiler, to tell it to leave these methods alone: 1.3 s of CPU.
@@ -53,7 +55,9 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
     options = [a for a in sys.argv[1:] if a.startswith("-")]
     overrides = [a for a in sys.argv[1:] if not a.startswith("-")]
     try:
-        if any(option.split("=")[0] in ASKS for option in options):
+        if any(option in HELP for option in options):
+            print(help_text(config_name, " ".join(typed(sys.argv[0])), overrides))
+        elif any(option.split("=")[0] in ASKS for option in options):
             entry()
         elif any(a in SWEEPS for a in sys.argv[1:]):
             sweep(entry, config_name, overrides, check)

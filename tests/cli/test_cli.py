@@ -11,7 +11,7 @@ import pytest
 
 from ocp_torch import load_controller
 from ocp_torch.certificate import table
-from ocp_torch.cli.launch import CHECKOUT, CONFIGS
+from ocp_torch.cli.launch import CHECKOUT
 from support.forked import assert_succeeded, certificate_in, script
 
 # Enough for a run of its own folder and certificate, and no more.
@@ -213,13 +213,3 @@ def test_a_wrong_job_of_a_sweep_ends_alone_and_is_named_at_the_end(tmp_path):
     assert "problem.discount is -1" in errors[0]
     assert "1 job(s)" in errors[-1]
     assert certificate_in(tmp_path / "sweep" / "1_circle_dual_seed0")["method"] == "dual"
-
-
-def test_help_names_every_group_and_its_choices(tmp_path):
-    result = fresh("train", "--help", cwd=tmp_path)
-    assert_succeeded(result)
-    for path in CONFIGS.glob("*/*.yaml"):
-        (line,) = [line for line in result.stdout.splitlines() if line.startswith(f"{path.parent.name}: ")]
-        assert path.stem in line.split(": ")[1].split(", ")
-    assert "activation: null" in result.stdout
-    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,123 @@
+"""What `--help` prints: what a command is for, examples, and every field with the value it has here and what it means."""
+
+import json
+import shutil
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ocp_torch.cli.compose import configuration
+from ocp_torch.cli.explain import CONFIGS, choices
+from ocp_torch.cli.terms import TERMS
+from ocp_torch.errors import InputError
+
+# Letters in a line, on narrow and on wide terminals, and those of the longest field that has its comment beside it.
+NARROWEST, WIDEST, BESIDE = 60, 120, 40
+LAST_WORDS = """\
+  -m seed=0,1,2 runs several, one after the other; -m hydra/launcher=joblib side by side
+  --help terms explains the words; --cfg job prints the configuration as YAML; --hydra-help is about Hydra itself"""
+
+
+def help_text(command: str, typed: str, overrides: list[str]) -> str:
+    """The help of ``command``, which was ``typed`` with these ``overrides``: groups chosen there show their own fields.
+
+    Raises `InputError` where the overrides cannot be composed.
+    """
+    if overrides == ["terms"]:
+        return "\n\n".join(_filled(f"{term}: {meaning}", "", "    ") for term, meaning in TERMS.items())
+    if stray := [o for o in overrides if "=" not in o and not o.startswith("~")]:
+        raise InputError(f"--help takes terms, or choices as in --help problem=pendulum, not {stray[0]!r}.")
+    config, data = configuration(command, overrides, whole=False)
+    file = CONFIGS / f"{command}.yaml"
+    taken = config.hydra.runtime.choices
+    chosen = {group: taken[group] for group in reversed(list(taken)) if not group.startswith("hydra")}
+    known = comments(file)
+    for group, choice in chosen.items():
+        folder, _, package = group.partition("@")
+        if choice not in (None, "null") and folder != "experiment":
+            known |= {f"{package or folder}.{k}": c for k, c in comments(CONFIGS / folder / f"{choice}.yaml").items()}
+    parts = [header(file).replace(f"python scripts/{command}.py", typed)]
+    listed = [(group, choices(group.partition("@")[0]), choice) for group, choice in chosen.items()]
+    if listed := [(group, known_ones, choice) for group, known_ones, choice in listed if len(known_ones) > 1]:
+        parts.append("Choices (group=choice), and the one taken here:")
+        parts.append("\n".join(_filled(f"  {g}={c or 'null'}: {', '.join(of)}", "", "      ") for g, of, c in listed))
+    parts.append("Fields (field=value), with their values here:")
+    parts.extend(sections(data, known))
+    return "\n\n".join([*parts, LAST_WORDS])
+
+
+def header(file: Path) -> str:
+    """The comment that a configuration file begins with: what the command is for, then examples."""
+    lines = file.read_text(encoding="utf-8").splitlines()
+    first = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+    return "\n".join(line.removeprefix("#").removeprefix(" ") for line in lines[:first])
+
+
+def comments(file: Path) -> dict[str, str]:
+    """What a YAML file says of its fields, by their dotted names: on their own line, or in a line of its own before."""
+    text = file.read_text(encoding="utf-8")
+    lines, found = text.splitlines(), {}
+    top = len(header(file).splitlines()) if text.startswith("#") else 0
+
+    def walk(mapping: yaml.MappingNode, prefix: str) -> None:
+        for key, value in mapping.value:
+            end = (key if isinstance(value, yaml.MappingNode) and not value.flow_style else value).end_mark
+            told = lines[end.line][end.column :].partition("#")[2] if end.line < len(lines) else ""
+            before = lines[key.start_mark.line - 1].strip() if key.start_mark.line > top else ""
+            if told or before.startswith("#"):
+                found[f"{prefix}{key.value}"] = (told or before.removeprefix("#")).strip()
+            if isinstance(value, yaml.MappingNode):
+                walk(value, f"{prefix}{key.value}.")
+
+    tree = yaml.compose(text)
+    if isinstance(tree, yaml.MappingNode):
+        walk(tree, "")
+    return found
+
+
+def sections(data: dict, known: dict[str, str]) -> Iterator[str]:
+    """The fields of each section, with what is ``known`` of them; those of no section come last."""
+    alone = {key: value for key, value in data.items() if not isinstance(value, dict) or not value}
+    for name, section in ((key, value) for key, value in data.items() if key not in alone):
+        told = f"  {known[name]}" if name in known else ""
+        own = comments(default) if (default := CONFIGS / name / "default.yaml").is_file() else {}
+        yield "\n".join(
+            [f"{name}{told}", *rows(section, f"{name}.", {f"{name}.{k}": c for k, c in own.items()} | known)]
+        )
+    yield "\n".join(rows(alone, "", known))
+
+
+def rows(section: dict, prefix: str, known: dict[str, str]) -> Iterator[str]:
+    for key, value in section.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, dict) and value:
+            if name in known:
+                yield _filled(known[name], f"  {name}: ".ljust(BESIDE), " " * BESIDE)
+            yield from rows(value, f"{name}.", known)
+            continue
+        field = f"  {name}={_written(value)}"
+        told = known.get(name, "")
+        if len(field) < BESIDE:
+            yield _filled(told, field.ljust(BESIDE), " " * BESIDE)
+        else:
+            yield field + (f"\n{_filled(told, ' ' * BESIDE, ' ' * BESIDE)}" if told else "")
+
+
+def _written(value: Any) -> str:
+    """As it is written on the command line."""
+    if isinstance(value, str):
+        return "..." if value == "???" else value
+    return json.dumps(value, separators=(",", ":")).replace('"', "")
+
+
+def _filled(words: str, first: str, rest: str) -> str:
+    width = min(WIDEST, max(NARROWEST, shutil.get_terminal_size().columns))
+    return (
+        textwrap.fill(
+            words, width, initial_indent=first, subsequent_indent=rest, break_long_words=False, break_on_hyphens=False
+        )
+        or first.rstrip()
+    )
