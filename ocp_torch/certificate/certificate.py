@@ -11,6 +11,7 @@ from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.estimate import CONFIDENCE, Estimate, known, known_of
 from ocp_torch.certificate.report import to_dict
 from ocp_torch.certificate.settings import Run
+from ocp_torch.maths.jets import Field
 from ocp_torch.problems.needs import GUESSED, Need
 
 # A side of a gap: the name of the bound, and the far end of its interval.
@@ -27,7 +28,8 @@ class Certificate:
     the level of the intervals; ``subject`` names the controller in ``perf`` that all this is about, by default the best of
     them. ``contradiction`` is the sentence that says why nothing counts, where two bounds exclude each other; ``refuted``
     are the names of guesses that another bound excludes. ``outside`` is the part of the discounted time that the controller
-    spends outside the box of a system in physical units.
+    spends outside the box of a system in physical units; ``occupation`` is the density that was fitted to its closed loop,
+    to draw.
     """
 
     run: Run
@@ -46,6 +48,7 @@ class Certificate:
     contradiction: str | None = None
     refuted: frozenset[str] = frozenset()
     outside: Estimate | None = None
+    occupation: Field | None = field(default=None, compare=False)
 
     def needs(self, name: str) -> tuple[Need, ...]:
         """What the bound ``name`` rests on; nothing for simulations, the truth, and names that nobody listed."""

@@ -36,12 +36,13 @@ def certify(context: Context) -> Certificate:
     bounds = [bound for bound in BOUNDS if bound.applies(context)]
     evaluated = lambda side: {bound.name: shown(bound, context) for bound in bounds if bound.side == side}
     _ = context.posed  # first of all: functions that are not finite are refused here
-    simulated, zero = context.simulated  # before the upper side, which is of the best of them
-    upper, perf_lower = evaluated(UPPER), evaluated(PERFORMANCE)
-    assumptions = context.assumptions  # before the lower side, whose `M` may follow from what is met here
-    context.progress("bounds")
-    lower = evaluated(LOWER)
-    outside = context.outside
+    with context.ahead:
+        simulated, zero = context.simulated  # before the upper side, which is of the best of them
+        upper, perf_lower = evaluated(UPPER), evaluated(PERFORMANCE)
+        assumptions = context.assumptions  # before the lower side, whose `M` may follow from what is met here
+        context.progress("bounds")
+        lower = evaluated(LOWER)
+        outside = context.outside
     sides = {LOWER: lower, UPPER: upper, PERFORMANCE: perf_lower}
     certificate = Certificate(
         run=context.run,
@@ -70,6 +71,7 @@ def certify(context: Context) -> Certificate:
         subject=context.kind if context.recorded or context.external else None,
         perf_lower=perf_lower,
         outside=outside,
+        occupation=None if context.closed_loop is None else context.closed_loop.occupation,
     )
     return examined(certificate)
 

@@ -1,5 +1,6 @@
 """What the bounds of one certificate share: a problem, states, functions, and what was found of them, each computed once."""
 
+import contextlib
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
@@ -119,6 +120,11 @@ class Context:
             return None
         search = self.settings.searches(self.constants)
         return SampledValue(self.problem, self.value, self.wide, self.settings.ascents, search, self.seed, self.odd)
+
+    @property
+    def ahead(self) -> contextlib.AbstractContextManager[None]:
+        """Within it a second core works on the lower side, beside simulation and the upper one."""
+        return contextlib.nullcontext() if self.sampled_value is None else self.sampled_value.ahead()
 
     @cached_property
     def simulated(self) -> tuple[dict[str, Simulated], Estimate | None]:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from ocp_torch.certificate.certificate import Certificate
 
 SCHEMA = 2
+# A gap above this says nothing as a percentage, and is told as a multiple.
+MEANS = 1.0
 
 
 def to_dict(certificate: Certificate) -> dict:
@@ -56,10 +58,11 @@ def to_dict(certificate: Certificate) -> dict:
 
 
 def table(certificate: dict, searches: Sequence[str] = ()) -> str:
-    """The certificate (as a dict of its schema) as a table for the terminal, and how its suprema were found."""
+    """The certificate (as a dict of its schema) for the terminal: what it comes to, the numbers as a table, and how its
+    suprema were found."""
     exact = certificate["exact"]
     name = lambda key: visible(certificate[key], LONGEST_NAME)
-    lines = [f"{name('problem')} / {name('method')}, seed {certificate['seed']}", ""]
+    lines = [f"{name('problem')} / {name('method')}, seed {certificate['seed']}", *in_words(certificate), ""]
     covered = f"± {100.0 * certificate['confidence']:.6g} %" if "confidence" in certificate else "± se"
     header = f"{'':26}{'value':>14}{covered:>11}{'of it bias':>11}" + (f"{'vs OPT':>12}" if exact else "")
     lines += [header, "-" * len(header)]
@@ -68,7 +71,7 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
         if estimate is None:
             return
         bias = f"{estimate['bias']:11.1e}" if "bias" in estimate else " " * 11
-        against = f"{100.0 * (estimate['value'] / exact - 1.0):+11.4f}%" if exact else ""
+        against = _against(estimate["value"] / exact) if exact else ""
         half = estimate["interval"][1] - estimate["value"] if "interval" in estimate else estimate["se"]
         lines.append(f"{label:26}{estimate['value']:14.8f}{half:11.1e}{bias}{against}")
 
@@ -93,20 +96,30 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
     gap, share = certificate["gap"], certificate["share"]
     for kind in ("certified", "simulated"):
         if gap[kind] is not None:
-            part = f", {100 * share[kind]:.2f}% of the gain over doing nothing" if share[kind] is not None else ""
-            lines.append(f"gap, {kind}: {100.0 * gap[kind]:.4f}%{part}")
+            had = share[kind] is not None and share[kind] > 0.0
+            part = f", {100 * share[kind]:.2f}% of the gain over doing nothing" if had else ""
+            lines.append(f"gap, {kind}: {gap_in_words(gap[kind])}{part}")
     if gap.get("conditional") is not None:
         guesses = dict.fromkeys(visible(b["if"]) for b in certificate["lower"].values() if b and "if" in b)
-        lines.append(f"gap, if {' and '.join(guesses)}: {100.0 * gap['conditional']:.4f}%, which rests on a guess")
-    lines += in_words(certificate)
+        lines.append(f"gap, if {' and '.join(guesses)}: {gap_in_words(gap['conditional'])}, which rests on a guess")
     if (outside := certificate.get("outside_box")) is not None:
         half = outside["interval"][1] - outside["value"]
         lines.append(
             f"outside the box: {100.0 * outside['value']:.3g} % of the discounted time (+- {100.0 * half:.1g})"
         )
     lines += searches
-    lines += [f"warning: {visible(warning)}" for warning in certificate["warnings"]]
+    lines += [f"warning: {warning}" for warning in dict.fromkeys(map(visible, certificate["warnings"]))]
     return "\n".join(lines)
+
+
+def gap_in_words(gap: float) -> str:
+    """A relative gap in per cent, or, where that would mean nothing, how many times the lower bound the upper one is."""
+    return f"{100.0 * gap:.4f}%" if gap <= MEANS else f"the upper side is {1.0 + gap:.3g} times the lower one"
+
+
+def _against(ratio: float) -> str:
+    """How far a number is from `OPT`, by their ``ratio``, in the width of its column."""
+    return f"{100.0 * (ratio - 1.0):+11.4f}%" if abs(ratio - 1.0) <= MEANS else f"{f'{ratio:.3g} times':>12}"
 
 
 def in_words(certificate: dict) -> list[str]:

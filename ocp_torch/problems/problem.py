@@ -158,6 +158,12 @@ class Problem(Reproducible, Placed, Played):
         return 0 if type(self).__module__.startswith("ocp_torch.") else SCAN_FACTOR
 
     @property
+    def concurrent(self) -> bool:
+        """Whether two threads may call the functions at once, as pure functions of the state in PyTorch: true of the
+        package's own problems; a subclass that knows it of its own may say so, and certificates take less time."""
+        return type(self).__module__.startswith("ocp_torch.")
+
+    @property
     def driftless(self) -> bool:
         """Whether `a = 0`: true exactly when `drift` is not overridden, unless a subclass knows better."""
         return type(self).drift is Problem.drift

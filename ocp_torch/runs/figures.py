@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ocp_torch.certificate.bound import LOWER, UPPER
 from ocp_torch.certificate.lower.shifted import slack_function
 from ocp_torch.certificate.settings import LONGEST_NAME
 from ocp_torch.certificate.trained import in_float64
@@ -37,19 +38,21 @@ Function = Callable[[Tensor], Any]
 
 
 def interval_figure(certificate: dict) -> Figure:
-    """The certificate (as a dict of its schema) on a line: bounds, `OPT` where known and performances, with their intervals.
+    """The certificate (as a dict of its schema) on a line: bounds that count, `OPT` where known, and performances, with
+    their intervals.
 
     What is much farther from the tightest of them than they are from one another is cut off, with an arrow and its value.
     """
-    rows = [(f"{n} ≤ OPT", e, "C0") for n, e in certificate["lower"].items() if e]
+    counting = lambda side: [(n, e) for n, e in certificate[side].items() if e and e.get("counts", True)]
+    rows = [(f"{n} ≤ OPT", e, "C0") for n, e in counting(LOWER)]
     rows += [(f"Perf, {n}", e, "C2") for n, e in certificate["perf"].items() if e]
     rows += [(f"{n} ≤ Perf", e, "C4") for n, e in certificate.get("perf_lower", {}).items() if e]
-    rows += [(f"≤ {n}", e, "C3") for n, e in certificate["upper"].items() if e]
+    rows += [(f"≤ {n}", e, "C3") for n, e in counting(UPPER)]
     rows += [("doing nothing", e, "C7") for e in certificate["baseline"].values() if e]
     figure = blank_figure(7.0, 1.2 + 0.32 * max(len(rows), 1))
     axis = figure.subplots()
-    lows, highs = ([e["value"] for e in certificate[side].values() if e] for side in ("lower", "perf"))
-    highs = highs or [e["value"] for e in certificate["upper"].values() if e]
+    lows, highs = ([e["value"] for _, e in counting(side)] for side in (LOWER, "perf"))
+    highs = highs or [e["value"] for _, e in counting(UPPER)]
     ends = ([max(lows)] if lows else []) + ([min(highs)] if highs else [])
     ends += [certificate["exact"]] if certificate["exact"] is not None else []
     ends += [end for name, e, _ in rows if name.startswith("Perf") for end in e["interval"]]
@@ -77,13 +80,20 @@ def interval_figure(certificate: dict) -> Figure:
     return figure
 
 
-def draw(problem: Problem, fields: Fields, constants: Constants, occupation: str | None) -> dict[str, Figure]:
-    """A figure per quantity; in three and more dimensions a cut along the first two coordinates through 1/2, or in
-    physical units through the middle of the others."""
+def draw(
+    problem: Problem,
+    fields: Fields,
+    constants: Constants,
+    occupation: str | None,
+    kind: str | None = None,
+    fitted: Function | None = None,
+) -> dict[str, Figure]:
+    """A figure for each of the `quantities`; in three and more dimensions a cut along the first two coordinates through 1/2,
+    or in physical units through the middle of the others."""
     frame = frame_of(problem)
     x = frame.line(LINE_POINTS) if problem.dim == 1 else frame.map(MAP_POINTS)
     figures = {}
-    for name, functions in quantities(problem, fields, constants, occupation).items():
+    for name, functions in quantities(problem, fields, constants, occupation, kind, fitted).items():
         values = {label: _columns(function, x) for label, function in functions.items()}
         unit = frame.control if name.startswith("control") else ""
         title = f"{TITLES[name]}, {unit}" if unit else TITLES[name]
@@ -92,8 +102,16 @@ def draw(problem: Problem, fields: Fields, constants: Constants, occupation: str
     return figures
 
 
-def quantities(problem: Problem, fields: Fields, constants: Constants, occupation: str | None) -> dict[str, dict]:
-    """Name -> the learned, the exact and the simulated function, or `None`, for what the fields give."""
+def quantities(
+    problem: Problem,
+    fields: Fields,
+    constants: Constants,
+    occupation: str | None,
+    kind: str | None = None,
+    fitted: Function | None = None,
+) -> dict[str, dict]:
+    """Name -> the learned, the exact and the simulated function, or `None`, for what the fields give. The density simulated
+    is that of the controller ``kind`` (by default the first), and so is the one learned where that was ``fitted`` to it."""
     fields = in_float64(fields)
     policies = trained_policies(occupation, problem, fields, constants)
     drawn: dict[str, dict] = {}
@@ -105,11 +123,11 @@ def quantities(problem: Problem, fields: Fields, constants: Constants, occupatio
         if kind != "value" or problem.knows_control_matrix:
             functions = {"learned": policy, "exact": problem.exact_control}
             drawn[f"control_{kind}"] = {label: in_units(problem, control) for label, control in functions.items()}
-    learned, simulated = None, None
-    if occupation is not None and (problem.has_simulator or occupation == NETWORK):
+    learned, simulated = fitted, None
+    if fitted is None and occupation is not None and (problem.has_simulator or occupation == NETWORK):
         learned = occupation_density(occupation, problem, fields, constants)
     if problem.dim in BINS and problem.has_simulator:
-        simulated = simulated_occupation(problem, next(iter(policies.values())))
+        simulated = simulated_occupation(problem, policies.get(kind or "") or next(iter(policies.values())))
     if learned is not None or simulated is not None:
         drawn["occupation"] = {"learned": learned, "exact": problem.exact_occupation, "simulated": simulated}
     return drawn

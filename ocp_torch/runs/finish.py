@@ -104,7 +104,8 @@ def hand_out(
         monitor.stages("figures")
         drawn = {"certificate": interval_figure(certificate.to_dict())}
         with unless_it_failed(failure, trainer):
-            drawn |= draw(trainer.problem, fields, trainer.constants, trainer.objective.occupation)
+            how = trainer.constants, trainer.objective.occupation
+            drawn |= draw(trainer.problem, fields, *how, kind, certificate.occupation)
             moved = motion(trainer.problem, policy_of(controller), trainer.seed)
             drawn |= {} if moved is None else {"motion": moved}
         canvas.save(drawn, folder / "figures")

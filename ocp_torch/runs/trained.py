@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ocp_torch.certificate import table
+from ocp_torch.certificate.report import gap_in_words
 from ocp_torch.control.controller import Controller
 from ocp_torch.errors import InputError
 
@@ -35,7 +36,7 @@ class TrainedRun:
 
     def __repr__(self) -> str:
         name, gap = "{problem}/{method}, seed {seed}, step {step}".format(**self.certificate), self.certificate["gap"]
-        shown = ", ".join(f"{k} {100 * gap[k]:.3g} %" for k in ("certified", "simulated") if gap[k] is not None)
+        shown = ", ".join(f"{k}: {gap_in_words(gap[k])}" for k in ("certified", "simulated") if gap[k] is not None)
         return f"<TrainedRun {name}; gap {shown or 'unknown'}; {self.folder or 'in no folder'}>"
 
 

@@ -3,21 +3,25 @@
 import copy
 import math
 from dataclasses import replace
+from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ocp_torch.certificate import Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lower.mollified import DIRECTIONS, EVALUATIONS, Mollified
 from ocp_torch.certificate.lower.sampled import SampledValue, to_gain
 from ocp_torch.certificate.lower.shifted import TOP, SlackParts, climbed, scaled_by, slack_function
 from ocp_torch.certificate.lower.tightened import tightened
 from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.fields import PeriodicMLP
+from ocp_torch.fields import Fields, PeriodicMLP
+from ocp_torch.maths.ahead import Ahead
 from ocp_torch.maths.jets import jet
-from ocp_torch.problems import Circle
+from ocp_torch.problems import Circle, Simulator
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
@@ -267,3 +271,35 @@ def test_rounds_go_on_while_there_is_something_to_gain(monkeypatch):
     assert found.best.value is good
     assert asked == [worse, good]
     assert abs(to_gain(found.best)) < 1e-3
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", ["kuramoto n=3", "noisy 1-d"])
+def test_a_second_core_gives_the_same_certificate(name, monkeypatch):
+    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.STEPS", 10)
+    monkeypatch.setattr("ocp_torch.certificate.lower.sampled.WORTH", 0.0)
+    problem, threads = zoo.build(name), []
+    torch.manual_seed(0)
+    fields = Fields({"value": PeriodicMLP(problem.dim, width=8, depth=2, modes=1)})
+    trained = Trained(fields, None, partial(PeriodicMLP, width=8, depth=2, modes=1))
+    small = dict(points=256, replicates=2, trajectories=4, ascents=2, occupation_states=0, mollify=True, tolerance=0.1)
+    settings_ = CertificateSettings(**small, stage=StageSettings(steps=20, rounds=1))
+
+    def said(cores: int) -> dict:
+        monkeypatch.setattr("ocp_torch.maths.ahead.cores", lambda: cores)
+        constants = resolve_constants(problem)
+        return certify_fields(problem, trained, constants, settings_, Run("any", "dual")).to_dict()
+
+    begun = Ahead.begin
+    monkeypatch.setattr(Ahead, "begin", lambda work: (begun(work), threads.append(work._thread))[0])
+    assert said(1) == said(2)
+    assert [thread is None for thread in threads] == [True, False]
+
+
+def test_a_strangers_functions_are_not_called_from_two_threads():
+    class Own(Circle):
+        pass
+
+    assert Circle().concurrent
+    assert not Own().concurrent
+    assert not Simulator(lambda x: (0.0, None, np.eye(1)), dim=1).concurrent

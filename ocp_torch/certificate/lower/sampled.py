@@ -1,5 +1,7 @@
 """`V` at sampled states: what the lower bounds of one `V` share."""
 
+import contextlib
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,6 +12,7 @@ from ocp_torch.certificate.lower.levels import best_level
 from ocp_torch.certificate.lower.mollified import mollified_shift
 from ocp_torch.certificate.lower.shifted import Shift, SlackParts
 from ocp_torch.certificate.lower.tightened import PHASE, tightened
+from ocp_torch.maths.ahead import Ahead
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
@@ -50,15 +53,37 @@ class SampledValue:
         """`E[V mu0]`, per set."""
         return self.own.initial
 
-    @cached_property
+    @property
     def best(self) -> Shift:
         """That of `V` itself, or of a function made of it where it is higher."""
+        return self._best.answer()
+
+    @contextlib.contextmanager
+    def ahead(self) -> Iterator[None]:
+        """Within it a second core looks for the `best`, if there is one and the problem can be asked from two threads."""
+        _ = self.initial  # which is asked for at once
+        if self.search and self.problem.concurrent:
+            self._best.begin()
+        try:
+            yield
+        finally:
+            self._best.stop()
+
+    @cached_property
+    def _best(self) -> Ahead[Shift]:
+        return Ahead(self._found())
+
+    def _found(self) -> Generator[None, None, Shift]:
         if not self.search:
             return self.own
         best, batch = self.own, len(self.sets[0])  # a small certificate is a quick one
-        rounds = tightened(self.problem, self.value, self.seed, batch)
-        while to_gain(best) > WORTH * abs(best.bound) and (W := next(rounds, None)) is not None:
-            best = max(best, replace(self.own, value=W, name="V tightened"), key=lambda shift: shift.bound)
+        worth = lambda: to_gain(best) > WORTH * abs(best.bound)
+        for W in tightened(self.problem, self.value, self.seed, batch) if worth() else ():
+            yield
+            if W is not None:
+                best = max(best, replace(self.own, value=W, name="V tightened"), key=lambda shift: shift.bound)
+                if not worth():
+                    break
         return best if self.problem.noisy else mollified_shift(best)
 
 

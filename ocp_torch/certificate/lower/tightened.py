@@ -32,9 +32,9 @@ PHASE = Phase(Constants(M=100.0, C_V=1.0, C_u=1.0, sources={}))
 BATCH, ROUNDS, STEPS, RATE = 2048, 3, 300, 5e-4
 
 
-def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> Iterator[Field]:
-    """`W` for ``value`` `V` in float64, after each round of training in float32 on up to ``batch`` states a step; none where
-    `V` has no weights, none more where these do not stay finite."""
+def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> Iterator[Field | None]:
+    """`W` for ``value`` `V` in float64, after each round of training in float32 on up to ``batch`` states a step, and `None`
+    after each step; nothing where `V` has no weights, nothing more where these do not stay finite."""
     if not isinstance(value, nn.Module) or not any(True for _ in value.parameters()):
         return
     objective, unit = LevelledDual(problem), cost_unit(problem)
@@ -44,9 +44,10 @@ def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> 
     for k in range(ROUNDS):
         stepper, average = short_fit(fields, objective, RATE, STEPS * 2**k, unit)
         try:
-            with torch.enable_grad():
-                for _ in range(STEPS * 2**k):
+            for _ in range(STEPS * 2**k):
+                with torch.enable_grad():
                     advance(stepper, average, draw, PHASE)
+                yield None
         except NonFiniteError:
             return
         fields.load_state_dict(average.module.state_dict())

@@ -56,6 +56,7 @@ class ClosedLoopBounds:
     hidden: Hidden | None  # a divergence that the residual does not see: only the sandwich stands then
     contributions: list[list[Tensor]]  # of `lagrangian` and `J`, parts of each
     sup_occupation: float  # the largest `mu` met
+    occupation: Field  # `mu` itself
 
 
 def closed_loop_bounds(
@@ -103,7 +104,9 @@ def closed_loop_bounds(
     contributions = [[v / (abs(estimate.value) or 1.0) for v in weighted] for estimate, weighted in pairs]
     lagrangian = replace(lagrangian, controller=controller)
     densest = climbed_from(occupation, mu, states, ascents).value
-    return ClosedLoopBounds(lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions, densest)
+    return ClosedLoopBounds(
+        lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions, densest, occupation
+    )
 
 
 class Lagrangian(Bound):

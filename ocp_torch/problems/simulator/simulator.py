@@ -57,6 +57,11 @@ class Simulator(Problem):
         return 0 if self._oracle.one_by_one or self.workers > 1 else SCAN_FACTOR
 
     @property
+    def concurrent(self) -> bool:
+        """A stranger's function may keep a state of its own."""
+        return False
+
+    @property
     def driftless(self) -> bool:
         return self._oracle.driftless
 

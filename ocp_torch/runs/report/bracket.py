@@ -12,12 +12,14 @@ ROW = 42
 
 def bracket(certificate: dict) -> str:
     """Bounds, `OPT` where known, and performances on a line, and the band between the best two that count; what is much
-    farther away is an arrow at the edge. Filled dots count, open ones do not."""
+    farther away is an arrow at the edge. Filled dots count; open ones would if a
+    guess were right, and what is not used is left out."""
     gap, exact = certificate["gap"], certificate["exact"]
     rows = [
         (label(side, n), e, k)
         for side, k in (("lower", 0), ("perf", 2), ("upper", 1))
         for n, e in _known(certificate, side)
+        if e.get("counts", True) or "if" in e
     ]
     rows += [("doing nothing", e, 5) for _, e in _known(certificate, "baseline")]
     if not rows:

@@ -2,8 +2,8 @@
 
 import math
 
-from ocp_torch.certificate.report import in_words, taking
-from ocp_torch.runs.report.words import MEANS, NEEDS, number, percent, sentence
+from ocp_torch.certificate.report import MEANS, in_words, taking
+from ocp_torch.runs.report.words import NEEDS, number, percent, sentence
 
 
 def certified(certificate: dict) -> bool:

@@ -4,13 +4,12 @@ import math
 
 from ocp_torch.certificate import bounds
 from ocp_torch.certificate.bound import LOWER, UPPER
+from ocp_torch.certificate.report import MEANS
 from ocp_torch.errors import visible
 from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED
 
 # A certified gap up to this, or up to so many times the simulated one, says enough of the controller.
 NARROW, FAR = 0.01, 2.0
-# A gap above this means nothing as a percentage.
-MEANS = 1.0
 PERFORMANCES = {
     "value": "controller from V",
     "density": "controller w / mu",
