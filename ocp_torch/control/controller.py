@@ -16,6 +16,7 @@ from ocp_torch.errors import InputError, notes
 from ocp_torch.export import export
 from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, MODELS, TRAJECTORY_VALUE, VALUE, Fields
 from ocp_torch.files.limits import require_held, require_modest_problem
+from ocp_torch.files.reading import FILE, FOLDER, kind
 from ocp_torch.files.storage import load_tensors, save_tensors
 from ocp_torch.problems import PROBLEMS, Problem
 from ocp_torch.problems.checks.check import check_once
@@ -23,8 +24,8 @@ from ocp_torch.problems.commands import ForeignProblem, current_name, current_se
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.physical.system import System
 
-# Of `controller.safetensors`; raised when an older version could not read what is written.
-SCHEMA = 1
+# What a run calls the file of its controller, and its schema, raised when an older version could not read what is written.
+FILE_NAME, SCHEMA = "controller.safetensors", 1
 # What the file holds of a controller just as it is.
 PLAIN = ("model", "occupation", "kind", "certificate", "config")
 FIELDS = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION, TRAJECTORY_VALUE)
@@ -111,14 +112,23 @@ class Controller:
         return export(function, example_states(problem, place), Path(out), format, about(problem, place), inside)
 
 
+def controller_file(path: Path) -> Path:
+    """The file of the controller that ``path`` names: itself, that of a run's folder, or of the newest run in a folder."""
+    if kind(path) != FOLDER or kind(path / FILE_NAME) is not None:
+        return path / FILE_NAME if kind(path) == FOLDER else path
+    inside = [file for file in path.glob(f"*/{FILE_NAME}") if kind(file) == FILE]
+    return max(inside, key=lambda file: file.stat().st_mtime, default=path / FILE_NAME)
+
+
 def load_controller(path: str | Path, problem: Problem | None = None, device: str = "cpu") -> Controller:
-    """Load a controller saved by a run; no code in the file is run.
+    """Load a controller saved by a run, by its file, its run's folder, or a folder of runs, of which it is the newest; no
+    code in the file is run.
 
     A controller of one of the package's problems rebuilds it from its parameters; one of a user's own problem needs that
     ``problem``, made with the same arguments. Raises `InputError` when the file is missing, damaged, of a newer schema, or
     does not fit the problem.
     """
-    path = Path(path)
+    path = controller_file(Path(path))
     tensors, metadata = load_tensors(path)
     schema = metadata.get("schema")
     if not isinstance(schema, int) or schema > SCHEMA:

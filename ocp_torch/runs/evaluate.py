@@ -10,7 +10,7 @@ from ocp_torch.certificate.settings import require_possible
 from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.errors import InputError, require_integer, require_section
 from ocp_torch.files.limits import require_modest_run
-from ocp_torch.files.reading import FOLDER, kind
+from ocp_torch.files.reading import kind
 from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem, use_threads
 from ocp_torch.runs.loading import policy_of
 from ocp_torch.runs.metrics.trial import write_metrics
@@ -43,16 +43,13 @@ def recertification(config: dict) -> Callable[[], Certificate]:
 
 
 def load_run(config: dict) -> Controller:
-    """The controller of ``config["run"]``, a run's folder or a file; a user's own problem comes from ``config["problem"]``,
-    that is from the command line, never from the file."""
+    """The controller of ``config["run"]``, a run's folder, one that holds runs, or a file. A user's own problem comes from
+    ``config["problem"]``, that is from the command line, never from the file."""
     path = Path(str(config["run"]))
-    found = kind(path)
-    if found is None:
+    if kind(path) is None:
         raise InputError(
-            f"run is {str(path)!r}, which does not exist; give a run's folder or its controller.safetensors."
+            f"run is {str(path)!r}, which does not exist; give a run's folder, one of runs, or a controller.safetensors."
         )
-    if found == FOLDER:
-        path = path / "controller.safetensors"
     problem = build_problem(config["problem"]) if config["problem"] else None
     return load_controller(path, problem=problem)
 

@@ -1,6 +1,7 @@
 """Figures of a run: its certificate on a line; `V`, `u`, `mu` and the HJB slack as curves, or as maps of two coordinates."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -80,57 +81,57 @@ def interval_figure(certificate: dict) -> Figure:
     return figure
 
 
-def draw(
-    problem: Problem,
-    fields: Fields,
-    constants: Constants,
-    occupation: str | None,
-    kind: str | None = None,
-    fitted: Function | None = None,
-) -> dict[str, Figure]:
-    """A figure for each of the `quantities`; in three and more dimensions a cut along the first two coordinates through 1/2,
-    or in physical units through the middle of the others."""
-    frame = frame_of(problem)
-    x = frame.line(LINE_POINTS) if problem.dim == 1 else frame.map(MAP_POINTS)
-    figures = {}
-    for name, functions in quantities(problem, fields, constants, occupation, kind, fitted).items():
-        values = {label: _columns(function, x) for label, function in functions.items()}
-        unit = frame.control if name.startswith("control") else ""
-        title = f"{TITLES[name]}, {unit}" if unit else TITLES[name]
-        known = {label: v for label, v in values.items() if v is not None}
-        figures[name] = (_curve if problem.dim == 1 else _map)(title, x, known, frame)
-    return figures
+@dataclass(frozen=True)
+class Shown:
+    """What is drawn of trained ``fields``, whose `mu` follows by ``occupation`` (see `trained_policies`).
 
+    The density that is simulated is that of the controller ``kind``, by default the first, and so is the one drawn where it
+    was ``fitted`` to it. One that is ``quick`` leaves out the slack and the simulation.
+    """
 
-def quantities(
-    problem: Problem,
-    fields: Fields,
-    constants: Constants,
-    occupation: str | None,
-    kind: str | None = None,
-    fitted: Function | None = None,
-) -> dict[str, dict]:
-    """Name -> the learned, the exact and the simulated function, or `None`, for what the fields give. The density simulated
-    is that of the controller ``kind`` (by default the first), and so is the one learned where that was ``fitted`` to it."""
-    fields = in_float64(fields)
-    policies = trained_policies(occupation, problem, fields, constants)
-    drawn: dict[str, dict] = {}
-    if fields.value is not None:
-        drawn["value"] = {"learned": fields.value, "exact": problem.exact_value}
-        if problem.has_simulator:
-            drawn["slack"] = {"learned": slack_function(problem, fields.value)}
-    for kind, policy in policies.items():
-        if kind != "value" or problem.knows_control_matrix:
-            functions = {"learned": policy, "exact": problem.exact_control}
-            drawn[f"control_{kind}"] = {label: in_units(problem, control) for label, control in functions.items()}
-    learned, simulated = fitted, None
-    if fitted is None and occupation is not None and (problem.has_simulator or occupation == NETWORK):
-        learned = occupation_density(occupation, problem, fields, constants)
-    if problem.dim in BINS and problem.has_simulator:
-        simulated = simulated_occupation(problem, policies.get(kind or "") or next(iter(policies.values())))
-    if learned is not None or simulated is not None:
-        drawn["occupation"] = {"learned": learned, "exact": problem.exact_occupation, "simulated": simulated}
-    return drawn
+    problem: Problem
+    fields: Fields
+    constants: Constants
+    occupation: str | None
+    kind: str | None = None
+    fitted: Function | None = None
+    quick: bool = False
+
+    def figures(self) -> dict[str, Figure]:
+        """A figure for each quantity; in three and more dimensions a cut along the first two coordinates through 1/2, or in
+        physical units through the middle of the others."""
+        dim, frame = self.problem.dim, frame_of(self.problem)
+        x = frame.line(LINE_POINTS) if dim == 1 else frame.map(MAP_POINTS)
+        figures = {}
+        for name, functions in self.quantities().items():
+            values = {label: _columns(function, x) for label, function in functions.items()}
+            unit = frame.control if name.startswith("control") else ""
+            title = f"{TITLES[name]}, {unit}" if unit else TITLES[name]
+            known = {label: v for label, v in values.items() if v is not None}
+            figures[name] = (_curve if dim == 1 else _map)(title, x, known, frame)
+        return figures
+
+    def quantities(self) -> dict[str, dict]:
+        """Name -> the learned, the exact and the simulated function, or `None`."""
+        problem, fields, how = self.problem, in_float64(self.fields), self.occupation
+        policies = trained_policies(how, problem, fields, self.constants)
+        drawn: dict[str, dict] = {}
+        if fields.value is not None:
+            drawn["value"] = {"learned": fields.value, "exact": problem.exact_value}
+            if problem.has_simulator and not self.quick:
+                drawn["slack"] = {"learned": slack_function(problem, fields.value)}
+        for kind, policy in policies.items():
+            if kind != "value" or problem.knows_control_matrix:
+                functions = {"learned": policy, "exact": problem.exact_control}
+                drawn[f"control_{kind}"] = {label: in_units(problem, control) for label, control in functions.items()}
+        learned, simulated = self.fitted, None
+        if learned is None and how is not None and (problem.has_simulator or how == NETWORK):
+            learned = occupation_density(how, problem, fields, self.constants)
+        if problem.dim in BINS and problem.has_simulator and not self.quick:
+            simulated = simulated_occupation(problem, policies.get(self.kind or "") or next(iter(policies.values())))
+        if learned is not None or simulated is not None:
+            drawn["occupation"] = {"learned": learned, "exact": problem.exact_occupation, "simulated": simulated}
+        return drawn
 
 
 @torch.no_grad()

@@ -6,13 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings
-from ocp_torch.control.controller import Controller
+from ocp_torch.control.controller import FILE_NAME, Controller
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.fields import Fields
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.problems.blame import blamed
 from ocp_torch.runs import canvas
-from ocp_torch.runs.figures import draw, interval_figure
+from ocp_torch.runs.canvas import Figure
+from ocp_torch.runs.figures import Shown, interval_figure
 from ocp_torch.runs.loading import policy_of
 from ocp_torch.runs.metrics.measures import has_metrics
 from ocp_torch.runs.metrics.trial import METRICS
@@ -97,7 +98,7 @@ def hand_out(
     named = certificate.controller or certificate.subject
     kind = named or ("value" if fields.value is not None else "density")
     controller = controller_of(trainer, certificate, kind, fields)
-    controller.save(folder / "controller.safetensors")
+    controller.save(folder / FILE_NAME)
     write_atomically(folder / "certificate.json", certificate.save)
     drawn = {}
     if trainer.settings.figures:
@@ -105,12 +106,18 @@ def hand_out(
         drawn = {"certificate": interval_figure(certificate.to_dict())}
         with unless_it_failed(failure, trainer):
             how = trainer.constants, trainer.objective.occupation
-            drawn |= draw(trainer.problem, fields, *how, kind, certificate.occupation)
+            drawn |= Shown(trainer.problem, fields, *how, kind, certificate.occupation).figures()
             moved = motion(trainer.problem, policy_of(controller), trainer.seed)
             drawn |= {} if moved is None else {"motion": moved}
         canvas.save(drawn, folder / "figures")
     monitor.finish(certificate, drawn, _flat(trainer.config), trainer.step)
     return controller
+
+
+def glimpse(trainer: Trainer) -> dict[str, Figure]:
+    """`V`, `u` and `mu` as they are in the middle of training."""
+    how = trainer.constants, trainer.objective.occupation
+    return Shown(trainer.problem, trainer.averaged_fields, *how, quick=True).figures()
 
 
 def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields: Fields) -> Controller:
@@ -145,7 +152,7 @@ def complete(folder: Path) -> None:
 
 def missing(folder: Path, trainer: Trainer, settings: CertificateSettings) -> str | None:
     """What the end of the run in ``folder`` lacks, in words, or `None`."""
-    files = ["certificate.json", "controller.safetensors"]
+    files = ["certificate.json", FILE_NAME]
     if trainer.settings.figures:
         files += ["figures/certificate.png", *(["figures/motion.png"] if scene(trainer.problem) is not None else [])]
         files.append(REPORT)

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from ocp_torch.certificate.trained import in_float64
-from ocp_torch.control.controller import Controller, load_controller, problem_name
+from ocp_torch.control.controller import Controller, controller_file, load_controller, problem_name
 from ocp_torch.control.policies import Policy, trained_policies
 from ocp_torch.errors import InputError, nearest
 from ocp_torch.files.reading import FOLDER, kind, require_file
@@ -50,7 +50,7 @@ def load_policy(source: str, problem: Problem) -> Callable | Controller:
 
 def load_saved(path: Path, problem: Problem) -> Controller:
     """A controller of ours, by its file or its run's folder, for ``problem``, or, of one of the package's, for its class."""
-    file = path / "controller.safetensors" if kind(path) == FOLDER else path
+    file = controller_file(path)
     if problem_name(problem) not in PROBLEMS:
         return load_controller(file, problem=problem)
     found = load_controller(file)

@@ -20,7 +20,16 @@ from ocp_torch.files.storage import sweep_temporaries
 from ocp_torch.problems import Problem
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.runs.configuration import keep_configuration, load_state, starts
-from ocp_torch.runs.finish import complete, failure_of, hand_out, missing, salvaged, unless_it_failed, with_warnings
+from ocp_torch.runs.finish import (
+    complete,
+    failure_of,
+    glimpse,
+    hand_out,
+    missing,
+    salvaged,
+    unless_it_failed,
+    with_warnings,
+)
 from ocp_torch.runs.loading import policy_of
 from ocp_torch.runs.metrics.trial import write_metrics
 from ocp_torch.runs.report.report import REPORT, write_report
@@ -147,6 +156,8 @@ def ending(
     log.info(summary(trainer))
     try:
         with Signals(exits) as signals, watch(folder, trainer) as monitor:
+            if trainer.settings.figures:
+                monitor.pictures = glimpse
             trainer.tell, failure = lambda stage: monitor.stages(f"certifying: {stage}"), None
             try:
                 certificate, fields = _trained(trainer, settings, monitor, last, signals)

@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,8 @@ class Monitor(Silent):
         self.bar = tqdm(total=max(trainer.end, step), initial=step, unit="step", dynamic_ncols=True, disable=hidden)
         self.stages = Stages(hidden)
         self._folder = folder
+        # What is drawn at a look, by name; whoever has a room for figures says how.
+        self.pictures: Callable[[Trainer], dict[str, Any]] = lambda _: {}
         self._shown: dict[str, str] = {}
         self._mark = (time.perf_counter(), trainer.samples)
 
@@ -122,6 +125,8 @@ class Monitor(Silent):
 
     def evaluated(self, trainer: Trainer, certificate: Certificate) -> None:
         record(self.writer, certificate, trainer.step)
+        for name, figure in self.pictures(trainer).items():
+            self.writer.add_figure(f"fields/{name}", figure, trainer.step, close=False)
         shown = certificate.lower | certificate.upper
         values = {name: f"{e.value:.6f}" for name in ("F_M", "J") if (e := shown.get(name)) is not None}
         gaps = [gap for kind in ("certified", "simulated") if (gap := certificate.gap[kind]) is not None]

@@ -204,3 +204,24 @@ def test_a_certificate_of_the_first_schema_is_still_shown():
     shown = [line.split("  ")[0] for line in table(old).splitlines()[4:]]
     assert shown[:4] == ["lower: F_M", "Perf: controller from V", "upper: Lagrangian", "upper: J"]
     assert shown[5:] == ["gap, certified: 2.0000%", "gap, simulated: 1.0000%", "warning: C_V is not known."]
+
+
+def test_what_means_nothing_as_a_percentage_is_said_otherwise_and_a_warning_once():
+    said = certificate().to_dict()
+    said |= {
+        "gap": {**said["gap"], "certified": 2.11, "simulated": 0.5},
+        "share": {"certified": -4.74, "simulated": 0.9},
+        "exact": 0.1,
+        "warnings": ["twice.", "once.", "twice."],
+        "suboptimality": {"at_least": None, "at_most": 0.5, "takes": []},
+    }
+    lines = table(said).splitlines()
+    assert lines[1].startswith("the controller is at most 50 % worse than the optimum")
+    assert "gap, certified: the upper side is 3.11 times the lower one" in lines
+    assert "gap, simulated: 50.0000%, 90.00% of the gain over doing nothing" in lines
+    assert [line for line in lines if "warning" in line] == ["warning: twice.", "warning: once."]
+    assert not any("-474" in line or "211" in line for line in lines)
+    said["exact"] = 1e-4  # everything is far above it
+    far = [line for line in table(said).splitlines() if line.startswith(("lower", "upper", "Perf"))]
+    assert far
+    assert all(line.endswith(" times") for line in far)

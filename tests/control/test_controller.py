@@ -52,6 +52,19 @@ def test_a_loaded_controller_is_the_saved_one_to_the_bit(method, dtype, tmp_path
         assert loaded.config == controller.config
 
 
+def test_a_folder_stands_for_its_controller_or_for_that_of_the_newest_run_in_it(saved, tmp_path):
+    runs = [tmp_path / "runs" / name for name in ("a", "b", "c")]
+    for age, (run, method) in enumerate(zip(runs[:2], ("primal closed", "dual"), strict=True)):
+        run.mkdir(parents=True)
+        controllers(method)[0].save(run / "controller.safetensors")
+        os.utime(run / "controller.safetensors", (1e9 - age, 1e9 - age))  # a is the newest
+    runs[2].mkdir()  # a run that has not ended
+    assert load_controller(runs[1]).kind == "value"
+    assert load_controller(tmp_path / "runs").kind == load_controller(runs[0]).kind == "density"
+    with pytest.raises(InputError, match=r"controller\.safetensors"):
+        load_controller(runs[2])
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_any_real_state_is_wrapped_to_the_torus(method):
     for controller in controllers(method):

@@ -31,7 +31,7 @@ from ocp_torch.runs import record as recording_command
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.evaluate import certify_saved, load_run
 from ocp_torch.runs.external import certify as certify_given
-from ocp_torch.runs.figures import draw
+from ocp_torch.runs.figures import Shown
 from ocp_torch.runs.frame import frame_of, in_units
 from ocp_torch.training.checkpoint import load_checkpoint
 from ocp_torch.training.monitor import Silent
@@ -102,7 +102,7 @@ def test_a_strangers_names_are_no_formulas_in_a_figure(tmp_path):
     np.savez(path, **arrays_of(path), units=np.frombuffer(json.dumps(units).encode(), np.uint8))
     fields = Fields({"value": PeriodicMLP(dim=1, width=8, depth=2, modes=2)})
     data = Dataset(str(path))
-    for figure in draw(data, fields, resolve_constants(data, occupation_bound=2.0), None).values():
+    for figure in Shown(data, fields, resolve_constants(data, occupation_bound=2.0), None).figures().values():
         figure.canvas.draw()
         assert figure.axes[0].get_xlabel() == "$\\frac{ [rad]"
 

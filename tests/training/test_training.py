@@ -245,6 +245,15 @@ def test_tensorboard_shows_every_group_of_scalars_and_the_exact_optimum(run):
         assert [event.step for event in events.Scalars("loss/value")] == [5, 10, 15, 20]
 
 
+def test_tensorboard_shows_the_fields_at_each_look_and_at_the_end(tmp_path):
+    session(small("method=dual", "trainer.evaluate_every=8", "trainer.figures=true"), tmp_path)
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    steps = {tag: [event.step for event in events.Images(tag)] for tag in events.Tags()["images"]}
+    assert steps["fields/value"] == steps["fields/control_value"] == [8, 16, 20]
+    assert steps["fields/slack"] == [20]
+
+
 def test_a_run_that_diverges_says_so_and_never_saves_what_is_not_finite(tmp_path):
     trainer = small("method=dual", "optimizer=sgd", "optimizer.lr=1e6", "trainer.checkpoint_every=1")
     with pytest.raises(InputError, match="Training stopped at step .* the loss of player 'value'") as stopped:
