@@ -7,6 +7,7 @@ from ocp_torch.certificate import table
 from ocp_torch.certificate.report import gap_in_words
 from ocp_torch.control.controller import Controller
 from ocp_torch.errors import InputError
+from ocp_torch.runs.report.report import write_report
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,12 @@ class TrainedRun:
     history: History = field(default_factory=History)
     metrics: dict | None = None
     folder: Path | None = None
+
+    def report(self) -> Path:
+        """Write the run's `report.html` anew; its path. Raises `InputError` where the run is in no folder."""
+        if self.folder is None:
+            raise InputError("this run is in no folder, and a report is made of its files; train it with folder=...")
+        return write_report(self.folder, self.controller.problem, self.controller.config)
 
     def __str__(self) -> str:
         return table(self.certificate)

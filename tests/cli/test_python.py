@@ -6,6 +6,7 @@ import random
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -185,6 +186,15 @@ def test_a_problem_of_ones_own_is_trained_as_it_is_and_its_controller_is_loaded_
     x = torch.rand(9, 1)
     assert torch.equal(loaded(x), run.controller(x))
     assert train(Hill(0.3), resume=tmp_path / "run").certificate == run.certificate
+
+
+def test_a_report_is_written_anew_where_the_run_is_in_a_folder(here):
+    written = here.report()
+    assert written == here.folder / "report.html"
+    assert "<h1>circle</h1>" in written.read_text(encoding="utf-8")
+    with pytest.raises(InputError, match="folder=") as refused:
+        replace(here, folder=None).report()
+    assert "\n" not in str(refused.value)
 
 
 def test_a_run_that_fails_under_way_still_gives_what_it_has():
