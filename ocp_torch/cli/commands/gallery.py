@@ -48,9 +48,9 @@ def planned(data: dict) -> list[Planned]:
     if not isinstance(names, list) or not names or len({*map(str, names)}) < len(names):
         raise InputError(f"systems is {shown(names)}, but must be a list of different names, as in [circle,pendulum].")
     for name in names:
-        require_choice("systems", name, known)
+        require_choice("a name in systems", name, known)
     own = require_section("overrides", data["overrides"])
-    given = {require_choice("overrides", name, known): fields(f"overrides.{name}", own[name]) for name in own}
+    given = {require_choice("a name in overrides", name, known): fields(f"overrides.{name}", own[name]) for name in own}
     common = {name: value for name, value in fields("common", data["common"]).items() if value is not None}
     require_writable(folder, "folder")
     seconds_in(folder)

@@ -73,17 +73,16 @@ def _row(exhibit: Exhibit, seconds: dict[str, float]) -> list[str]:
 
 
 def _card(exhibit: Exhibit, seconds: float | None, place: Path) -> str:
-    parts = [f'<div id="{text(exhibit.name)}"></div>', described(exhibit.problem, {})[0]]
+    parts = [described(exhibit.problem, {})[0]]
     if exhibit.failed:
         parts.append(paragraph(text(sentence(f"it failed: {exhibit.failed}")), "lead alert"))
     if seconds is None:
         parts.append(paragraph("It has not been trained yet."))
     elif kind(exhibit.folder / "certificate.json") is not None:
-        parts += [said(exhibit.folder), picture(exhibit.folder)]
-    if seconds is not None:
-        parts.append(paragraph(f"{seconds:,.0f} s for training, certificate and figures. To train it alone:"))
-    parts += [code(exhibit.command), linked(exhibit.folder, place)]
-    return section(exhibit.name, *parts)
+        parts += [picture(exhibit.folder), said(exhibit.folder)]
+    spent = "To" if seconds is None else f"{seconds:,.0f} s for training, certificate and figures. To"
+    parts += [paragraph(f"{spent} train it alone:"), code(exhibit.command), linked(exhibit.folder, place)]
+    return f'<div id="{text(exhibit.name)}"></div>{section(exhibit.name, *parts)}'
 
 
 def picture(folder: Path) -> str:
