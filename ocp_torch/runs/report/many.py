@@ -50,14 +50,24 @@ def _parts(comparison: Comparison, place: Path) -> list[str]:
 
 def _one(row: dict, folder: Path, place: Path) -> str:
     """What a run says, folded; with a link to its report where there is one."""
-    try:
-        certificate = read_json(folder / "certificate.json", LARGEST_CERTIFICATE)
-        said = paragraph(text(lead(certificate))) + bracket(certificate)
-    except DAMAGE as error:
-        said = paragraph(text(f"It cannot be shown: {reason(error)}."))
-    if kind(folder / REPORT) == FILE:
-        link = quote(os.path.relpath((folder / REPORT).absolute(), place))
-        said += paragraph(f'<a href="{text(link)}">its report</a>')
+    told = said(folder) + linked(folder, place)
     gap = next((row[name] for name in ("gap_certified", "gap_simulated") if row[name] is not None), None)
     head = f"{row['run']}: {row['problem']}, {row['method']}, {'no gap' if gap is None else percent(gap)}"
-    return f"<details><summary>{text(head)}</summary>{said}</details>"
+    return f"<details><summary>{text(head)}</summary>{told}</details>"
+
+
+def said(folder: Path) -> str:
+    """How far from optimal the run in ``folder`` is, and its bracket; or why that cannot be shown."""
+    try:
+        certificate = read_json(folder / "certificate.json", LARGEST_CERTIFICATE)
+        return paragraph(text(lead(certificate))) + bracket(certificate)
+    except DAMAGE as error:
+        return paragraph(text(f"It cannot be shown: {reason(error)}."))
+
+
+def linked(folder: Path, place: Path) -> str:
+    """A link from a page in the folder ``place`` to the report of the run in ``folder``, where there is one."""
+    if kind(folder / REPORT) != FILE:
+        return ""
+    link = quote(os.path.relpath((folder / REPORT).absolute(), place))
+    return paragraph(f'<a href="{text(link)}">its report</a>')
