@@ -32,7 +32,7 @@ def first(certificate: dict) -> str:
 
 def closed(certificate: dict) -> list[str]:
     """The bracket, and which number of it to trust."""
-    note = "Filled dots count, open ones rest on a guess or are not used; the band, simulation included, is where OPT lies."
+    note = "Filled dots count, open ones would if a guess were right; the band, simulation included, is where OPT lies."
     drawn = [paragraph(BRACKET, "formula"), bracket(certificate), paragraph(note, "soft")]
     trusted = (paragraph(prose(said)) for said in words.trust(certificate))
     return [section("The bracket", *drawn), section("Which number to trust", *trusted)]
