@@ -10,6 +10,7 @@ from ocp_torch.control.controller import FILE_NAME, Controller
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.fields import Fields
 from ocp_torch.files.storage import write_atomically
+from ocp_torch.maths.seeds import generators_kept
 from ocp_torch.problems.blame import blamed
 from ocp_torch.runs import canvas
 from ocp_torch.runs.canvas import Figure
@@ -115,9 +116,11 @@ def hand_out(
 
 
 def glimpse(trainer: Trainer) -> dict[str, Figure]:
-    """`V`, `u` and `mu` as they are in the middle of training."""
+    """`V`, `u` and `mu` as they are in the middle of training; a problem that draws random numbers goes on as if nobody had
+    looked."""
     how = trainer.constants, trainer.objective.occupation
-    return Shown(trainer.problem, trainer.averaged_fields, *how, quick=True).figures()
+    with generators_kept():
+        return Shown(trainer.problem, trainer.averaged_fields, *how, quick=True).figures()
 
 
 def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields: Fields) -> Controller:

@@ -10,6 +10,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ocp_torch.control.policies import occupation_density
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
+from ocp_torch.runs.finish import glimpse
 from ocp_torch.runs.run import run_to_end
 from ocp_torch.training.monitor import Monitor, Stages, liouville_residual
 from ocp_torch.training.running import RunningEstimates
@@ -61,14 +62,17 @@ def test_running_estimates_are_those_of_a_certificate(method, noise):
             assert found[bound] == pytest.approx(side[bound].value, rel=off)
 
 
-def test_running_estimates_leave_the_generators_of_a_problem_that_draws_alone(monkeypatch):
+@pytest.mark.parametrize("look", ["running estimates", "figures"])
+def test_what_is_shown_leaves_the_generators_of_a_problem_that_draws_alone(look, monkeypatch):
     trainer = small("problem=circle")
     cost = trainer.problem.state_cost
     noisy = lambda x: cost(x) + 1e-3 * torch.rand(len(x)).to(x) + 1e-3 * random.random() + 1e-3 * np.random.rand()  # noqa: NPY002
     monkeypatch.setattr(trainer.problem, "state_cost", noisy)
     states = lambda: (torch.get_rng_state().tolist(), random.getstate(), str(np.random.get_state()))  # noqa: NPY002
     before = states()
-    assert RunningEstimates(trainer.problem, trainer.trained, 0)(trainer.constants)
+    estimate = lambda: RunningEstimates(trainer.problem, trainer.trained, 0)(trainer.constants)
+    monkeypatch.setattr(trainer.problem, "control_matrix", lambda x: 1.0 + 0.0 * noisy(x)[:, None, None])
+    assert estimate() if look == "running estimates" else glimpse(trainer)
     assert states() == before
 
 
