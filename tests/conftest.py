@@ -32,12 +32,14 @@ def quick_composition():
 
 @pytest.fixture(scope="module")
 def cheap_looks():
-    """For modules whose looks on the way need not say much."""
+    """For modules whose looks on the way need not say much, nor draw."""
+    from ocp_torch.runs import run
     from ocp_torch.training import evaluator
 
     little = replace(evaluator.QUICK, points=64, replicates=2, trajectories=2, ascents=1, tolerance=0.01)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluator, "QUICK", little)
+        patch.setattr(run, "glimpse", lambda _: {})
         yield
 
 

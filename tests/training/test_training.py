@@ -13,6 +13,7 @@ from ocp_torch.certificate import trained
 from ocp_torch.control.controller import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.runs.build import build_certificate_settings
+from ocp_torch.runs.finish import glimpse
 from ocp_torch.training.checkpoint import load_checkpoint
 from ocp_torch.training.monitor import Silent
 from support.bits import differences
@@ -245,7 +246,8 @@ def test_tensorboard_shows_every_group_of_scalars_and_the_exact_optimum(run):
         assert [event.step for event in events.Scalars("loss/value")] == [5, 10, 15, 20]
 
 
-def test_tensorboard_shows_the_fields_at_each_look_and_at_the_end(tmp_path):
+def test_tensorboard_shows_the_fields_at_each_look_and_at_the_end(tmp_path, monkeypatch):
+    monkeypatch.setattr("ocp_torch.runs.run.glimpse", glimpse)
     session(small("method=dual", "trainer.evaluate_every=8", "trainer.figures=true"), tmp_path)
     events = EventAccumulator(str(tmp_path))
     events.Reload()
