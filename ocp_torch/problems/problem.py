@@ -155,13 +155,18 @@ class Problem(Reproducible, Placed, Played):
     def scan_factor(self) -> int:
         """How many states are scanned for narrow features of the data, for each at which a bound is evaluated. The package's
         own problems have none narrower than those states show."""
-        return 0 if type(self).__module__.startswith("ocp_torch.") else SCAN_FACTOR
+        return 0 if self._shipped else SCAN_FACTOR
+
+    @property
+    def _shipped(self) -> bool:
+        """Whether the class is one of the package's own."""
+        return type(self).__module__.startswith("ocp_torch.")
 
     @property
     def concurrent(self) -> bool:
         """Whether two threads may call the functions at once, as pure functions of the state in PyTorch: true of the
         package's own problems; a subclass that knows it of its own may say so, and certificates take less time."""
-        return type(self).__module__.startswith("ocp_torch.")
+        return self._shipped
 
     @property
     def driftless(self) -> bool:

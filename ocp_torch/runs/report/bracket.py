@@ -12,8 +12,8 @@ ROW = 42
 
 def bracket(certificate: dict) -> str:
     """Bounds, `OPT` where known, and performances on a line, and the band between the best two that count; what is much
-    farther away is an arrow at the edge. Filled dots count; open ones would if a
-    guess were right, and what is not used is left out."""
+    farther away is an arrow at the edge. Filled dots count, open ones would if a guess were right; what is not used is left
+    out."""
     gap, exact = certificate["gap"], certificate["exact"]
     rows = [
         (label(side, n), e, k)
