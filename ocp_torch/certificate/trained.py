@@ -95,10 +95,13 @@ class TrainedContext(FieldsContext):
     def candidates(self) -> dict[str, Candidate]:
         sampled, own = self.sampled_value, self.fields.trajectory_value
         initial = None if sampled is None else sampled.initial
-        found = {name: Candidate(policy, self.value, initial) for name, policy in self.policies.items()}
+        single = self.fields.rounded
+        rounded = {name: (policy, single.value) for name, policy in self.policies_of(single).items()}
+        found = {name: Candidate(policy, self.value, initial, rounded[name]) for name, policy in self.policies.items()}
         if sampled is not None and own is not None:  # its controller has a control variate of its own
             initial = replace(sampled, value=own, search=False).initial
-            found[TRAJECTORIES] = Candidate(self.policies[TRAJECTORIES], own, initial)
+            beside = (rounded[TRAJECTORIES][0], single.trajectory_value)
+            found[TRAJECTORIES] = Candidate(self.policies[TRAJECTORIES], own, initial, beside)
         return found
 
     @cached_property

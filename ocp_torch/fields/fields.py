@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ocp_torch.errors import InputError
 from ocp_torch.fields.embedding import FourierEmbedding
+from ocp_torch.fields.rounded import Rounded
 from ocp_torch.fields.waves import STATES, prominent_waves
 from ocp_torch.problems.problem import Problem
 
@@ -67,6 +68,11 @@ class Fields(nn.Module):
     def trajectory_value(self) -> Any:
         """The `V` of the warm start: ``(N, d) -> (N,)``."""
         return self._get(TRAJECTORY_VALUE)
+
+    @property
+    def rounded(self) -> "Fields":
+        """The fields at float64 states, computed in float32."""
+        return Fields({name: Rounded(network) for name, network in self.networks.items()})
 
     def _get(self, name: str) -> nn.Module | None:
         return self.networks[name] if name in self.networks else None

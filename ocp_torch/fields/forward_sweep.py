@@ -9,9 +9,11 @@ fewer; then one reverse pass gives the gradient.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from ocp_torch.fields.embedding import FourierEmbedding
 
@@ -76,7 +78,10 @@ class Sweep:
 
     def activated(self, activation: nn.Module, along: Along) -> "Sweep":
         """Through a smooth function of each entry."""
-        value, first, second = DERIVATIVES[type(activation)](self.value)
+        derivatives = DERIVATIVES[type(activation)]
+        if along.scales is not None:
+            return Sweep(*Activated.apply(self.value, self.slopes, self.curvature, derivatives))
+        value, first, second, _ = derivatives(self.value)
         bent = second * along.form(self.slopes, self.slopes)
         return Sweep(value, first * self.slopes, first * self.curvature + bent)
 
@@ -90,31 +95,65 @@ class Sweep:
         )
 
 
-def _tanh(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+class Activated(torch.autograd.Function):
+    """`Sweep.activated` along columns of the noise, with a reverse of its own: autograd's takes twice as many passes over
+    ``(p, N, F)`` numbers, and a step a quarter longer."""
+
+    @staticmethod
+    def forward(ctx: Any, z: Tensor, slopes: Tensor, curvature: Tensor, derivatives: "Derivatives") -> Any:
+        value, first, second, third = derivatives(z)
+        square = 0.5 * _contracted(slopes, slopes)
+        ctx.save_for_backward(slopes, curvature, square, first, second, third)
+        return value, first * slopes, torch.addcmul(first * curvature, second, square)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, of_value: Tensor, of_slopes: Tensor, of_curvature: Tensor) -> Any:
+        slopes, curvature, square, first, second, third = ctx.saved_tensors
+        of_first = _contracted(of_slopes, slopes).addcmul_(of_curvature, curvature)
+        of_z = (first * of_value).addcmul_(second, of_first).addcmul_(third * square, of_curvature)
+        of_slopes = (first * of_slopes).addcmul_(second * of_curvature, slopes)
+        return of_z, of_slopes, first * of_curvature, None
+
+
+def _contracted(left: Tensor, right: Tensor) -> Tensor:
+    """`sum_i left_i right_i` ``(N, F)`` of ``(p, N, F)``, without an array of the products."""
+    total = left[0] * right[0]
+    for one, other in zip(left[1:], right[1:], strict=True):
+        total.addcmul_(one, other)
+    return total
+
+
+# A smooth function with its first three derivatives, each of the shape of its argument.
+Derivatives = Callable[[Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
+
+
+def _tanh(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     s = torch.tanh(z)
     slope = 1.0 - s * s
-    return s, slope, -2.0 * s * slope
+    return s, slope, -2.0 * s * slope, slope * (4.0 - 6.0 * slope)
 
 
-def _gelu(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _gelu(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     below, square = torch.special.ndtr(z), z * z
     density = torch.exp(-0.5 * square - 0.5 * math.log(2.0 * math.pi))
-    return z * below, below + z * density, (2.0 - square) * density
+    return z * below, below + z * density, (2.0 - square) * density, (square - 4.0) * z * density
 
 
-def _silu(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _silu(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    s = torch.sigmoid(z)
+    slope, tilt = s * (1.0 - s), 1.0 - 2.0 * s
+    return z * s, s + z * slope, slope * (2.0 + z * tilt), slope * (3.0 * tilt + z * (1.0 - 6.0 * slope))
+
+
+def _softplus(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     s = torch.sigmoid(z)
     slope = s * (1.0 - s)
-    return nn.functional.silu(z), s + z * slope, slope * (2.0 + z * (1.0 - 2.0 * s))
+    return nn.functional.softplus(z), s, slope, slope * (1.0 - 2.0 * s)
 
 
-def _softplus(z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    s = torch.sigmoid(z)
-    return nn.functional.softplus(z), s, s * (1.0 - s)
-
-
-# Each activation with its first two derivatives.
-DERIVATIVES: dict[type[nn.Module], Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]] = {
+# Each activation with its derivatives.
+DERIVATIVES: dict[type[nn.Module], Derivatives] = {
     nn.Tanh: _tanh,
     nn.GELU: _gelu,
     nn.SiLU: _silu,

@@ -1,9 +1,15 @@
-"""Work that a second core may begin before its answer is asked for."""
+"""Work for more than one core: begun before its answer is asked for, or in pieces. The results are the same on one."""
 
 import os
 import threading
-from collections.abc import Generator
+from collections.abc import Callable, Generator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from ocp_torch.maths.jets import CHUNK
 
 T = TypeVar("T")
 
@@ -11,6 +17,19 @@ T = TypeVar("T")
 def cores() -> int:
     """How many this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def in_pieces(function: Callable[[Tensor], tuple[Tensor, ...]], rows: Tensor, together: bool) -> tuple[Tensor, ...]:
+    """The tensors ``function(rows)`` from pieces of ``rows``, one after the other or ``together``, on as many cores as there
+    are: then ``function`` must be pure."""
+    pieces = rows.split(CHUNK)
+    threads = min(cores(), len(pieces)) if together else 1
+    if threads == 1:
+        found = [function(piece) for piece in pieces]
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            found = list(pool.map(function, pieces))
+    return tuple(torch.cat(parts) for parts in zip(*found, strict=True))
 
 
 class Ahead(Generic[T]):

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from ocp_torch.maths.ahead import in_pieces
 from ocp_torch.maths.runge_kutta import Dynamics
 from ocp_torch.maths.seeds import Branch, derive_seed
 
@@ -129,19 +130,23 @@ def expectation(
     weight: Weight,
     tolerance: float,
     seed: int,
+    audit: Dynamics | None = None,
+    together: bool = False,
 ) -> Mean:
     """The mean by ``weights`` ``(N,)`` of the `path_integral` from ``x0`` ``(N, d)``, ``replicates`` sets one after the
     other. Steps are halved until halving moves it by less than ``tolerance`` or little beside its standard error.
 
-    The bias is what the last halving moved the extrapolated mean by, with twice the standard error of that or `LEFT` times.
+    The bias is what the last halving moved the extrapolated mean by, with twice the standard error of that or `LEFT` times;
+    and, where ``dynamics`` round, by how much ``audit`` moves the mean over a few paths. Paths are followed ``together`` on
+    all cores if ``dynamics`` and ``noise`` are pure.
     """
     motions = noise(x0[:1]).shape[-1]
     rows = torch.arange(len(x0)).unflatten(0, (replicates, -1))
     chunks = rows.split(max(1, TOGETHER // replicates), dim=1)
 
-    def followed(halvings: int) -> tuple[Tensor, Tensor]:
+    def followed(halvings: int, by: Dynamics = dynamics, thinned: int = 0) -> tuple[Tensor, Tensor]:
         """Integrals ``(replicates, n)`` along the first `n` paths of each replicate, and their ends."""
-        few = rows[:, : max(FEWEST_PATHS, rows.shape[1] >> halvings)]
+        few = rows[:, : max(FEWEST_PATHS, rows.shape[1] >> max(halvings, thinned))]
         first, moves = 0, []
         for number, chunk in enumerate(chunks):
             if first < few.shape[1]:
@@ -149,8 +154,9 @@ def expectation(
                 moves.append(drawn.unflatten(1, chunk.shape)[:, :, : few.shape[1] - first])
             first += chunk.shape[1]
         at, fine = few.flatten(), Grid(grid.horizon, grid.steps * 2**halvings, grid.grading)
-        together = torch.cat(moves, dim=2).flatten(1, 2)
-        integrals, end = path_integral(dynamics, noise, x0[at], fine.of(at), together, weight)
+        drawn = torch.cat(moves, dim=2).flatten(1, 2)
+        along = lambda n: path_integral(by, noise, x0[at[n]], fine.of(at[n]), drawn[:, n], weight)
+        integrals, end = in_pieces(along, torch.arange(len(at)), together)
         return integrals.view_as(few), end
 
     mass = weights.view_as(rows)
@@ -171,4 +177,9 @@ def expectation(
             if bias <= max(tolerance, GOOD_PART * chance):
                 break
         coarse, before = fine, change
+    if audit is not None:
+        exact, _ = followed(0, audit, thinnings)
+        of = slice(exact.shape[1])
+        off = (mass[:, of] * (exact - integrals[:, of])).flatten()
+        bias += abs(float(off.mean())) + 2.0 * float(off.std()) / math.sqrt(len(off))
     return Mean(integrals.flatten(), extrapolated - (mass * integrals).mean(dim=1), end, bias)

@@ -86,6 +86,7 @@ def refined(
     tolerance: float,
     generator: torch.Generator,
     standard_error: Callable[[Tensor], float] = lambda results: 0.0,
+    audit: Integrate | None = None,
 ) -> tuple[Tensor, Tensor, float]:
     r"""Results and end states of all trajectories, and a bound on the error of the results' mean by ``weights`` ``(N,)``.
 
@@ -93,7 +94,8 @@ def refined(
     still change by more than ``tolerance`` on halving the step are halved again: those that cross a jump or a kink of the
     controller, or slide along one. The error has three parts: the last change of each trajectory; what its slow decay
     leaves to come (`r/(1-r)` of it, at ratio `r`: a jump makes the order 1, not 4); and, because a trajectory may agree
-    with itself by missing a feature twice, what a random few of all of them change on far finer steps.
+    with itself by missing a feature twice, what a random few of all of them change on far finer steps, by ``audit`` where
+    ``integrate`` rounds.
     """
     everything = torch.arange(len(weights))
     coarse, _ = integrate(everything, steps // 2)
@@ -117,7 +119,7 @@ def refined(
     rough = taken[picked] < finest
     if rough.any():
         rows = picked[rough]
-        missed[rough] = weights[rows] * (integrate(rows, finest)[0] - result[rows])
+        missed[rough] = weights[rows] * ((audit or integrate)(rows, finest)[0] - result[rows])
     noise = float(missed.std()) / math.sqrt(len(missed)) if len(missed) > 1 else 0.0
     unseen = abs(float(missed.mean())) + 2.0 * noise
     return result, end, float((weights * change * factor).mean()) + unseen

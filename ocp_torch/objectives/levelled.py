@@ -1,5 +1,6 @@
 r"""D(M) with the best constant in `V`: what comes closest to the bound without `M`."""
 
+import torch
 from torch import Tensor
 
 from ocp_torch.fields.fields import VALUE, Fields
@@ -18,10 +19,14 @@ class LevelledDual(Objective):
     players = {"value": (VALUE,)}
 
     def losses(self, fields: Fields, samples: Samples, phase: Phase) -> dict[str, Tensor]:
-        generator, M = self.generator(samples), phase.constants.M
-        V = generator.jet(fields.value)
-        slack = generator.hjb_slack(V)
-        # At the best level the loss does not change with it to first order.
-        level = upper_quantile(slack.detach(), samples.weight, 1.0 / M)
-        tail = level + M * samples.mean((slack - level).clamp_min(0.0))
-        return {"value": tail - samples.mean(V.value * samples.mu0)}
+        M, V = phase.constants.M, fields.value
+        with torch.no_grad():
+            generator = self.generator(samples)
+            slack = generator.hjb_slack(generator.jet(V))
+            level = upper_quantile(slack, samples.weight, 1.0 / M)
+        # At the best level the loss does not change with it to first order; and no gradient comes from where Q is below it.
+        high, start = samples.take(slack >= level), samples.take(samples.mu0 > 0.0)
+        generator = self.generator(high)
+        excess = high.weight * (generator.hjb_slack(generator.jet(V)) - level).clamp_min(0.0)
+        paid = start.weight * V(start.x) * start.mu0
+        return {"value": level + (M * excess.sum() - paid.sum()) / len(samples)}

@@ -50,11 +50,21 @@ def test_a_sweep_gives_what_nested_reverse_passes_give(dim, columns, activation,
         assert_same(jet(network, x, sigma), swept)
 
 
+@pytest.mark.parametrize("gated", [False, True])
+@pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("dim", [1, 3])
-def test_noise_along_the_coordinates_takes_the_short_way_to_the_same(dim):
-    network, (x, sigma) = made(dim, 7), drawn(dim, dim)
-    diagonal = torch.diag_embed(sigma.diagonal(dim1=1, dim2=2))
-    assert_same(jet(network, x, diagonal), reverse_jet(network, x, diagonal))
+def test_noise_along_the_coordinates_takes_the_short_way_to_the_same(dim, activation, gated):
+    """Its reverse, which is written out, as well: in the parameters and in the states, on which the noise may depend."""
+    network, (x, sigma) = made(dim, 7, activation=activation, gated=gated), drawn(dim, dim)
+    x.requires_grad_(True)
+    diagonal = torch.diag_embed(sigma.diagonal(dim1=1, dim2=2) * (1.5 + x.sin()))
+    swept, nested = jet(network, x, diagonal), reverse_jet(network, x, diagonal)
+    assert_same(swept, nested)
+    loss = lambda j: (j.value.sin() + j.gradient.square().sum(dim=-1) + j.curvature.square()).sum()
+    inputs = [x, *network.parameters()]
+    gradients = [torch.autograd.grad(loss(j), inputs, retain_graph=True) for j in (swept, nested)]
+    for found, expected in zip(*gradients, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize(("dim", "columns"), SHAPES)

@@ -6,7 +6,7 @@ and `E[rate(x_T)]` is the discounted integral, without a tail.
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -16,9 +16,10 @@ from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
 from ocp_torch.certificate.simulated.trajectories import Sliding, closed_loop_dynamics
 from ocp_torch.control.policies import Policy, zero_policy
+from ocp_torch.maths.ahead import in_pieces
 from ocp_torch.maths.brownian import Grid, at_random_times, discounted, expectation
 from ocp_torch.maths.jets import Field
-from ocp_torch.maths.runge_kutta import discounted_integral, rate_at, refined
+from ocp_torch.maths.runge_kutta import Dynamics, Integrate, discounted_integral, rate_at, refined
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import initial_points
@@ -36,6 +37,9 @@ TAIL, LEAST = 2e-5, 0.1
 # States to which the starts' mean cost is compared, how many standard errors apart the two must be, and by how many times
 # that the interval is widened: trajectories may stay where no start was.
 COMPARED, UNLIKELY, UNSEEN_ROOM = 2**15, 2.5, 2.0
+# How far the rates of networks in single precision may be off at the starts, as a part of what the steps of a trajectory may
+# be off by.
+ROUNDED = 0.1
 # Head-room on the rate's supremum, met at starts and ends, for the states after the end.
 RATE_ROOM = 2.0
 # Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
@@ -86,14 +90,16 @@ def simulate_performance(
     initial: list[float] | None = None,
     horizon: str = TRUNCATED,
     tolerance: float = CertificateSettings.tolerance,
+    rounded: tuple[Policy, Field | None] | None = None,
 ) -> Simulated:
     """Perf of ``policy`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts, near `mu0`.
 
     With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is added.
     Steps are halved until a trajectory changes by less than ``tolerance``, relative to the answer, or all of them by little
-    beside the standard error. ``bias`` is the error of integration (`refined`, with noise `expectation`) plus, where the
-    ``horizon`` is truncated, the discount left there times the rate's supremum as met along the trajectories, with
-    head-room.
+    beside the standard error. ``rounded``, the controller and `V` in single precision, takes their place where it agrees well
+    enough with them at the starts; a few trajectories are exact, and what they differ by goes into the ``bias``. That is the
+    error of integration (`refined`, with noise `expectation`) plus, where the ``horizon`` is truncated, the discount left
+    there times the rate's supremum as met along the trajectories, with head-room.
     """
     dim, rho = problem.dim, problem.discount
     random = horizon == RANDOM
@@ -104,33 +110,45 @@ def simulate_performance(
         base = value(x0) if value is not None else torch.zeros_like(x0[:, 0])
         state = x0 if value is None or problem.noisy else torch.cat([x0, base.unsqueeze(-1)], dim=-1)
         velocity, rate = dynamics(state)
+        quick = dynamics if rounded is None else closed_loop_dynamics(problem, *rounded)
+        off = (quick(state)[1] - rate).abs().max()
         velocity, rate = velocity[:, :dim], rate.reshape(len(x0), -1)[:, 0]
     if not (torch.isfinite(velocity).all() and torch.isfinite(rate).all()):
         return Simulated(Estimate(math.nan, math.nan), math.nan, x0)
     # By the slack's definition `V - Q_u = f + R(u) + grad V . g / rho`: the answer's size also where `E[V mu0]` is far off.
     size = max(float((mass * (base + rate)).mean().abs()), LEAST * float((mass * problem.state_cost(x0)).mean()), 1e-12)
     largest_rate = RATE_ROOM * float(rate.abs().max())
-    if random:
-        times = -torch.log1p(-points[:, dim]) / rho
-        longest = float(times.max())
-        integrate = lambda rows, count: rate_at(dynamics, state[rows], rho, times[rows], count, wrap=False)
-    else:
-        longest = max(math.log(max(largest_rate / (TAIL * size), math.e)), 1.0) / rho
-        integrate = lambda rows, count: discounted_integral(
-            dynamics, state[rows], rho, longest, count, wrap=False, grading=GRADING
-        )
-    sliding = None if value is None or problem.noisy else Sliding(integrate, len(x0), tolerance * size)
+    # Whoever brings networks of ours brings pure functions.
+    together, audited = rounded is not None and problem.concurrent, float(off) <= ROUNDED * tolerance * size
+    quick = quick if audited else dynamics
+    times = -torch.log1p(-points[:, dim]) / rho if random else torch.zeros_like(mass)
+    longest = float(times.max()) if random else max(math.log(max(largest_rate / (TAIL * size), math.e)), 1.0) / rho
+
+    def integrated(by: Dynamics) -> Integrate:
+        def some(rows: Tensor, count: int) -> tuple[Tensor, Tensor]:
+            if random:
+                return rate_at(by, state[rows], rho, times[rows], count, wrap=False)
+            return discounted_integral(by, state[rows], rho, longest, count, wrap=False, grading=GRADING)
+
+        all_rows = lambda rows, count: cast(tuple[Tensor, Tensor], in_pieces(lambda n: some(n, count), rows, together))
+        return all_rows if sliding is None else sliding.by(all_rows)
+
+    sliding = None if value is None or problem.noisy else Sliding(len(x0), tolerance * size)
     speed = float(velocity.norm(dim=-1).max())
     steps = max(FEWEST_STEPS, 2 * math.ceil(0.5 * longest * max(rho / DISCOUNTED, speed / MOVED)))
     means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
     if problem.noisy:
         grid = Grid(times, steps, 1.0) if random else Grid(torch.full_like(mass, longest), steps, GRADING)
         how = at_random_times(rho) if random else discounted(rho), tolerance * size, seed
-        result, refinement, end, bias = expectation(dynamics, problem.noise, x0, mass, replicates, grid, *how)
+        exact = dynamics if quick is not dynamics else None
+        found = expectation(quick, problem.noise, x0, mass, replicates, grid, *how, exact, together)
+        result, refinement, end, bias = found
     else:
         generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT))
         error = lambda results: Estimate.of(means(results).tolist()).se
-        result, end, bias = refined(sliding or integrate, mass, steps, tolerance * size, generator, error)
+        result, end, bias = refined(
+            integrated(quick), mass, steps, tolerance * size, generator, error, integrated(dynamics)
+        )
         refinement = torch.zeros_like(means(result))
     ended = end[:, :dim].remainder(1.0)
     with torch.no_grad():
@@ -162,11 +180,13 @@ def stratum_error(results: Tensor, replicates: int) -> float:
 
 
 class Candidate(NamedTuple):
-    """A controller to simulate, the control variate `V` of its simulation, and `E[V mu0]` per set."""
+    """A controller to simulate, the control variate `V` of its simulation, and `E[V mu0]` per set; and, if the first two are
+    networks of this package, what these are in single precision (see `Fields.rounded`)."""
 
     policy: Policy
     value: Field | None
     initial: list[float] | None
+    rounded: tuple[Policy, Field | None] | None = None
 
 
 def simulate_candidates(
@@ -176,8 +196,9 @@ def simulate_candidates(
     on a quarter of the trajectories gets no more of them, where that saves time."""
 
     def simulate(candidate: Candidate, trajectories: int, room: float = 1.0) -> Simulated:
-        (policy, value, initial), how = candidate, (settings.horizon, room * settings.tolerance)
-        return simulate_performance(problem, policy, trajectories, settings.replicates, seed, value, initial, *how)
+        policy, value, initial, rounded = candidate
+        effort, how = (trajectories, settings.replicates, seed), (settings.horizon, room * settings.tolerance, rounded)
+        return simulate_performance(problem, policy, *effort, value, initial, *how)
 
     few = max(2, settings.trajectories // BASELINE_PART)
     pays = best_only and len(candidates) > 1 and settings.trajectories * settings.replicates > CHEAP
@@ -186,4 +207,5 @@ def simulate_candidates(
     for name, candidate in candidates.items():
         if name not in found or not found[name].perf.interval(CONFIDENCE)[0] > best:
             found[name] = simulate(candidate, settings.trajectories)
-    return found, simulate(Candidate(zero_policy(problem), None, None), few, ROUGH).perf
+    nothing = zero_policy(problem)
+    return found, simulate(Candidate(nothing, None, None, (nothing, None)), few, ROUGH).perf

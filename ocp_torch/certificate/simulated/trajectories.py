@@ -77,20 +77,25 @@ def closed_loop_dynamics(problem: Problem, policy: Policy, value: Field | None) 
 
 
 class Sliding:
-    """Results of ``integrate`` for ``count`` trajectories, by `-Q_u`, or with `z - V` taken off where that stays above
-    ``allowed`` however fine the steps."""
+    """Results of ``count`` trajectories, by `-Q_u`, or with `z - V` taken off where that stays above ``allowed`` however fine
+    the steps."""
 
-    def __init__(self, integrate: Integrate, count: int, allowed: float) -> None:
-        self.integrate, self.allowed = integrate, allowed
+    def __init__(self, count: int, allowed: float) -> None:
+        self.allowed = allowed
         self.off = torch.full((count,), math.inf, dtype=torch.float64)
         self.stays = torch.zeros(count, dtype=torch.bool)
 
-    def __call__(self, rows: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-        rates, end = self.integrate(rows, steps)
-        off = rates[:, 1].abs()
-        self.stays[rows] = (off > self.allowed) & (off > SETTLING * self.off[rows])
-        self.off[rows] = off
-        return self.corrected(rates, rows), end
+    def by(self, integrate: Integrate) -> Integrate:
+        """The results of ``integrate``, of whose columns the first is `-Q_u` and the second `z - V`."""
+
+        def corrected(rows: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+            rates, end = integrate(rows, steps)
+            off = rates[:, 1].abs()
+            self.stays[rows] = (off > self.allowed) & (off > SETTLING * self.off[rows])
+            self.off[rows] = off
+            return self.corrected(rates, rows), end
+
+        return corrected
 
     def corrected(self, rates: Tensor, rows: Tensor) -> Tensor:
         """The first column of ``rates`` ``(n, 2)`` of ``rows``, less the second where that is to be taken off."""
