@@ -103,7 +103,8 @@ class Activated(torch.autograd.Function):
     def forward(ctx: Any, z: Tensor, slopes: Tensor, curvature: Tensor, derivatives: "Derivatives") -> Any:
         value, first, second, third = derivatives(z)
         square = 0.5 * _contracted(slopes, slopes)
-        ctx.save_for_backward(slopes, curvature, square, first, second, third)
+        if any(ctx.needs_input_grad):
+            ctx.save_for_backward(slopes, curvature, square, first, second, third())
         return value, first * slopes, torch.addcmul(first * curvature, second, square)
 
     @staticmethod
@@ -124,32 +125,35 @@ def _contracted(left: Tensor, right: Tensor) -> Tensor:
     return total
 
 
-# A smooth function with its first three derivatives, each of the shape of its argument.
-Derivatives = Callable[[Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
+# A smooth function with its first three derivatives, each of the shape of its argument, the last one if it is asked for.
+Third = Callable[[], Tensor]
+Derivatives = Callable[[Tensor], tuple[Tensor, Tensor, Tensor, Third]]
 
 
-def _tanh(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _tanh(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Third]:
     s = torch.tanh(z)
     slope = 1.0 - s * s
-    return s, slope, -2.0 * s * slope, slope * (4.0 - 6.0 * slope)
+    return s, slope, -2.0 * s * slope, lambda: slope * (4.0 - 6.0 * slope)
 
 
-def _gelu(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _gelu(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Third]:
     below, square = torch.special.ndtr(z), z * z
     density = torch.exp(-0.5 * square - 0.5 * math.log(2.0 * math.pi))
-    return z * below, below + z * density, (2.0 - square) * density, (square - 4.0) * z * density
+    third = lambda: (square - 4.0) * z * density
+    return z * below, torch.addcmul(below, z, density), (2.0 - square) * density, third
 
 
-def _silu(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _silu(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Third]:
     s = torch.sigmoid(z)
     slope, tilt = s * (1.0 - s), 1.0 - 2.0 * s
-    return z * s, s + z * slope, slope * (2.0 + z * tilt), slope * (3.0 * tilt + z * (1.0 - 6.0 * slope))
+    third = lambda: slope * (3.0 * tilt + z * (1.0 - 6.0 * slope))
+    return z * s, s + z * slope, slope * (2.0 + z * tilt), third
 
 
-def _softplus(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _softplus(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Third]:
     s = torch.sigmoid(z)
     slope = s * (1.0 - s)
-    return nn.functional.softplus(z), s, slope, slope * (1.0 - 2.0 * s)
+    return nn.functional.softplus(z), s, slope, lambda: slope * (1.0 - 2.0 * s)
 
 
 # Each activation with its derivatives.

@@ -1,35 +1,12 @@
-"""Work for more than one core: begun before its answer is asked for, or in pieces. The results are the same on one."""
+"""Work that a second core may begin before its answer is asked for."""
 
-import os
 import threading
-from collections.abc import Callable, Generator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Generator
 from typing import Generic, TypeVar
 
-import torch
-from torch import Tensor
-
-from ocp_torch.maths.jets import CHUNK
+from ocp_torch.maths.cores import cores, prepare_threads
 
 T = TypeVar("T")
-
-
-def cores() -> int:
-    """How many this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def in_pieces(function: Callable[[Tensor], tuple[Tensor, ...]], rows: Tensor, together: bool) -> tuple[Tensor, ...]:
-    """The tensors ``function(rows)`` from pieces of ``rows``, one after the other or ``together``, on as many cores as there
-    are: then ``function`` must be pure."""
-    pieces = rows.split(CHUNK)
-    threads = min(cores(), len(pieces)) if together else 1
-    if threads == 1:
-        found = [function(piece) for piece in pieces]
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            found = list(pool.map(function, pieces))
-    return tuple(torch.cat(parts) for parts in zip(*found, strict=True))
 
 
 class Ahead(Generic[T]):
@@ -49,6 +26,7 @@ class Ahead(Generic[T]):
     def begin(self) -> None:
         """Go on in a thread of its own, where there is a second core."""
         if self._thread is None and not self._answer and cores() > 1:
+            prepare_threads()
             self._thread = threading.Thread(target=self._run, name="ocp_torch ahead", daemon=True)
             self._thread.start()
 

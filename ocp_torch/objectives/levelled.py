@@ -22,7 +22,7 @@ class LevelledDual(Objective):
         M, V = phase.constants.M, fields.value
         with torch.no_grad():
             generator = self.generator(samples)
-            slack = generator.hjb_slack(generator.jet(V))
+            slack = generator.hjb_slack(generator.chunked_jet(V))
             level = upper_quantile(slack, samples.weight, 1.0 / M)
         # At the best level the loss does not change with it to first order; and no gradient comes from where Q is below it.
         high, start = samples.take(slack >= level), samples.take(samples.mu0 > 0.0)

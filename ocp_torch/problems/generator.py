@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.jets import Field, Jet, chunked_jet, control_flux_divergence, jet
+from ocp_torch.maths.jets import Field, Jet, batch_jet, chunked_jet, control_flux_divergence
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
@@ -56,7 +56,7 @@ class Generator:
 
     def jet(self, field: Field) -> Jet:
         """The jet of a scalar ``field`` at the samples."""
-        return jet(field, self.data.x, self.data.noise)
+        return batch_jet(field, self.data.x, self.data.noise)
 
     def chunked_jet(self, field: Field) -> Jet:
         """`jet` at many samples, without a graph."""

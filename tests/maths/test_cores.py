@@ -1,0 +1,46 @@
+"""Pieces on several cores: the results of one, in their order, and errors for whoever asked."""
+
+import threading
+
+import pytest
+import torch
+
+from ocp_torch.maths import cores
+from ocp_torch.maths.cores import CHUNK, in_pieces, side_by_side
+
+
+@pytest.mark.parametrize(("count", "together"), [(1, True), (2, True), (4, True), (4, False)])
+def test_results_are_in_order_and_threads_are_those_that_are_allowed(monkeypatch, count, together):
+    monkeypatch.setattr(cores, "cores", lambda: count)
+    barrier = threading.Barrier(count if together else 1, timeout=60.0)
+
+    def work(k):
+        if k < barrier.parties:
+            barrier.wait()  # passed by so many at once alone
+        return k, threading.current_thread()
+
+    found = side_by_side(work, list(range(7)), together)
+    assert [k for k, _ in found] == list(range(7))
+    here = threading.current_thread() in {thread for _, thread in found}
+    assert here == (count == 1 or not together)
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_an_error_in_a_piece_reaches_whoever_asked(monkeypatch, together):
+    monkeypatch.setattr(cores, "cores", lambda: 2)
+
+    def work(k):
+        if k == 1:
+            raise ArithmeticError("piece 1")
+        return k
+
+    with pytest.raises(ArithmeticError, match="piece 1"):
+        side_by_side(work, [0, 1, 2], together)
+
+
+@pytest.mark.parametrize("count", [1, CHUNK, 2 * CHUNK + 3])
+def test_rows_come_back_where_they_were(monkeypatch, count):
+    monkeypatch.setattr(cores, "cores", lambda: 3)
+    first, second = in_pieces(lambda rows: (2 * rows, rows.unsqueeze(-1)), torch.arange(count), together=True)
+    assert torch.equal(first, 2 * torch.arange(count))
+    assert torch.equal(second, torch.arange(count).unsqueeze(-1))
