@@ -98,10 +98,11 @@ class Batches:
         visited = replace(visited, weight=torch.zeros_like(visited.weight), penalty_weight=spent)
         return Samples.concatenate([drawn, visited])
 
+    @torch.no_grad()
     def _move(self, at: Samples) -> Tensor:
         """Along the closed loop for a short time, or back to a uniform state; the part of `STEP_TIME` it took, ``(k,)``."""
         policy, rho = ValuePolicy(self.problem, self.fields.value), self.problem.discount
-        u = policy(at.x).detach()
+        u = policy(at.x)
         velocity = at.a + torch.einsum("ndm,nm->nd", at.B, u)
         time = (LONGEST_STEP / velocity.norm(dim=-1).clamp_min(1e-12)).clamp_max(STEP_TIME / rho)
         moved = at.x + time.unsqueeze(-1) * velocity
