@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.ahead import in_pieces
+from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.runge_kutta import Dynamics
 from ocp_torch.maths.seeds import Branch, derive_seed
 

@@ -8,6 +8,7 @@ import torch
 
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
 from ocp_torch.certificate.simulated.trajectories import backward_flow, settled_occupation
+from ocp_torch.maths import cores
 from ocp_torch.maths.runge_kutta import discounted_integral, refined
 from ocp_torch.maths.sampling import evaluation_points
 from ocp_torch.problems import Pendulum, Problem
@@ -241,6 +242,60 @@ def test_a_standard_error_spares_halvings_and_hides_no_error(order):
     assert error <= bias
     assert noisy_error <= noisy_bias
     assert noisy_work < work if order == 1 else noisy_work <= work
+
+
+def rounded_perf(problem, rounded, policy):
+    """Of ``policy``, with ``rounded`` in its place; and of ``policy`` alone."""
+    run = lambda other: simulate_performance(problem, policy, 64, 4, 0, tolerance=1e-3, rounded=other).perf
+    return run(None if rounded is None else (rounded, None)), run(None)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_a_rounded_controller_takes_the_place_of_one_that_it_agrees_with(noise):
+    problem, asked = zoo.Manufactured(dim=1, noise=noise), []
+
+    def rounded(x):
+        asked.append(len(x))
+        return problem.exact_control(x.float().double())
+
+    single, double = rounded_perf(problem, rounded, problem.exact_control)
+    assert sum(asked) > 1000
+    assert single.value == pytest.approx(double.value, rel=1e-6)
+    assert single.bias < 1.2 * double.bias + 1e-6
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_where_it_differs_along_the_way_the_bias_says_by_how_much(noise):
+    """It is another controller wherever no trajectory starts."""
+    problem = zoo.Manufactured(dim=1, noise=noise)
+    starts = starting_points(problem, 64, 4, seed=0)[0]
+
+    def rounded(x):
+        u = problem.exact_control(x)
+        return u if x.shape == starts.shape and torch.equal(x, starts) else 0.5 * u
+
+    found, exact = rounded_perf(problem, rounded, problem.exact_control)
+    assert found.value != exact.value
+    assert abs(found.value - exact.value) > 4.0 * exact.bias
+    assert abs(found.value - exact.value) <= found.bias
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_a_rounded_controller_that_differs_at_the_starts_is_not_used(noise):
+    problem = zoo.Manufactured(dim=1, noise=noise)
+    found, exact = rounded_perf(problem, lambda x: problem.exact_control(x) + 1e-2, problem.exact_control)
+    assert found == exact
+
+
+def test_trajectories_are_the_same_on_one_core_and_on_several(monkeypatch):
+    problem, found = zoo.Circle(), []
+    for count in (1, 3):
+        monkeypatch.setattr(cores, "cores", lambda count=count: count)
+        found.append(
+            simulate_performance(problem, problem.exact_control, 600, 4, 0, rounded=(problem.exact_control, None))
+        )
+    assert found[0].perf == found[1].perf
+    assert torch.equal(found[0].end_states, found[1].end_states)
 
 
 def test_with_noise_the_estimated_density_is_a_number_where_paths_scatter_widely():

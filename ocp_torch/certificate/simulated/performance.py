@@ -16,8 +16,8 @@ from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
 from ocp_torch.certificate.simulated.trajectories import Sliding, closed_loop_dynamics
 from ocp_torch.control.policies import Policy, zero_policy
-from ocp_torch.maths.ahead import in_pieces
 from ocp_torch.maths.brownian import Grid, at_random_times, discounted, expectation
+from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.runge_kutta import Dynamics, Integrate, discounted_integral, rate_at, refined
 from ocp_torch.maths.seeds import Branch, derive_seed
@@ -111,7 +111,7 @@ def simulate_performance(
         state = x0 if value is None or problem.noisy else torch.cat([x0, base.unsqueeze(-1)], dim=-1)
         velocity, rate = dynamics(state)
         quick = dynamics if rounded is None else closed_loop_dynamics(problem, *rounded)
-        off = (quick(state)[1] - rate).abs().max()
+        off = (quick(state)[1] - rate).abs().mean()
         velocity, rate = velocity[:, :dim], rate.reshape(len(x0), -1)[:, 0]
     if not (torch.isfinite(velocity).all() and torch.isfinite(rate).all()):
         return Simulated(Estimate(math.nan, math.nan), math.nan, x0)
