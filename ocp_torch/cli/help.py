@@ -1,5 +1,6 @@
 """What `--help` prints: what a command is for, examples, and every field with the value it has here and what it means."""
 
+import inspect
 import json
 import shutil
 import textwrap
@@ -13,6 +14,9 @@ from ocp_torch.cli.compose import configuration
 from ocp_torch.cli.explain import CONFIGS, choices
 from ocp_torch.cli.terms import TERMS
 from ocp_torch.errors import InputError
+from ocp_torch.problems import Problem
+from ocp_torch.problems.commands import PACKAGE, current_target
+from ocp_torch.runs.build import problem_class
 
 # Letters in a line, on narrow and on wide terminals, and those of the longest field that has its comment beside it.
 NARROWEST, WIDEST, BESIDE = 60, 120, 40
@@ -44,9 +48,25 @@ def help_text(command: str, typed: str, overrides: list[str]) -> str:
     if listed := [(group, known_ones, choice) for group, known_ones, choice in listed if len(known_ones) > 1]:
         parts.append("Choices (group=choice), and the one taken here:")
         parts.append("\n".join(_filled(f"  {g}={c or 'null'}: {', '.join(of)}", "", "      ") for g, of, c in listed))
+    own = data.get("problem") or {}
+    if not str(current_target(own.get("_target_", PACKAGE))).startswith(PACKAGE):
+        cls = problem_class(own["_target_"])
+        data["problem"], known["problem"] = {"_target_": "", **arguments(cls)} | own, first_sentence(cls)
     parts.append("Fields (field=value), with their values here:")
     parts.extend(sections(data, known))
     return "\n\n".join([*parts, LAST_WORDS])
+
+
+def arguments(cls: type[Problem]) -> dict[str, Any]:
+    """What a class that the package does not have is made from, with its defaults."""
+    kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    taken = [p for p in inspect.signature(cls).parameters.values() if p.kind in kinds]
+    return {p.name: "???" if p.default is p.empty else p.default for p in taken}
+
+
+def first_sentence(cls: type) -> str:
+    """The first line of what a class says of itself."""
+    return (cls.__doc__ or "").strip().partition("\n")[0]
 
 
 def header(file: Path) -> str:
@@ -110,7 +130,7 @@ def _written(value: Any) -> str:
     """As it is written on the command line."""
     if isinstance(value, str):
         return "..." if value == "???" else value
-    return json.dumps(value, separators=(",", ":")).replace('"', "")
+    return json.dumps(value, separators=(",", ":"), default=str).replace('"', "")
 
 
 def _filled(words: str, first: str, rest: str) -> str:

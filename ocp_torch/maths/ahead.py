@@ -4,7 +4,7 @@ import threading
 from collections.abc import Generator
 from typing import Generic, TypeVar
 
-from ocp_torch.maths.cores import cores, prepare_threads
+from ocp_torch.maths.cores import cores
 
 T = TypeVar("T")
 
@@ -26,7 +26,6 @@ class Ahead(Generic[T]):
     def begin(self) -> None:
         """Go on in a thread of its own, where there is a second core."""
         if self._thread is None and not self._answer and cores() > 1:
-            prepare_threads()
             self._thread = threading.Thread(target=self._run, name="ocp_torch ahead", daemon=True)
             self._thread.start()
 

@@ -4,7 +4,6 @@ PyTorch's own threads wait for one another in a loop: of two processes with two 
 long as with one. Threads of Python wait without working, and give up their lock while PyTorch computes.
 """
 
-import ctypes
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,8 +17,6 @@ S = TypeVar("S")
 
 # States evaluated at once: what fits the cache is fastest.
 CHUNK = 1024
-# M_ARENA_MAX of GNU's malloc.h.
-ARENA_MAX = -8
 
 
 def cores() -> int:
@@ -27,20 +24,11 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def prepare_threads() -> None:
-    """Let all threads take memory from one arena, where the C library is GNU's: from arenas of their own they give large
-    blocks back to the system after each use, and two threads then took 1.4 times as long as one for the work of one."""
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
-    if mallopt is not None:
-        mallopt(ARENA_MAX, 1)
-
-
 def side_by_side(function: Callable[[T], S], pieces: Sequence[T], together: bool = True) -> list[S]:
     """``function`` of each of ``pieces``: ``together``, for which it must be pure, or one after the other."""
     threads = min(cores(), len(pieces)) if together else 1
     if threads < 2:
         return [function(piece) for piece in pieces]
-    prepare_threads()
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(function, pieces))
 

@@ -3,7 +3,7 @@
 import pytest
 import yaml
 
-from ocp_torch.cli.compose import register_resolvers
+from ocp_torch.cli.compose import register_resolvers, with_own_defaults
 from ocp_torch.cli.explain import CONFIGS
 from ocp_torch.cli.help import comments, help_text
 from ocp_torch.errors import InputError
@@ -95,3 +95,22 @@ def test_help_from_the_command_line_leaves_nothing(tmp_path):
     assert_succeeded(result)
     assert "problem.dim=2" in result.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+def test_help_shows_what_a_class_of_ones_own_is_made_from(tmp_path, monkeypatch):
+    (tmp_path / "winches.py").write_text(
+        "from ocp_torch import System\n\n\n"
+        "class Winch(System):\n"
+        '    """A drum winds up a load."""\n\n'
+        "    def __init__(self, load: float, radius: float = 0.25, walls: list | None = None):\n"
+        "        raise AssertionError('help makes nothing')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    typed = lambda *overrides: helped("train", *with_own_defaults("train", list(overrides)))
+    text = typed("problem._target_=winches.Winch", "problem.walls=[1,2]")
+    assert "\nproblem  A drum winds up a load.\n" in text
+    assert "  problem.load=...\n" in text
+    assert "  problem.radius=0.25\n" in text
+    assert "  problem.walls=[1,2]\n" in text
+    with pytest.raises(InputError, match="winches.Wench is not a Problem"):
+        typed("problem._target_=winches.Wench")
