@@ -21,8 +21,9 @@ from ocp_torch.maths.seeds import Branch, derive_seed
 # What a rate counts at a part of each of the horizons ``(N,)``.
 Weight = Callable[[Tensor, float], Tensor]
 
-# Paths whose increments are drawn together.
-TOGETHER = 512
+# Paths whose increments are drawn together; and those that a core follows at a time: each halving has half as many as the one
+# before, and they are to be shared too.
+TOGETHER, PIECE = 512, 256
 # How often steps are halved at most; on how many paths of each replicate at least; and how often on these, as each halving
 # of them takes twice as long as the one before.
 MOST_HALVINGS, FEWEST_PATHS, ON_FEWEST = 5, 8, 2
@@ -156,7 +157,7 @@ def expectation(
         at, fine = few.flatten(), Grid(grid.horizon, grid.steps * 2**halvings, grid.grading)
         drawn = torch.cat(moves, dim=2).flatten(1, 2)
         along = lambda n: path_integral(by, noise, x0[at[n]], fine.of(at[n]), drawn[:, n], weight)
-        integrals, end = in_pieces(along, torch.arange(len(at)), together)
+        integrals, end = in_pieces(along, torch.arange(len(at)), together, PIECE)
         return integrals.view_as(few), end
 
     mass = weights.view_as(rows)

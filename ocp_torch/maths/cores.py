@@ -33,7 +33,9 @@ def side_by_side(function: Callable[[T], S], pieces: Sequence[T], together: bool
         return list(pool.map(function, pieces))
 
 
-def in_pieces(function: Callable[[Tensor], tuple[Tensor, ...]], rows: Tensor, together: bool) -> tuple[Tensor, ...]:
-    """The tensors ``function(rows)``, each of a row for each of ``rows``, from `CHUNK` of these at a time."""
-    found = side_by_side(function, rows.split(CHUNK), together)
+def in_pieces(
+    function: Callable[[Tensor], tuple[Tensor, ...]], rows: Tensor, together: bool, size: int = CHUNK
+) -> tuple[Tensor, ...]:
+    """The tensors ``function(rows)``, each of a row for each of ``rows``, from pieces of ``size`` of these."""
+    found = side_by_side(function, rows.split(size), together)
     return tuple(torch.cat(parts) for parts in zip(*found, strict=True))
