@@ -26,7 +26,8 @@ def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -
     if isinstance(error, MissingConfigException) and unknown:
         group, choice = unknown.groups()
         if group == "hydra/launcher":
-            return f"{group} is {choice!r}, which is not installed; pip install -e '.[parallel]' brings joblib's."
+            brings = "'.[parallel]' brings joblib, '.[cluster]' submitit_slurm and submitit_local"
+            return f"{group} is {choice!r}, which is not installed; pip install -e {brings}."
         known = choices(group)
         return f"{group} is {choice!r}, but must be one of {', '.join(known)}{nearest(choice, known)}."
     override = re.search(r"Could not override '([\w.@/-]+)'", text)

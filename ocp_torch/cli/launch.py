@@ -82,7 +82,7 @@ def sweep(entry: Callable, config_name: str, overrides: list[str], check: Callab
     check_sweep(config_name, overrides, check)
     for root in (o.value() for o in parsed(overrides) if o.key_or_group == "hydra.sweep.dir"):
         require_unlinked(Path(str(root)), "*")
-    with failures() as failed:
+    with failures(elsewhere=any("submitit" in o for o in overrides)) as failed:
         entry()
         names = failed()
     if names:

@@ -41,9 +41,10 @@ def fail(sentence: str) -> None:
 
 
 @contextlib.contextmanager
-def failures():
-    """Collect the failed jobs of all processes; yields a function that names them."""
-    with tempfile.TemporaryDirectory(prefix="ocp_torch_") as folder:
+def failures(elsewhere: bool = False):
+    """Collect the failed jobs of all processes, of those ``elsewhere`` in the folder one starts from, which machines of a
+    cluster share; yields a function that names them."""
+    with tempfile.TemporaryDirectory(prefix=".ocp_torch_", dir=os.getcwd() if elsewhere else None) as folder:
         file = Path(folder) / "failed"
         os.environ[FAILURES] = str(file)
         try:

@@ -1,6 +1,5 @@
 """Sweeps run unattended: jobs end alone, leave nothing to the next, go on when called again, and run side by side."""
 
-import importlib.util
 import json
 import random
 import time
@@ -110,22 +109,22 @@ def test_a_sweep_of_resumes_goes_on_in_each_runs_own_folder(tmp_path):
 
 
 @pytest.mark.nightly
-@pytest.mark.skipif(
-    importlib.util.find_spec("hydra_plugins.hydra_joblib_launcher") is None
-    if importlib.util.find_spec("hydra_plugins") is not None
-    else True,
-    reason="needs the extra ocp_torch[parallel]",
-)
-def test_jobs_run_side_by_side_with_the_same_end(tmp_path):
+def test_jobs_run_side_by_side_and_as_on_a_cluster_with_the_same_end(tmp_path):
+    """Submitit's local executor stands for that of a cluster: a process of its own for each job, from pickles."""
     way = (*TINY, "trainer.steps=4", "seed=0,1", "problem.discount=-1,2")
+    launchers = {
+        "basic": (),
+        "joblib": ("hydra.launcher.n_jobs=2",),
+        "submitit_local": ("hydra.launcher.cpus_per_task=1",),
+    }
     statuses = []
-    for name, launcher in (("one", "basic"), ("many", "joblib")):
+    for name, more in launchers.items():
         sweep = f"hydra.sweep.dir={tmp_path / name}"
-        more = ("hydra.launcher.n_jobs=2",) if launcher == "joblib" else ()
-        ended = train("-m", *way, sweep, f"hydra/launcher={launcher}", *more, cwd=tmp_path)
+        ended = train("-m", *way, sweep, f"hydra/launcher={name}", *more, cwd=tmp_path)
         statuses.append((ended.status, ended.stderr.splitlines()[-1]))
-    assert statuses[0] == statuses[1]
+    assert statuses == [statuses[0]] * 3
     assert statuses[0][0] == 2
     for job in ("1_circle_dual_seed0", "3_circle_dual_seed1"):
-        one, many = (certificate_in(tmp_path / name / job) for name in ("one", "many"))
-        assert one | {"train_seconds": 0} == many | {"train_seconds": 0}
+        found = [certificate_in(tmp_path / name / job) | {"train_seconds": 0} for name in launchers]
+        assert found == [found[0]] * 3
+    assert not list(tmp_path.glob(".ocp_torch_*"))
