@@ -15,8 +15,9 @@ from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.settings import CertificateSettings, Progress, Run, silent
+from ocp_torch.certificate.simulated.candidates import Candidate, simulate_candidates
 from ocp_torch.certificate.simulated.outside import time_outside
-from ocp_torch.certificate.simulated.performance import Candidate, Simulated, simulate_candidates
+from ocp_torch.certificate.simulated.performance import Simulated
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.upper.penalised import DensityBounds
 from ocp_torch.control.policies import Policy

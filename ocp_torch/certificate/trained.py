@@ -13,7 +13,7 @@ from ocp_torch.certificate.checks.observed import Observed, observe
 from ocp_torch.certificate.checks.tails import sharpened
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.context import Context
-from ocp_torch.certificate.simulated.performance import Candidate
+from ocp_torch.certificate.simulated.candidates import Candidate
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
 from ocp_torch.certificate.upper.penalised import DensityBounds, density_bounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop

@@ -12,7 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.jets import Field, Jet, batch_jet, chunked_jet, control_flux_divergence
+from ocp_torch.maths.batch_jet import batch_jet
+from ocp_torch.maths.jets import Field, Jet, chunked_jet, control_flux_divergence
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples

@@ -6,7 +6,8 @@ import torch
 from ocp_torch.fields import PeriodicMLP, SobolevField
 from ocp_torch.fields.mlp import ACTIVATIONS
 from ocp_torch.maths import cores
-from ocp_torch.maths.jets import batch_jet, chunked_jet, jet, reverse_jet
+from ocp_torch.maths.batch_jet import batch_jet
+from ocp_torch.maths.jets import chunked_jet, jet, reverse_jet
 
 # Columns of noise: none but one, fewer than coordinates, as many, more.
 SHAPES = ((1, 1), (2, 1), (3, 2), (2, 2), (3, 3), (2, 4))

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
 from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.certificate.simulated.performance import BASELINE_PART, simulate_performance
+from ocp_torch.certificate.simulated.candidates import BASELINE_PART
+from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.control.policies import Policy, zero_policy
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.physical.system import System

@@ -6,16 +6,16 @@ and `E[rate(x_T)]` is the discounted integral, without a tail.
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple, cast
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from ocp_torch.certificate.checks.tails import widened
-from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
+from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
 from ocp_torch.certificate.simulated.trajectories import Sliding, closed_loop_dynamics
-from ocp_torch.control.policies import Policy, zero_policy
+from ocp_torch.control.policies import Policy
 from ocp_torch.maths.brownian import Grid, at_random_times, discounted, expectation
 from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.jets import Field
@@ -42,10 +42,6 @@ COMPARED, UNLIKELY, UNSEEN_ROOM = 2**15, 2.5, 2.0
 ROUNDED = 0.1
 # Head-room on the rate's supremum, met at starts and ends, for the states after the end.
 RATE_ROOM = 2.0
-# Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
-# a controller that another one clearly beats; but so few in all as the second number take hardly longer than a part of them.
-# Their steps need not be as fine either: the third is by how many times.
-BASELINE_PART, CHEAP, ROUGH = 4, 256, 200.0
 
 
 @dataclass(frozen=True)
@@ -118,9 +114,8 @@ def simulate_performance(
     # By the slack's definition `V - Q_u = f + R(u) + grad V . g / rho`: the answer's size also where `E[V mu0]` is far off.
     size = max(float((mass * (base + rate)).mean().abs()), LEAST * float((mass * problem.state_cost(x0)).mean()), 1e-12)
     largest_rate = RATE_ROOM * float(rate.abs().max())
-    # Whoever brings networks of ours brings pure functions.
-    together, audited = rounded is not None and problem.concurrent, float(off) <= ROUNDED * tolerance * size
-    quick = quick if audited else dynamics
+    quick = quick if float(off) <= ROUNDED * tolerance * size else dynamics
+    together = rounded is not None and problem.concurrent  # networks of ours are pure functions
     times = -torch.log1p(-points[:, dim]) / rho if random else torch.zeros_like(mass)
     longest = float(times.max()) if random else max(math.log(max(largest_rate / (TAIL * size), math.e)), 1.0) / rho
 
@@ -177,35 +172,3 @@ def stratum_error(results: Tensor, replicates: int) -> float:
     7 %.
     """
     return float(results.std()) / (len(results) // replicates * math.sqrt(replicates))
-
-
-class Candidate(NamedTuple):
-    """A controller to simulate, the control variate `V` of its simulation, and `E[V mu0]` per set; and, if the first two are
-    networks of this package, what these are in single precision (see `Fields.rounded`)."""
-
-    policy: Policy
-    value: Field | None
-    initial: list[float] | None
-    rounded: tuple[Policy, Field | None] | None = None
-
-
-def simulate_candidates(
-    problem: Problem, candidates: dict[str, Candidate], settings: CertificateSettings, seed: int, best_only: bool
-) -> tuple[dict[str, Simulated], Estimate]:
-    """Performance of each of ``candidates``, and of doing nothing. With ``best_only`` one that is clearly worse than another
-    on a quarter of the trajectories gets no more of them, where that saves time."""
-
-    def simulate(candidate: Candidate, trajectories: int, room: float = 1.0) -> Simulated:
-        policy, value, initial, rounded = candidate
-        effort, how = (trajectories, settings.replicates, seed), (settings.horizon, room * settings.tolerance, rounded)
-        return simulate_performance(problem, policy, *effort, value, initial, *how)
-
-    few = max(2, settings.trajectories // BASELINE_PART)
-    pays = best_only and len(candidates) > 1 and settings.trajectories * settings.replicates > CHEAP
-    found = {name: simulate(candidate, few, ROUGH) for name, candidate in candidates.items()} if pays else {}
-    best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
-    for name, candidate in candidates.items():
-        if name not in found or not found[name].perf.interval(CONFIDENCE)[0] > best:
-            found[name] = simulate(candidate, settings.trajectories)
-    nothing = zero_policy(problem)
-    return found, simulate(Candidate(nothing, None, None, (nothing, None)), few, ROUGH).perf

@@ -1,0 +1,49 @@
+"""Jets of a network in training at the states of a large batch, on all cores."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from ocp_torch.maths.cores import side_by_side
+from ocp_torch.maths.jets import Field, Jet, jet
+
+# States of a piece of a batch that is differentiated on several cores; and derivatives along the noise from which on that
+# pays: three columns at 1,024 states take two thirds of the time on two cores, two as long as on one.
+PIECE, MANY = 512, 3072
+
+
+def batch_jet(field: Field, x: Tensor, sigma: Tensor | None = None) -> Jet:
+    """`jet` at the states of a batch, which are data: where a network learns from many with noise, in pieces on all cores."""
+    weights = [p for p in field.parameters() if p.requires_grad] if isinstance(field, nn.Module) else []
+    small = sigma is None or len(x) * sigma.shape[2] < MANY
+    if small or not weights or not torch.is_grad_enabled() or x.requires_grad:
+        return jet(field, x, sigma)
+    return Jet(*_Pieces.apply(field, x, sigma, *weights))
+
+
+class _Pieces(torch.autograd.Function):
+    """`batch_jet`: each piece has a graph of its own, as autograd goes back through one on a single core."""
+
+    @staticmethod
+    def forward(ctx: Any, field: Field, x: Tensor, sigma: Tensor, *weights: Tensor) -> Any:
+        def piece(of: tuple[Tensor, Tensor]) -> Jet:
+            with torch.enable_grad():
+                return jet(field, *of)
+
+        ctx.weights = weights
+        ctx.jets = side_by_side(piece, list(zip(x.split(PIECE), sigma.split(PIECE), strict=True)))
+        found = Jet.concatenate(ctx.jets).map(Tensor.detach)
+        return found.value, found.gradient, found.curvature
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *slopes: Tensor) -> Any:
+        def piece(of: tuple) -> tuple:
+            j, *cotangents = of
+            parts = (j.value, j.gradient, j.curvature)
+            return torch.autograd.grad(parts, ctx.weights, cotangents, retain_graph=True, materialize_grads=True)
+
+        found = side_by_side(piece, list(zip(ctx.jets, *(s.split(PIECE) for s in slopes), strict=True)))
+        return None, None, None, *(torch.stack(parts).sum(dim=0) for parts in zip(*found, strict=True))
