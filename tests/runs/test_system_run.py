@@ -22,6 +22,7 @@ def run(tmp_path_factory):
     cheap = ("certificate.mollify=false", "certificate.occupation_states=0", "certificate.stage.steps=0")
     own = (
         "certificate.trajectories=32",
+        "certificate.tolerance=0.01",
         "certificate.replicates=2",
         "problem._target_=support.systems.Swing",
         "problem.control_limit=2.0",
