@@ -36,6 +36,8 @@ def side_by_side(function: Callable[[T], S], pieces: Sequence[T], together: bool
 def in_pieces(
     function: Callable[[Tensor], tuple[Tensor, ...]], rows: Tensor, together: bool, size: int = CHUNK
 ) -> tuple[Tensor, ...]:
-    """The tensors ``function(rows)``, each of a row for each of ``rows``, from pieces of ``size`` of these."""
-    found = side_by_side(function, rows.split(size), together)
+    """The tensors ``function(rows)``, of a row for each of ``rows``: ``together`` from pieces of ``size``, or all at once."""
+    if not together:
+        return function(rows)
+    found = side_by_side(function, rows.split(size))
     return tuple(torch.cat(parts) for parts in zip(*found, strict=True))
