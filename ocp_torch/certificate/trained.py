@@ -91,7 +91,7 @@ class TrainedContext(FieldsContext):
     def posed(self) -> WellPosed:
         return check_problem(self.problem, self.few if self.value is None else self.wide)
 
-    @property
+    @cached_property
     def candidates(self) -> dict[str, Candidate]:
         sampled, own = self.sampled_value, self.fields.trajectory_value
         initial = None if sampled is None else sampled.initial

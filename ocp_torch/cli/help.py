@@ -15,7 +15,7 @@ from ocp_torch.cli.explain import CONFIGS, choices
 from ocp_torch.cli.terms import TERMS
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Problem
-from ocp_torch.problems.commands import PACKAGE, current_target
+from ocp_torch.problems.problem import shipped
 from ocp_torch.runs.build import problem_class
 
 # Letters in a line, on narrow and on wide terminals, and those of the longest field that has its comment beside it.
@@ -49,9 +49,9 @@ def help_text(command: str, typed: str, overrides: list[str]) -> str:
         parts.append("Choices (group=choice), and the one taken here:")
         parts.append("\n".join(_filled(f"  {g}={c or 'null'}: {', '.join(of)}", "", "      ") for g, of, c in listed))
     own = data.get("problem") or {}
-    if not str(current_target(own.get("_target_", PACKAGE))).startswith(PACKAGE):
-        cls = problem_class(own["_target_"])
-        data["problem"], known["problem"] = {"_target_": "", **arguments(cls)} | own, first_sentence(cls)
+    if own.get("_target_") and not shipped(cls := problem_class(own["_target_"])):
+        data["problem"] = {"_target_": "", **arguments(cls)} | own
+        known |= {"problem": line} if (line := first_line(cls)) else {}
     parts.append("Fields (field=value), with their values here:")
     parts.extend(sections(data, known))
     return "\n\n".join([*parts, LAST_WORDS])
@@ -64,8 +64,8 @@ def arguments(cls: type[Problem]) -> dict[str, Any]:
     return {p.name: "???" if p.default is p.empty else p.default for p in taken}
 
 
-def first_sentence(cls: type) -> str:
-    """The first line of what a class says of itself."""
+def first_line(cls: type) -> str:
+    """Of what a class says of itself; empty where that is nothing."""
     return (cls.__doc__ or "").strip().partition("\n")[0]
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from ocp_torch.errors import visible
+from ocp_torch.errors import InputError, visible
 
 log = logging.getLogger(__name__)
 FAILED_INPUT, INTERRUPTED = 2, 130
@@ -43,8 +43,11 @@ def fail(sentence: str) -> None:
 @contextlib.contextmanager
 def failures(elsewhere: bool = False):
     """Collect the failed jobs of all processes, of those ``elsewhere`` in the folder one starts from, which machines of a
-    cluster share; yields a function that names them."""
-    with tempfile.TemporaryDirectory(prefix=".ocp_torch_", dir=os.getcwd() if elsewhere else None) as folder:
+    cluster share; yields a function that names them. Raises `InputError` where nothing can be written there."""
+    shared = os.getcwd() if elsewhere else None
+    if shared is not None and not os.access(shared, os.W_OK):
+        raise InputError(f"jobs on other machines say in {shared} that they failed, but it cannot be written to.")
+    with tempfile.TemporaryDirectory(prefix=".ocp_torch_", dir=shared) as folder:
         file = Path(folder) / "failed"
         os.environ[FAILURES] = str(file)
         try:

@@ -1,4 +1,4 @@
-"""Networks that compute in single precision for states in double precision, in a third of the time."""
+"""Networks that compute in single precision for states in double precision, in less than half the time."""
 
 import copy
 

@@ -96,11 +96,12 @@ def _differentiable(x: Tensor) -> Tensor | None:
 
 @torch.no_grad()
 def chunked_jet(field: Field, x: Tensor, sigma: Tensor | None = None, chunk: int = CHUNK) -> Jet:
-    """The jet of a scalar ``field`` at many states, without a graph."""
+    """The jet of a scalar ``field`` at many states, without a graph; on all cores that of a network of this package, which is
+    known by its method ``jet`` to be a pure function."""
     columns = [None] * len(x.split(chunk)) if sigma is None else sigma.split(chunk)
-    quiet = torch.no_grad()(lambda of: jet(field, *of))
+    quiet = torch.no_grad()(lambda of: jet(field, *of))  # each thread decides for itself whether there are graphs
     pieces = list(zip(x.split(chunk), columns, strict=True))
-    return Jet.concatenate(side_by_side(quiet, pieces, together=isinstance(field, nn.Module)))
+    return Jet.concatenate(side_by_side(quiet, pieces, together=isinstance(field, nn.Module) and hasattr(field, "jet")))
 
 
 def value_and_jacobian(field: Field, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -94,8 +94,8 @@ def refined(
     still change by more than ``tolerance`` on halving the step are halved again: those that cross a jump or a kink of the
     controller, or slide along one. The error has three parts: the last change of each trajectory; what its slow decay
     leaves to come (`r/(1-r)` of it, at ratio `r`: a jump makes the order 1, not 4); and, because a trajectory may agree
-    with itself by missing a feature twice, what a random few of all of them change on far finer steps, by ``audit`` where
-    ``integrate`` rounds.
+    with itself by missing a feature twice, what a random few of all of them change on far finer steps. Where ``integrate``
+    rounds these few are all integrated by ``audit``, which does not, on steps that are no coarser.
     """
     everything = torch.arange(len(weights))
     coarse, _ = integrate(everything, steps // 2)
@@ -116,7 +116,8 @@ def refined(
         factor[active] = max(1.0, ratio / (1.0 - ratio))
     picked = torch.randperm(len(weights), generator=generator)[:AUDITED]
     missed = torch.zeros_like(weights[picked])
-    rough = taken[picked] < finest
+    finest = finest if audit is None else max(finest, int(taken[picked].max()))
+    rough = (taken[picked] < finest) if audit is None else torch.ones_like(picked, dtype=torch.bool)
     if rough.any():
         rows = picked[rough]
         missed[rough] = weights[rows] * ((audit or integrate)(rows, finest)[0] - result[rows])

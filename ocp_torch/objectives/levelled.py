@@ -25,7 +25,8 @@ class LevelledDual(Objective):
             slack = generator.hjb_slack(generator.chunked_jet(V))
             level = upper_quantile(slack, samples.weight, 1.0 / M)
         # At the best level the loss does not change with it to first order; and no gradient comes from where Q is below it.
-        high, start = samples.take(slack >= level), samples.take(samples.mu0 > 0.0)
+        # What is not a number is not below, and is met by whoever looks at the loss.
+        high, start = samples.take(~(slack < level)), samples.take(samples.mu0 != 0.0)
         generator = self.generator(high)
         excess = high.weight * (generator.hjb_slack(generator.jet(V)) - level).clamp_min(0.0)
         paid = start.weight * V(start.x) * start.mu0

@@ -3,7 +3,8 @@
 from ocp_torch.problems.exact.circle import Circle
 from ocp_torch.problems.exact.manufactured import Manufactured
 from ocp_torch.problems.exact.torus import Torus
-from ocp_torch.problems.problem import Lipschitz, Problem
+from ocp_torch.problems.lipschitz import Lipschitz
+from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.recorded.dataset import Dataset
 from ocp_torch.problems.simulator.simulator import Simulator
 from ocp_torch.problems.systems.arm import Arm

@@ -4,7 +4,6 @@ minimise  rho E int_0^inf e^{-rho t} (f(x_t) + |u_t|^q / q) dt,   dx = (a(x) + B
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -16,6 +15,7 @@ from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.constant_noise import column_matrix, constant_diffusion
 from ocp_torch.problems.control_limit import Limit, control_cost
+from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.physical.measures import Measures
 from ocp_torch.problems.placed import Placed
 from ocp_torch.problems.played import Played
@@ -33,18 +33,9 @@ MARGIN = 1.05
 SCAN_FACTOR = 32
 
 
-@dataclass(frozen=True)
-class Lipschitz:
-    """`|g(x) - g(y)| <= L |x - y|`, Euclidean in torus units, for each entry `g` of the data; `None` where `L` is unknown.
-
-    A method that is not overridden needs none.
-    """
-
-    state_cost: float | None = None
-    drift: float | None = None
-    control_matrix: float | None = None
-    initial_density: float | None = None
-    noise: float | None = None
+def shipped(kind: type) -> bool:
+    """Whether a class is one of the package's own, which its tests vouch for."""
+    return kind.__module__.startswith("ocp_torch.")
 
 
 class Problem(Reproducible, Placed, Played):
@@ -155,18 +146,13 @@ class Problem(Reproducible, Placed, Played):
     def scan_factor(self) -> int:
         """How many states are scanned for narrow features of the data, for each at which a bound is evaluated. The package's
         own problems have none narrower than those states show."""
-        return 0 if self._shipped else SCAN_FACTOR
-
-    @property
-    def _shipped(self) -> bool:
-        """Whether the class is one of the package's own."""
-        return type(self).__module__.startswith("ocp_torch.")
+        return 0 if shipped(type(self)) else SCAN_FACTOR
 
     @property
     def concurrent(self) -> bool:
         """Whether two threads may call the functions at once, as pure functions of the state in PyTorch: true of the
         package's own problems; a subclass that knows it of its own may say so, and certificates take less time."""
-        return self._shipped
+        return shipped(type(self))
 
     @property
     def driftless(self) -> bool:

@@ -1,6 +1,7 @@
 """Simulated closed loops: order of convergence, exact performances, control variates and occupation densities."""
 
 import math
+import threading
 
 import numpy as np
 import pytest
@@ -244,6 +245,20 @@ def test_a_standard_error_spares_halvings_and_hides_no_error(order):
     assert noisy_work < work if order == 1 else noisy_work <= work
 
 
+def test_what_rounds_is_audited_however_fine_the_steps_of_all_trajectories_are():
+    rounding, sizes = 0.01, torch.linspace(1e6, 2e6, 200, dtype=torch.float64)
+
+    def by(off):
+        end = torch.zeros(len(sizes), 1, dtype=torch.float64)
+        return lambda rows, steps: (1.0 + off + sizes[rows] * float(steps) ** -8, end[rows])
+
+    how = torch.ones_like(sizes), 4, 1e-3, torch.Generator().manual_seed(0), lambda results: 0.0
+    result, _, bias = refined(by(rounding), *how, by(0.0))
+    assert float(result.mean()) - 1.0 == pytest.approx(rounding, rel=0.2)
+    assert rounding <= bias < 1.5 * rounding
+    assert refined(by(rounding), *how)[2] < 0.2 * rounding
+
+
 def rounded_perf(problem, rounded, policy):
     """Of ``policy``, with ``rounded`` in its place; and of ``policy`` alone."""
     run = lambda other: simulate_performance(problem, policy, 64, 4, 0, tolerance=1e-3, rounded=other).perf
@@ -291,9 +306,14 @@ def test_trajectories_are_the_same_on_one_core_and_on_several(monkeypatch):
     problem, found = zoo.Circle(), []
     for count in (1, 3):
         monkeypatch.setattr(cores, "cores", lambda count=count: count)
-        found.append(
-            simulate_performance(problem, problem.exact_control, 600, 4, 0, rounded=(problem.exact_control, None))
-        )
+        threads = set()
+
+        def rounded(x, threads=threads):
+            threads.add(threading.current_thread())
+            return problem.exact_control(x)
+
+        found.append(simulate_performance(problem, problem.exact_control, 600, 4, 0, rounded=(rounded, None)))
+        assert (len(threads) > 1) == (count > 1)
     assert found[0].perf == found[1].perf
     assert torch.equal(found[0].end_states, found[1].end_states)
 

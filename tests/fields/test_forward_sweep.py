@@ -6,7 +6,7 @@ import torch
 from ocp_torch.fields import PeriodicMLP, SobolevField
 from ocp_torch.fields.mlp import ACTIVATIONS
 from ocp_torch.maths import cores
-from ocp_torch.maths.batch_jet import batch_jet
+from ocp_torch.maths.batch_jet import PIECE, batch_jet
 from ocp_torch.maths.jets import chunked_jet, jet, reverse_jet
 
 # Columns of noise: none but one, fewer than coordinates, as many, more.
@@ -126,16 +126,22 @@ def test_a_jet_of_many_states_is_that_of_its_parts_and_scales_as_a_whole():
     torch.testing.assert_close(tripled.curvature, 3.0 * whole.curvature, **EXACT)
 
 
-def test_a_large_batch_is_differentiated_in_pieces_to_the_same_on_any_number_of_cores(monkeypatch):
-    network, (x, sigma) = made(3, 6), drawn(3, 3, count=1100)
+@pytest.mark.parametrize("along", ["the coordinates", "columns"])
+def test_a_large_batch_is_differentiated_in_pieces_to_the_same_on_any_number_of_cores(monkeypatch, along):
+    network, (x, sigma) = made(3, 6), drawn(3, 3, count=2 * PIECE + 76)
+    if along == "the coordinates":
+        sigma = torch.diag_embed(sigma.diagonal(dim1=1, dim2=2))
+    sizes = []
+    network.embedding.register_forward_hook(lambda module, given, made: sizes.append(len(made)))
     loss = lambda j: (j.value.sin() + j.gradient.square().sum(dim=-1) + j.curvature.square()).mean()
     weights, found = list(network.parameters()), []
     for count in (1, 2):
         monkeypatch.setattr(cores, "cores", lambda count=count: count)
         found.append(torch.autograd.grad(loss(batch_jet(network, x, sigma)), weights))
+        assert sorted(sizes) == [76, PIECE, PIECE]
+        sizes.clear()
     whole = torch.autograd.grad(loss(jet(network, x, sigma)), weights)
     for one, two, other in zip(*found, whole, strict=True):
         assert torch.equal(one, two)
         torch.testing.assert_close(one, other, rtol=1e-10, atol=1e-12)
-    with torch.no_grad():
-        assert_same(batch_jet(network, x, sigma), jet(network, x, sigma))
+    assert sizes == [len(x)]

@@ -43,3 +43,14 @@ def test_a_constant_in_the_value_does_not_matter_to_loss_and_gradient():
             value.head.bias += 3.0
     for here, there in zip(*found, strict=True):
         torch.testing.assert_close(here, there, rtol=1e-9, atol=1e-9)
+
+
+def test_a_slack_that_is_no_number_makes_a_loss_that_is_none():
+    """However few they are: it is no smallest of the slacks."""
+    problem = zoo.build("box-limited 2-d")
+    x, value = zoo.states(problem, 300), zoo.rough_network(2, seed=2)
+    state_cost = problem.state_cost
+    holed = lambda y: state_cost(y).masked_fill((y == x[7]).all(dim=-1), float("nan"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(problem, "state_cost", holed)
+        assert loss(problem, value, x, 20.0).isnan()

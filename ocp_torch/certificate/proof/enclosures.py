@@ -25,7 +25,8 @@ from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.control_limit import BoxLimitedCost, LimitedCost
 from ocp_torch.problems.exact.manufactured import Manufactured
 from ocp_torch.problems.exact.torus import Torus
-from ocp_torch.problems.problem import Lipschitz, Problem
+from ocp_torch.problems.lipschitz import Lipschitz
+from ocp_torch.problems.problem import Problem
 
 # Data evaluated at one state are taken to be right up to so much, relative to 1 + their size: 2^16 units in the last place
 # of float64 are left to the rounding of the user's formula.

@@ -44,5 +44,5 @@ def simulate_candidates(
     for name, candidate in candidates.items():
         if name not in found or not found[name].perf.interval(CONFIDENCE)[0] > best:
             found[name] = simulate(candidate, settings.trajectories)
-    nothing = zero_policy(problem)
+    nothing = zero_policy(problem)  # the same in any precision
     return found, simulate(Candidate(nothing, None, None, (nothing, None)), few, ROUGH).perf

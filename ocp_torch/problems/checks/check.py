@@ -24,7 +24,7 @@ from ocp_torch.problems.checks.sameness import (
 from ocp_torch.problems.checks.values import require_divergences, require_finite, require_kept_noise, require_signs
 from ocp_torch.problems.control_limit import control_cost
 from ocp_torch.problems.physical.system import System
-from ocp_torch.problems.problem import MOST_COORDINATES, Problem
+from ocp_torch.problems.problem import MOST_COORDINATES, Problem, shipped
 from ocp_torch.problems.simulator.simulator import Simulator
 
 # Sizes of the batches that shapes are checked with: none a likely d or m, and one a single state.
@@ -47,7 +47,7 @@ def check_once(problem: Problem) -> None:
     if not problem.has_simulator:
         return
     simulator = isinstance(problem, Simulator)
-    if simulator or not type(problem).__module__.startswith("ocp_torch."):
+    if simulator or not shipped(type(problem)):
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             if isinstance(problem, System):
                 require_system(SystemFunctions(problem))

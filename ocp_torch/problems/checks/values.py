@@ -9,7 +9,7 @@ from torch import Tensor
 from ocp_torch.errors import ProblemError
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.checks.functions import DIV_D, DIV_DIV_D, NOISE, Functions
-from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.problem import Problem, shipped
 
 # A part of the largest value that rounding may take a function below 0, or above its bound, by.
 ROUNDING = 1e-6
@@ -94,7 +94,7 @@ def require_kept_noise(functions: Functions) -> None:
     problem, x = functions.problem, functions.states(COMPARED, KEPT)
     owner = next(kind for kind in type(problem).__mro__ if "noise" in vars(kind))
     given = Problem.noise(problem, x)
-    if given is None or owner.__module__.startswith("ocp_torch."):
+    if given is None or shipped(owner):
         return
     square = given @ given.mT
     own = functions.ask(NOISE, x) if functions.noisy else torch.zeros_like(given)
