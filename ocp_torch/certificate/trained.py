@@ -162,8 +162,8 @@ class TrainedContext(FieldsContext):
         found = self.simulated[0].get(self.kind)
         self.progress("assumptions")
         usable = found if found is not None and found.perf.finite else None
-        states = self.settings.occupation_states
-        return observe(self.problem, self.policies[self.kind], usable, self.few, states)
+        states, together = self.settings.occupation_states, self.problem.concurrent  # networks of ours are pure
+        return observe(self.problem, self.policies[self.kind], usable, self.few, states, together)
 
     @property
     def notes(self) -> list[str]:

@@ -1,8 +1,8 @@
 """Training budgets by dimension, for every field of the configuration that is null: what won in measurements."""
 
 import copy
+import math
 from dataclasses import dataclass, replace
-from math import inf
 
 from ocp_torch.errors import require_choice, require_section
 from ocp_torch.fields import MODELS
@@ -27,7 +27,7 @@ BUDGETS = (
     Budget(2, steps=900, batch=256, good_gap=0.005, stage_steps=400),
     Budget(4, steps=1200, batch=384, good_gap=0.005, stage_steps=600),
     Budget(8, steps=1000, batch=512, good_gap=0.01, stage_steps=600),
-    Budget(inf, steps=1200, batch=512, good_gap=0.02, stage_steps=800),
+    Budget(math.inf, steps=1200, batch=512, good_gap=0.02, stage_steps=800),
 )
 
 # Where no M is known the bound is decided by the worst state: that wants more states at once, and, without noise, longer
@@ -40,6 +40,9 @@ DENSITY_BATCH = 256
 # Evenly spread states leave more steep spots than independent ones, and the worst state is in one.
 SAMPLER, WORST_STATE_SAMPLER = "sobol", "uniform"
 LEARNING_RATE = 1e-2
+# Steps between looks at most. A look with noise takes as long as 100 to 200 steps; every 600 steps they were a third of the
+# training of a pendulum.
+LOOKS_APART = 1200
 
 
 def fill(config: dict, problem: Problem) -> dict:
@@ -72,6 +75,9 @@ def fill(config: dict, problem: Problem) -> dict:
     }
     if unbounded and method.get("name") == "pd" and config["trainer"].get("batch") is None:
         defaults["method.density_batch"] = DENSITY_BATCH
+    given = config["trainer"].get("steps")
+    steps = given if isinstance(given, int) and given > 0 else budget.steps
+    defaults["trainer.evaluate_every"] = math.ceil(steps / math.ceil(steps / LOOKS_APART))
     for path, value in defaults.items():
         *groups, name = path.split(".")
         section = filled

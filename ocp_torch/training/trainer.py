@@ -152,7 +152,7 @@ class Trainer:
             for sentence in self.health.stepped(state.step, report.losses, self.stepper.parameters):
                 monitor.noticed(sentence)
         monitor.stepped(self, report, log)
-        if due(settings.evaluate_every) and not last:
+        if due(settings.evaluate_every) and not (last and state.round + 1 == settings.rounds):
             self._evaluate(monitor, checkpoint)
         state.elapsed += time.perf_counter() - started
         if due(settings.checkpoint_every) or state.pending:

@@ -69,10 +69,16 @@ class Observed:
 
 
 def observe(
-    problem: Problem, policy: Policy, simulated: Simulated | None, sets: list[Samples], occupation_states: int
+    problem: Problem,
+    policy: Policy,
+    simulated: Simulated | None,
+    sets: list[Samples],
+    occupation_states: int,
+    together: bool = False,
 ) -> Observed:
     """Look at the controller ``policy`` at the states of ``sets``, and where the trajectories of ``simulated`` end; its
-    occupation density is computed at so many ``occupation_states``, 0 for not at all."""
+    occupation density is computed at so many ``occupation_states``, 0 for not at all, on all cores ``together`` if both are
+    pure functions."""
     with torch.no_grad():
         sup_control = max(float(policy(samples.x[:CONTROLLED]).norm(dim=-1).max()) for samples in sets)
     near = torch.cat([samples.x[:CROSSED] for samples in sets])
@@ -83,7 +89,7 @@ def observe(
         # With noise the density is followed back in time by its divergences.
         followed = problem.gives_divergences or not problem.noisy
         if occupation_states and followed and problem.occupation_bound != math.inf:
-            occupation = estimated_sup_occupation(problem, policy, simulated.end_states, occupation_states)
+            occupation = estimated_sup_occupation(problem, policy, simulated.end_states, occupation_states, together)
             a_priori = a_priori_sup_occupation(problem, policy, sets[0].x[:CONTROLLED])
     jump = largest_jump(policy, problem.dim, problem=problem, near=near)
     return Observed(occupation, a_priori, sup_control, largest_value, jump)

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from ocp_torch.control.policies import Policy, ValuePolicy
 from ocp_torch.maths.brownian import Grid, discounted, increments, path_integral
+from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.runge_kutta import Dynamics, Integrate, discounted_integral
 from ocp_torch.maths.seeds import fixed_generator
@@ -102,12 +103,14 @@ class Sliding:
         return torch.where(self.stays[rows], rates[:, 0] - rates[:, 1], rates[:, 0])
 
 
-def backward_flow(problem: Problem, policy: Policy) -> Dynamics:
+def backward_flow(problem: Problem, policy: Policy, together: bool = False) -> Dynamics:
     r"""`dy/dt = -g(y)` for the closed loop `g = a + B u`, with the logarithm of the density's growth as one more coordinate.
 
     Its discounted integral is `mu^u(x) = rho int e^{-rho t} mu0(y_t) exp(-int_0^t div g(y_s) ds) dt`, `y_0 = x`: the density
     of a flow changes by its divergence (the representation behind Proposition 8 of the paper). Valid for a Lipschitz loop.
     Differences of `g`, all in one call, are cheaper than derivatives of a controller that is a derivative itself.
+
+    It is evaluated on all cores ``together`` if ``problem`` and ``policy`` are pure functions.
 
     With noise, whose divergences must be known, `dy = (2 div D - g) dt + sigma dW`, the density grows by `div div D - div
     g`, and `mu^u(x)` is the mean over paths (Feynman and Kac, for the adjoint equation written out).
@@ -117,7 +120,8 @@ def backward_flow(problem: Problem, policy: Policy) -> Dynamics:
         y, log_factor = state[:, :-1], state[:, -1]
         moves = DIFFERENCE * torch.eye(y.shape[1], dtype=y.dtype)
         around = torch.cat([y, *(y + move for move in moves)])
-        here, *moved = problem.velocity(around, policy(around)).chunk(len(moves) + 1)
+        (velocity,) = in_pieces(lambda at: (problem.velocity(at, policy(at)),), around, together)
+        here, *moved = velocity.chunk(len(moves) + 1)
         divergence = summed((g[:, i] - here[:, i]) / DIFFERENCE for i, g in enumerate(moved))
         motion = torch.cat([-here, -divergence.unsqueeze(-1)], dim=-1)
         if problem.noisy:
@@ -128,14 +132,16 @@ def backward_flow(problem: Problem, policy: Policy) -> Dynamics:
     return backward
 
 
-def settled_occupation(problem: Problem, policy: Policy, x: Tensor, evaluations: int = EVALUATIONS) -> Tensor:
+def settled_occupation(
+    problem: Problem, policy: Policy, x: Tensor, evaluations: int = EVALUATIONS, together: bool = False
+) -> Tensor:
     """`mu^u` ``(N,)`` along the `backward_flow`, as far back as it takes; infinite where the past adds ever more. With
     noise the mean over as many paths as ``evaluations`` allow, less twice its standard error: a lower estimate, and finite.
 
     Where the flow contracts nearly as fast as the discount forgets, the integral settles slowly, and geometrically: what
     is left is extrapolated from the last pieces.
     """
-    rho, dynamics = problem.discount, backward_flow(problem, policy)
+    rho, dynamics = problem.discount, backward_flow(problem, policy, together)
     horizon = PIECE / rho
     with torch.no_grad():
         speed = float(problem.velocity(x, policy(x)).norm(dim=-1).max())
@@ -173,15 +179,18 @@ def _noisy_piece(
     return path_integral(dynamics, sigma, state, grid, moves, discounted(problem.discount))
 
 
-def estimated_sup_occupation(problem: Problem, policy: Policy, end_states: Tensor, states: int) -> float:
+def estimated_sup_occupation(
+    problem: Problem, policy: Policy, end_states: Tensor, states: int, together: bool = False
+) -> float:
     """The largest `mu^u` met: at the ends of trajectories, where mass accumulates, at uniform states, and then near the
-    highest of them."""
+    highest of them; ``together`` as in `backward_flow`."""
     count = max(1, 2 * states // 3)
     picked = end_states[:: max(1, len(end_states) // count)][:count]
     generator = fixed_generator()
     uniform = torch.rand(states - len(picked), problem.dim, dtype=picked.dtype, generator=generator)
     x = torch.cat([picked, uniform])
-    met = lambda x, effort: settled_occupation(problem, policy, x, effort).nan_to_num(nan=math.inf, posinf=math.inf)
+    mu = lambda x, effort: settled_occupation(problem, policy, x, effort, together)
+    met = lambda x, effort: mu(x, effort).nan_to_num(nan=math.inf, posinf=math.inf)
     density = met(x, FEW_EVALUATIONS)
     if not bool(torch.isfinite(density).all()):
         return math.inf
