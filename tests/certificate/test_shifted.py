@@ -242,11 +242,13 @@ def test_what_cannot_be_trained_on_stays_as_it_is():
     ("heights", "made"),
     [
         ((0.02, 0.03, 0.0, 0.01), 2),  # nothing gained in the first, nothing left to gain after the second
-        ((0.02, 0.01, 0.01, 0.0), 2),  # nothing gained in the second
         ((0.02, 0.03, 0.01, 0.0), 3),
+        ((0.02, 6e-4, 0.0, 0.0), 1),  # of .06: one per cent is left, not worth a second round
+        ((8e-4, 0.0, 0.0, 0.0), 1),  # as much is worth a first one
+        ((2e-4, 0.0, 0.0, 0.0), 0),
     ],
 )
-def test_rounds_go_on_while_there_is_something_to_gain_and_they_gain(heights, made, monkeypatch):
+def test_rounds_go_on_while_there_is_as_much_to_gain_as_they_take_longer(heights, made, monkeypatch):
     problem = Circle()
     grid = torch.linspace(0.0, 1.0, 1001, dtype=torch.float64).unsqueeze(1)
     place = float(grid[problem.state_cost(grid).argmin()])  # where no multiple of V makes up for it
@@ -273,8 +275,8 @@ def test_rounds_go_on_while_there_is_something_to_gain_and_they_gain(heights, ma
     monkeypatch.setattr("ocp_torch.certificate.lower.sampled.mollified_shift", lambda best: best)
     found = SampledValue(problem, V, sets, ascents=2, search=True)
     lost = problem.exact_optimum - found.own.bound
-    assert lost > 0.01
-    assert to_gain(found.own) == pytest.approx(lost, rel=0.4)  # the mean of the tail has a part of the spike
+    # The mean of the tail has a part of the spike.
+    assert to_gain(found.own) == pytest.approx(lost, rel=0.4, abs=1e-4)
     assert found.best.value.height.item() == min(heights[: made + 1])
     assert asked == later[:made]
 

@@ -34,17 +34,20 @@ BATCH, ROUNDS, STEPS, RATE = 2048, 3, 300, 5e-4
 
 def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> Iterator[Field | None]:
     """`W` for ``value`` `V` in float64, after each round of training in float32 on up to ``batch`` states a step, and `None`
-    after each step; nothing where `V` has no weights, nothing more where these do not stay finite."""
+    after each step; nothing where `V` has no weights, nothing more where these do not stay finite. Fewer states than `BATCH`
+    are for a quick certificate, with as many times fewer steps."""
     if not isinstance(value, nn.Module) or not any(True for _ in value.parameters()):
         return
     objective, unit = LevelledDual(problem), cost_unit(problem)
     fields = Fields({VALUE: copy.deepcopy(value).float().requires_grad_(True)})
     sampler = SobolSampler(problem.dim, derive_seed(seed, Branch.TIGHTENING), torch.float32)
-    draw = lambda _: problem.samples(sampler.draw(min(batch, BATCH)), divergences=False)
+    states = min(batch, BATCH)
+    draw = lambda _: problem.samples(sampler.draw(states), divergences=False)
     for k in range(ROUNDS):
-        stepper, average = short_fit(fields, objective, RATE, STEPS * 2**k, unit)
+        steps = max(1, STEPS * states // BATCH) * 2**k
+        stepper, average = short_fit(fields, objective, RATE, steps, unit)
         try:
-            for _ in range(STEPS * 2**k):
+            for _ in range(steps):
                 with torch.enable_grad():
                     advance(stepper, average, draw, PHASE)
                 yield None
