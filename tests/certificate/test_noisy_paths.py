@@ -1,15 +1,40 @@
 """Paths with noise: the density by following them back, against its equation and their law; and what is averaged on them."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from ocp_torch.certificate.simulated import candidates
+from ocp_torch.certificate.simulated.candidates import Candidate, simulate_candidates
 from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.certificate.simulated.trajectories import _noisy_piece, backward_flow
 from ocp_torch.maths.differences import STEPS
 from ocp_torch.problems import Manufactured, Problem
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
+from ocp_torch.training.evaluator import QUICK
 from support import zoo
+
+
+@pytest.mark.parametrize(("noise", "efforts"), [(0.02, [4, 4, 16, 4]), (0.0, [16, 16, 4])])
+def test_with_noise_a_controller_that_is_clearly_worse_is_followed_shortly_even_in_a_quick_look(
+    noise, efforts, monkeypatch
+):
+    """Without, so few trajectories are no work. The last ones are those of doing nothing."""
+    problem, made = Manufactured(dim=1, noise=noise), []
+
+    def simulated(problem, policy, trajectories, *rest):
+        made.append(trajectories)
+        return simulate_performance(problem, policy, trajectories, *rest)
+
+    monkeypatch.setattr(candidates, "simulate_performance", simulated)
+    wild = lambda x: torch.full_like(x, 30.0)
+    both = {"worse": Candidate(wild, None, None), "good": Candidate(problem.exact_control, None, None)}
+    settings = replace(QUICK, tolerance=0.05)
+    found, _ = simulate_candidates(problem, both, settings, 0, best_only=True)
+    assert made == efforts
+    assert found["worse"].perf.value > 2.0 * found["good"].perf.value
 
 
 @zoo.on(("noisy 1-d", "noisy 2-d sigma(x)"))

@@ -105,6 +105,25 @@ def test_looking_at_the_bounds_on_the_way_changes_nothing():
     assert all(name.startswith("/watch/") for name in changed), changed
 
 
+@pytest.mark.parametrize(("steps", "apart"), [(7, 7), (900, 900), (1200, 1200), (2000, 1000), (3601, 901)])
+def test_looks_are_evenly_spread_over_the_steps(steps, apart):
+    assert small("trainer.evaluate_every=null", f"trainer.steps={steps}").settings.evaluate_every == apart
+
+
+def test_a_round_ends_with_a_look_but_the_last_one_which_a_certificate_follows():
+    class Looks(Silent):
+        def __init__(self):
+            self.at = []
+
+        def evaluated(self, trainer, certificate):
+            self.at.append(trainer.step)
+
+    monitor = Looks()
+    trainer = small("trainer.evaluate_every=10", "trainer.rounds=2", "trainer.good_gap=1e-9")
+    trainer.fit(monitor)
+    assert (monitor.at, trainer.step) == ([10, 20, 30, 40, 50], 60)
+
+
 RUNS = {
     1: (
         "problem=circle",
