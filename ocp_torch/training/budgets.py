@@ -40,9 +40,9 @@ DENSITY_BATCH = 256
 # Evenly spread states leave more steep spots than independent ones, and the worst state is in one.
 SAMPLER, WORST_STATE_SAMPLER = "sobol", "uniform"
 LEARNING_RATE = 1e-2
-# Steps between looks at most. A look with noise takes as long as 100 to 200 steps; every 600 steps they were a third of the
-# training of a pendulum.
-LOOKS_APART = 1200
+# Steps between looks at most, and where one of them may end the run. A look with noise takes as long as 100 to 200 steps;
+# every 600 steps they were a third of the training of a pendulum.
+LOOKS_APART, TARGET_APART = 1200, 600
 
 
 def fill(config: dict, problem: Problem) -> dict:
@@ -77,7 +77,8 @@ def fill(config: dict, problem: Problem) -> dict:
         defaults["method.density_batch"] = DENSITY_BATCH
     given = config["trainer"].get("steps")
     steps = given if isinstance(given, int) and given > 0 else budget.steps
-    defaults["trainer.evaluate_every"] = math.ceil(steps / math.ceil(steps / LOOKS_APART))
+    apart = LOOKS_APART if config["trainer"].get("target_gap") is None else TARGET_APART
+    defaults["trainer.evaluate_every"] = math.ceil(steps / math.ceil(steps / apart))
     for path, value in defaults.items():
         *groups, name = path.split(".")
         section = filled

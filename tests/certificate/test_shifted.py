@@ -237,6 +237,15 @@ def test_what_cannot_be_trained_on_stays_as_it_is():
     assert not list(tightened(Circle(), broken, seed=0))
 
 
+def test_a_quick_certificate_trains_for_as_many_times_fewer_steps_as_it_has_fewer_states(monkeypatch):
+    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.STEPS", 8)
+    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.BATCH", 64)
+    for batch, first in ((1000, 8), (64, 8), (16, 2), (1, 1)):
+        met = list(tightened(Circle(), perturbed(Circle()), 0, batch))
+        rounds = [k for k, W in enumerate(met) if W is not None]
+        assert rounds == [first, 3 * first + 1, 7 * first + 2]
+
+
 # Heights of spikes on the exact `V` after each round, the first before any.
 @pytest.mark.parametrize(
     ("heights", "made"),

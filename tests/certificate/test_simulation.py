@@ -2,6 +2,7 @@
 
 import math
 import threading
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
 from ocp_torch.certificate.simulated.trajectories import backward_flow, settled_occupation
 from ocp_torch.maths import cores
+from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.runge_kutta import discounted_integral, refined
 from ocp_torch.maths.sampling import evaluation_points
 from ocp_torch.problems import Pendulum, Problem
@@ -203,6 +205,21 @@ class Step(Problem):
 
     def state_cost(self, x):
         return (x[:, 0] < self.edge).to(x) + self.slope * (1.0 + torch.sin(2.0 * math.pi * x[:, 0]))
+
+
+@zoo.on(("manufactured 2-d q=1.5", "noisy 1-d"))
+def test_a_density_followed_back_on_several_cores_is_the_same(problem, monkeypatch):
+    """To the bit whatever the number of cores, and to rounding that of all states at once."""
+    monkeypatch.setattr("ocp_torch.certificate.simulated.trajectories.in_pieces", partial(in_pieces, size=32))
+    x = zoo.states(problem, 48)
+
+    def found(cores: int, together: bool):
+        monkeypatch.setattr("ocp_torch.maths.cores.cores", lambda: cores)
+        return settled_occupation(problem, problem.exact_control, x, 12, together)
+
+    assert torch.equal(found(1, True), found(2, True))
+    # Velocities that differ by 1e-16 are divided by `DIFFERENCE`.
+    torch.testing.assert_close(found(2, True), found(2, False), rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("slope", [0.0, pytest.param(0.2, marks=pytest.mark.nightly)])

@@ -110,6 +110,11 @@ def test_looks_are_evenly_spread_over_the_steps(steps, apart):
     assert small("trainer.evaluate_every=null", f"trainer.steps={steps}").settings.evaluate_every == apart
 
 
+def test_a_run_that_may_stop_at_a_look_has_one_on_the_way():
+    trainer = small("method=dual", "trainer.evaluate_every=null", "trainer.steps=900", "trainer.target_gap=0.01")
+    assert trainer.settings.evaluate_every == 450
+
+
 def test_a_round_ends_with_a_look_but_the_last_one_which_a_certificate_follows():
     class Looks(Silent):
         def __init__(self):
