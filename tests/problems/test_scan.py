@@ -75,7 +75,8 @@ def test_a_supremum_that_only_a_scan_meets_is_used():
     centre = problem.centre.unsqueeze(0)
     # At the bottom of the needle V is about 0 and the conjugate hardly anything, so the slack is about -f.
     assert seeing.own.largest.value >= float(-problem.state_cost(centre)) - 0.02
-    assert seeing.own.largest.points == blind.own.largest.points + len(odd)
+    # A state that takes the bound away joins the search as well.
+    assert seeing.own.largest.points >= blind.own.largest.points + len(odd)
 
 
 def test_the_package_s_own_problems_are_not_scanned_but_what_derives_from_them_is():
