@@ -21,7 +21,7 @@ class Budget:
     stage_steps: int
 
 
-# Many dimensions want samples. In two a second round starts at .3 %: after one alone a noisy pendulum had .53 %, after two .28.
+# Many dimensions want samples. In two a second round starts at .3 %: a noisy pendulum had .53 % after one, .28 % after two.
 BUDGETS = (
     Budget(1, steps=900, batch=256, good_gap=0.005, stage_steps=300),
     Budget(2, steps=900, batch=256, good_gap=0.003, stage_steps=400),
