@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.simulated.outside import outside_note, time_outside
 from ocp_torch.control.policies import zero_policy
@@ -34,6 +35,16 @@ def test_a_controller_that_never_leaves_spends_no_time_there():
     found = time_outside(system, lambda x: system.to_controls(torch.full_like(x, -1.0)), SETTINGS, 0)
     assert found.value < 1e-3
     assert outside_note(system, found) == []
+
+
+def test_what_may_be_much_is_said_too():
+    system = Conveyor()
+    seen = Estimate(1e-4, 5e-3, replicates=8)
+    assert seen.above > 0.01
+    (note,) = outside_note(system, seen)
+    assert "may spend up to 1.2 %" in note
+    assert "0.01 % was seen" in note
+    assert outside_note(system, Estimate(1e-4, 1e-3, replicates=8)) == []
 
 
 def test_with_noise_it_is_what_brownian_motion_says():

@@ -56,13 +56,16 @@ def time_outside(problem: Problem, policy: Policy, settings: CertificateSettings
 
 
 def outside_note(problem: Problem, found: Estimate | None) -> list[str]:
-    """The warning that so much time is spent outside, if it is much."""
-    if found is None or not found.value > MUCH:
+    """The warning that so much time is spent outside, if it is much, or may be."""
+    if found is None or not found.above > MUCH:
         return []
     assert isinstance(problem, System)
     names = " and ".join(problem.coordinates[i].name for i in problem.chart.boxed)
-    half = found.half_width(CONFIDENCE)
+    where = f"of the discounted time outside the box of {names}, where the model is not yours"
+    part, half = 100.0 * found.value, 100.0 * found.half_width(CONFIDENCE)
+    if found.value > MUCH:
+        return [f"the controller spends {part:.2g} % (+- {half:.1g}) {where}: widen the box, or raise failure_cost."]
     return [
-        f"the controller spends {100.0 * found.value:.2g} % (+- {100.0 * half:.1g}) of the discounted "
-        f"time outside the box of {names}, where the model is not yours: widen the box, or raise failure_cost."
+        f"the controller may spend up to {100.0 * found.above:.2g} % {where}, though {part:.2g} % was seen: raise "
+        "certificate.trajectories to know, or widen the box."
     ]
