@@ -11,8 +11,10 @@ from torch import Tensor
 
 from ocp_torch.control.described import described, problem_name, require_same
 from ocp_torch.control.exported import about, coordinates_of, example_states, exported_function
-from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, trained_policies
-from ocp_torch.errors import InputError, notes
+from ocp_torch.control.greedy import HeldPolicy
+from ocp_torch.control.pace import Pace
+from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, TRAJECTORIES, Policy, trained_policies
+from ocp_torch.errors import InputError, notes, require_number
 from ocp_torch.export import export
 from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, MODELS, TRAJECTORY_VALUE, VALUE, Fields
 from ocp_torch.files.limits import require_held, require_modest_problem
@@ -37,9 +39,9 @@ States = TypeVar("States", Tensor, np.ndarray)
 class Controller:
     """`u(x)` with all it came from.
 
-    ``kind`` says which policy `u` is: ``value`` (from `V` alone), ``density`` (`w / mu`) or ``trajectories`` (from the `V` of
-    the warm start). ``certificate`` is the dict of `certificate.json`, ``config`` the resolved configuration of the run,
-    ``model`` the network's configuration.
+    ``kind`` says which policy `u` is: ``value`` (from `V` alone), ``density`` (`w / mu`) or ``trajectories`` (best for a
+    whole step, from the `V` of the warm start). ``certificate`` is the dict of `certificate.json`, ``config`` the resolved
+    configuration of the run, ``model`` the network's configuration.
     """
 
     problem: Problem
@@ -59,11 +61,24 @@ class Controller:
         """Controls ``(N, m)`` at states ``(N, d)``: any reals, wrapped to the torus; NumPy in gives NumPy out.
 
         Raises `InputError` for another shape."""
+        return self._controls(self._policy, x)
+
+    def _controls(self, policy: Policy, x: States) -> States:
         states = self._states("x", x)
         with torch.no_grad():
             # Wrapped before it is rounded, so that states far from the unit cell keep their place in it.
-            u = self._policy(states.remainder(1.0).to(self._like))
+            u = policy(states.remainder(1.0).to(self._like))
         return u.cpu().numpy() if isinstance(x, np.ndarray) else u
+
+    def held(self, x: States, step: float) -> States:
+        """Controls ``(N, m)`` at states ``(N, d)`` that are best where each is held for ``step`` units of time, from the `V`.
+
+        Raises `InputError` as a call does, for a ``step`` that is no time, and where the controller holds no `V`."""
+        field = self.fields.value if self.kind != TRAJECTORIES else self.fields.trajectory_value
+        if field is None:
+            raise InputError("this controller holds no V, from which controls for a whole step follow.")
+        pace = Pace.of(self.problem).with_step(require_number("step", step, above=0.0))
+        return self._controls(HeldPolicy(self.problem, field, pace), x)
 
     def physical(self, s: States) -> States:
         """Controls ``(N, m)`` at states ``(N, d)``, both in the units of a `System`; beyond its box what they are at the

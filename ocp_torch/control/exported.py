@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.control.described import problem_name
+from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.policies import ValuePolicy, trained_policies
 from ocp_torch.errors import InputError, require_choice
 from ocp_torch.export import CONTROL
@@ -61,7 +62,7 @@ def exported_function(
     ``gradient`` ``(N, d)``, in float64. In physical units a state beyond the box is taken for the nearest one in it."""
     fields = copy.deepcopy(fields).to("cpu").double()
     policy = trained_policies(occupation, problem, fields, constants)[kind]
-    field = policy.value if isinstance(policy, ValuePolicy) else fields.value
+    field = policy.value if isinstance(policy, ValuePolicy | HeldPolicy) else fields.value
 
     def on_torus(x: Tensor) -> Outputs:
         if field is None:

@@ -5,6 +5,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from ocp_torch.control.greedy import HeldPolicy
+from ocp_torch.control.pace import Pace
 from ocp_torch.fields.fields import Fields
 from ocp_torch.maths import jets
 from ocp_torch.maths.jets import Field, Jet
@@ -15,7 +17,7 @@ from ocp_torch.problems.generator import Generator, pull_back
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# The controller from the `V` of a warm start, which the values of trajectories were fitted to.
+# The controller from the `V` of a warm start, which the values of trajectories under held controls were fitted to.
 TRAJECTORIES = "trajectories"
 
 # A policy maps states (N, d) to controls (N, m); a density maps them to (N,).
@@ -90,5 +92,5 @@ def trained_policies(kind: str | None, problem: Problem, fields: Fields, constan
         mu = occupation_density(kind, problem, fields, constants)
         policies["density"] = density_policy(fields.control_density, mu, problem.control_cost)
     if fields.trajectory_value is not None:
-        policies[TRAJECTORIES] = ValuePolicy(problem, fields.trajectory_value)
+        policies[TRAJECTORIES] = HeldPolicy(problem, fields.trajectory_value, Pace.of(problem))
     return policies

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from ocp_torch.control.controller import Controller
+from ocp_torch.control.policies import TRAJECTORIES
 from ocp_torch.errors import InputError, require_integer
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.gym.environment import require_gymnasium
@@ -21,6 +22,8 @@ log = logging.getLogger(__name__)
 
 # Frames of a video at most, and steps of an episode: an environment may have no end.
 MOST_FRAMES, MOST_STEPS = 600, 100_000
+# What environments call the time of a step: ours, Pendulum-v1, MuJoCo's and Acrobot-v1, CartPole-v1.
+STEP_NAMES = ("time_step", "dt", "tau")
 
 
 class Agent:
@@ -33,6 +36,7 @@ class Agent:
     def __init__(self, controller: Controller, env, name: str) -> None:
         self.controller, self.name, self.space = controller, name, env.action_space
         own = env.unwrapped
+        self.step = step_of(own)
         if hasattr(own, "from_observation"):
             if own.problem.dim != controller.problem.dim or own.problem.control_dim != controller.problem.control_dim:
                 raise InputError(
@@ -50,13 +54,20 @@ class Agent:
         state = np.asarray(self._state(observation), dtype=np.float64)
         if state.shape != (d,) or not np.isfinite(state).all():
             raise InputError(f"from_observation gave {state} for {self.name}, but must give {d} finite coordinates.")
-        control = self.controller(state[None])[0]
+        step = self.step if self.controller.kind == TRAJECTORIES else None
+        control = (self.controller(state[None]) if step is None else self.controller.held(state[None], step))[0]
         action = np.asarray(self._action(control), dtype=self.space.dtype)
         if action.shape != self.space.shape:
             raise InputError(
                 f"to_action gave shape {action.shape} for {self.name}, whose actions have shape {self.space.shape}."
             )
         return np.clip(action, self.space.low, self.space.high) if hasattr(self.space, "low") else action
+
+
+def step_of(env) -> float | None:
+    """For how long ``env`` holds an action, in its unit of time, where it says so under one of the names in use."""
+    told = (getattr(env, name, None) for name in STEP_NAMES)
+    return next((float(t) for t in told if isinstance(t, int | float) and 0.0 < t < math.inf), None)
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,14 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ocp_torch.control.controller import Controller, load_controller
-from ocp_torch.control.policies import ValuePolicy
+from ocp_torch.control.greedy import HeldPolicy
+from ocp_torch.control.pace import Pace
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.runs.run import run_to_end
 from ocp_torch.training.monitor import Silent
 from ocp_torch.training.warm_start.iteration import ValueIteration
-from ocp_torch.training.warm_start.pace import Pace
 from ocp_torch.training.warm_start.pieces import lambda_returns, roll
 from ocp_torch.training.warm_start.settings import WarmStartSettings
 from support.bits import differences
@@ -112,8 +112,8 @@ def test_the_controller_of_the_warm_start_is_a_candidate_and_can_be_handed_out(t
     )
     fields = trainer.averaged_fields
     x = states(trainer.problem, 16, dtype=torch.float32)
-    best = ValuePolicy(trainer.problem, fields.trajectory_value)(x)
-    assert (best != ValuePolicy(trainer.problem, fields.value)(x)).any()
+    best = HeldPolicy(trainer.problem, fields.trajectory_value, Pace.of(trainer.problem))(x)
+    assert (best != HeldPolicy(trainer.problem, fields.value, Pace.of(trainer.problem))(x)).any()
     made = Controller(
         trainer.problem, fields, trainer.constants, None, "trajectories", trainer.config["model"], {}, trainer.config
     )

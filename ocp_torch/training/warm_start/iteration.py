@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from ocp_torch.control.pace import Pace
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem
 from ocp_torch.problems.starts import drawn_starts
 from ocp_torch.steppers.fitting import optimizer_maker
-from ocp_torch.training.warm_start.pace import Pace
 from ocp_torch.training.warm_start.pieces import lambda_returns, roll
 from ocp_torch.training.warm_start.settings import WarmStartSettings
 from ocp_torch.training.warm_start.trial import STARTS, Trial

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ocp_torch.control.policies import ValuePolicy
-from ocp_torch.maths.jets import Field, jet
+from ocp_torch.control.greedy import HeldPolicy
+from ocp_torch.control.pace import Pace
+from ocp_torch.maths.jets import Field
 from ocp_torch.problems import Problem
 from ocp_torch.problems.samples import Samples
-from ocp_torch.training.warm_start.pace import Pace
 
 
 @dataclass(frozen=True)
@@ -30,19 +30,18 @@ def roll(problem: Problem, value: Field, x: Tensor, pace: Pace, steps: int, gene
 
     Of the cost of a step the part of the state is the mean of that at its ends, exact to second order.
     """
-    policy, cost = ValuePolicy(problem, value), problem.control_cost
+    policy, cost = HeldPolicy(problem, value, pace), problem.control_cost
     states, values, costs = [x], list[Tensor](), list[Tensor]()
     with torch.no_grad():
         at = Samples.live(problem, x)
     for k in range(steps + 1):
-        V = jet(value, at.x).map(torch.Tensor.detach)
-        values.append(V.value)
         with torch.no_grad():
-            u = policy.control(at.B, V)
+            values.append(value(at.x))
+            u = policy(at.x)
             spent = cost.cost(u)
             if k == steps:
                 return Pieces(torch.stack(states), torch.stack(values), torch.stack(costs), at.f + spent)
-            x = pace.move(problem, at.x, u, at.a + torch.einsum("ndm,nm->nd", at.B, u))
+            x = at.x + pace.move(problem, at.x, u)
             if at.noise is not None:
                 drawn = torch.randn(len(x), at.noise.shape[-1], generator=generator).to(x)
                 x = x + math.sqrt(pace.step) * torch.einsum("ndk,nk->nd", at.noise, drawn)

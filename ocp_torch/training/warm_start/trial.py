@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ocp_torch.control.pace import Pace
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems import Problem
-from ocp_torch.training.warm_start.pace import Pace
 from ocp_torch.training.warm_start.pieces import lambda_returns, roll
 
 # Starts of a trial, and its time in units of `1 / rho`.

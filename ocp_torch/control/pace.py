@@ -1,7 +1,9 @@
-"""How fast a problem moves: the time step of simulated pieces, whatever the unit of time."""
+"""How fast a problem moves: for how long a control is held, whatever the unit of time."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -29,9 +31,16 @@ class Pace:
     substeps: int
 
     @classmethod
-    @torch.no_grad()
     def of(cls, problem: Problem) -> "Pace":
-        """That of ``problem`` under controls of its typical size, and within its limits, at states spread over the torus."""
+        """That of ``problem``, measured when it is first asked for: that takes thousands of evaluations."""
+        if problem not in _found:
+            _found[problem] = cls._measured(problem)
+        return _found[problem]
+
+    @classmethod
+    @torch.no_grad()
+    def _measured(cls, problem: Problem) -> "Pace":
+        """Under controls of its typical size, and within its limits, at states spread over the torus."""
         generator = fixed_generator()
         draw = lambda n, by=torch.randn: by(PROBED, n, dtype=torch.float64, generator=generator)
         x = draw(problem.dim, torch.rand)
@@ -43,14 +52,29 @@ class Pace:
         step = min(DISCOUNTED / problem.discount, MOVED / max(speed, 1e-300))
         return cls(step, min(max(1, math.ceil(step * rate / PARTED)), MOST_SUBSTEPS))
 
-    def move(self, problem: Problem, x: Tensor, u: Tensor, velocity: Tensor) -> Tensor:
-        """States ``(N, d)`` one step after ``x`` under the held controls ``u`` ``(N, m)``, not wrapped, without noise;
-        ``velocity`` is that at ``x``."""
-        h = self.step / self.substeps
-        for k in range(self.substeps):
-            v1 = velocity if k == 0 else problem.velocity(x, u)
-            v2 = problem.velocity(x + 0.5 * h * v1, u)
-            v3 = problem.velocity(x + 0.5 * h * v2, u)
-            v4 = problem.velocity(x + h * v3, u)
-            x = x + h / 6.0 * (v1 + 2.0 * v2 + 2.0 * v3 + v4)
-        return x
+    def with_step(self, step: float) -> "Pace":
+        """Steps of another length, in substeps as short as these."""
+        return Pace(step, min(math.ceil(self.substeps * max(1.0, step / self.step)), MOST_SUBSTEPS))
+
+    def move(self, problem: Problem, x: Tensor, u: Tensor) -> Tensor:
+        """How far states ``(N, d)`` move in a step under held controls ``u`` ``(N, m)``, without noise: moves, not states,
+        as the difference of two moves has more digits."""
+        return self._moved(x, lambda y: problem.velocity(y, u))
+
+    def drift(self, problem: Problem, x: Tensor) -> Tensor:
+        """The same without control."""
+        return torch.zeros_like(x) if problem.driftless else self._moved(x, problem.drift)
+
+    def _moved(self, x: Tensor, velocity: Callable[[Tensor], Tensor]) -> Tensor:
+        h, moved = self.step / self.substeps, torch.zeros_like(x)
+        for _ in range(self.substeps):
+            at = x + moved
+            v1 = velocity(at)
+            v2 = velocity(at + 0.5 * h * v1)
+            v3 = velocity(at + 0.5 * h * v2)
+            v4 = velocity(at + h * v3)
+            moved = moved + h / 6.0 * (v1 + 2.0 * v2 + 2.0 * v3 + v4)
+        return moved
+
+
+_found: WeakKeyDictionary[Problem, Pace] = WeakKeyDictionary()

@@ -1,0 +1,76 @@
+"""The control that is best for a whole step: against brute force, in the limit of no step, and within its limits."""
+
+import math
+
+import pytest
+import torch
+
+from ocp_torch.control.greedy import HeldPolicy, kept
+from ocp_torch.control.pace import Pace
+from ocp_torch.control.policies import ValuePolicy
+from ocp_torch.fields import PeriodicMLP
+from ocp_torch.problems import Circle, Pendulum
+from support.zoo import NATURAL, on, states
+
+SWING = Pendulum(control_limit=1.0)
+
+
+def bumpy(problem, seed: int):
+    """A random smooth `V` in the units of ``problem``."""
+    torch.manual_seed(seed)
+    return PeriodicMLP(problem.dim, width=16, depth=2, modes=2, scale=20.0).double().requires_grad_(False)
+
+
+def paid(problem, V, pace, x, u):
+    """What a step costs, and `V` after it, over the part of the discount that passes."""
+    after = V(x + pace.move(problem, x, u)) / (problem.discount * pace.step)
+    return problem.control_cost.cost(u) + after
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("problem", [SWING, Pendulum(), Pendulum(exponent=1.5)], ids=["limit", "free", "q = 1.5"])
+def test_it_beats_the_control_for_an_instant_and_comes_near_to_the_best_of_all(problem, seed):
+    V, x, pace = bumpy(problem, seed), states(problem, 256), Pace(0.08, 2)
+    u, pointwise = HeldPolicy(problem, V, pace)(x).detach(), ValuePolicy(problem, V)(x).detach()
+    reach = min(problem.control_cost.reach, 3.0 * float(pointwise.abs().max()))
+    best = torch.stack(
+        [paid(problem, V, pace, x, torch.full_like(u, float(c))) for c in torch.linspace(-reach, reach, 401)]
+    ).amin(dim=0)
+    lost = [float((paid(problem, V, pace, x, c) - best).clamp_min(0.0).mean()) for c in (u, pointwise)]
+    assert lost[0] < 0.5 * lost[1]
+
+
+@on(NATURAL)
+def test_without_time_it_is_the_control_for_an_instant(problem):
+    V, x = bumpy(problem, 0), states(problem, 32)
+    expected = ValuePolicy(problem, V)(x).detach()
+    errors = [float((HeldPolicy(problem, V, Pace(h, 1))(x).detach() - expected).abs().max()) for h in (1e-5, 1e-6)]
+    size = float(expected.abs().max())
+    assert errors[1] < 0.2 * errors[0] + 1e-9 * size
+    assert errors[1] < 0.01 * size
+
+
+def test_a_limit_holds():
+    u = HeldPolicy(SWING, lambda x: 1e6 * (2.0 * math.pi * x).sin().sum(dim=-1), Pace.of(SWING))(states(SWING, 512)).detach()
+    assert float(u.abs().max()) <= 1.0 + 1e-9
+    assert float(u.abs().max()) > 0.9
+
+
+@pytest.mark.parametrize("q", [2.0, 1.5, 1.1])
+def test_what_is_kept_of_a_control_minimises_a_price_and_a_slope_that_changes_evenly(q):
+    generator = torch.Generator().manual_seed(0)
+    draw = lambda: torch.rand(200, dtype=torch.float64, generator=generator)
+    cost, start = draw(), 2.0 * draw() - 1.5
+    end = start + 4.0 * draw()
+    s = torch.linspace(0.0, 1.0, 20_001, dtype=torch.float64)[:, None]
+    of = lambda s: s**q * cost + s * start + 0.5 * s**2 * (end - start)
+    assert (of(kept(q, cost, start, end)) <= of(s).amin(dim=0) + 1e-7).all()
+
+
+def test_the_pace_of_a_problem_is_measured_once(monkeypatch):
+    problem = Circle()
+    first = Pace.of(problem)
+    monkeypatch.setattr(Pace, "_measured", None)
+    assert Pace.of(problem) is first
+    assert first.with_step(3.0 * first.step).substeps == 3 * first.substeps
+    assert first.with_step(0.1 * first.step).substeps == first.substeps
