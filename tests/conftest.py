@@ -1,5 +1,6 @@
 """What every test shares: one thread, repeatable hypothesis examples, the devices there are, and the zoo as a fixture."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -41,6 +42,12 @@ def cheap_looks():
         patch.setattr(evaluator, "QUICK", little)
         patch.setattr(run, "glimpse", lambda _: {})
         yield
+
+
+@pytest.fixture
+def any_variate(monkeypatch):
+    """A control variate is used however bad it is."""
+    monkeypatch.setattr("ocp_torch.certificate.simulated.performance.NO_VARIATE", math.inf)
 
 
 @pytest.fixture(params=["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"])

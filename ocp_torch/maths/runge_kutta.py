@@ -79,6 +79,20 @@ def _step(dynamics: Dynamics, x: Tensor, h: tuple) -> tuple[Tensor, tuple[Tensor
     return x + (h[0] * v1 + 2.0 * h[1] * (v2 + v3) + h[2] * v4) / 6.0, (r1, r2, r3, r4)
 
 
+def in_finer_steps(integrate: Integrate, times: Tensor) -> Integrate:
+    """``integrate`` with so many ``times`` ``(N,)`` the steps that it is asked for, at least 1, trajectory by trajectory."""
+
+    def each(rows: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+        wanted = times[rows]
+        kinds = wanted.unique().tolist()
+        found = [integrate(rows[wanted == kind], kind * steps) for kind in kinds]
+        order = torch.cat([(wanted == kind).nonzero().squeeze(-1) for kind in kinds]).argsort()
+        results, ends = (torch.cat(parts)[order] for parts in zip(*found, strict=True))
+        return results, ends
+
+    return each
+
+
 def refined(
     integrate: Integrate,
     weights: Tensor,

@@ -147,6 +147,7 @@ def test_recorded_samples_are_certified_truly(tmp_path, name, value):
     assert faults(certificate, problem) == []
 
 
+@pytest.mark.usefixtures("any_variate")
 @pytest.mark.parametrize("horizon", [pytest.param("truncated", marks=pytest.mark.nightly), "random"])
 @pytest.mark.parametrize("tilt", [1.3, pytest.param(1.0, marks=pytest.mark.nightly)])
 def test_a_controller_that_slides_on_a_kink_of_V_costs_what_it_costs(tilt, horizon):

@@ -10,6 +10,7 @@ import torch
 
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
 from ocp_torch.certificate.simulated.trajectories import backward_flow, settled_occupation
+from ocp_torch.control.policies import zero_policy
 from ocp_torch.maths import cores
 from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.runge_kutta import discounted_integral, refined
@@ -85,6 +86,7 @@ def test_the_exact_value_as_control_variate_leaves_nothing_to_simulate(problem):
 
 
 @pytest.mark.nightly
+@pytest.mark.usefixtures("any_variate")
 @zoo.on(("manufactured 2-d mu0", "swing"))
 def test_a_control_variate_does_not_change_the_answer(problem):
     """Any smooth value function will do, and any controller: from the same starts nothing but the bias is left."""
@@ -134,6 +136,7 @@ def test_with_noise_the_occupation_density_is_the_mean_over_paths(problem):
     assert float((found / exact).mean()) > 0.7
 
 
+@pytest.mark.usefixtures("any_variate")
 @zoo.on(("noisy 1-d", pytest.param("noisy 2-d degenerate", marks=pytest.mark.nightly)))
 @pytest.mark.parametrize("horizon", ["truncated", pytest.param("random", marks=pytest.mark.nightly)])
 def test_any_control_variate_gives_the_performance_with_noise(problem, horizon):
@@ -342,3 +345,53 @@ def test_with_noise_the_estimated_density_is_a_number_where_paths_scatter_widely
     found = settled_occupation(problem, policy, zoo.states(problem, 48))
     assert bool(torch.isfinite(found).all())
     assert bool((found >= 0.0).all())
+
+
+@zoo.on(("manufactured 2-d mu0", "noisy 1-d"))
+@pytest.mark.parametrize(("size", "used"), [(0.003, True), (3.0, False)])
+def test_a_value_whose_slack_is_as_large_as_the_cost_is_no_control_variate(problem, size, used):
+    """Then what is found is what is found without any, to the last bit."""
+    rough = zoo.rough_network(problem.dim, seed=2, size=size)
+    value = lambda x: problem.exact_value(x) + rough(x)
+    plain, varied = (
+        simulate_performance(problem, problem.exact_control, 16, 2, 0, V, initial, tolerance=1e-2).perf
+        for V, initial in ((None, None), (value, [problem.exact_optimum] * 2))
+    )
+    assert (varied != plain) == used
+
+
+class Spinning(Problem):
+    """`dx_1/dt = 0`, `dx_2/dt = 1 + 40 (x_1 > 0.95)`: a few trajectories go round much faster than the others."""
+
+    def __init__(self):
+        super().__init__(dim=2)
+        self.asked = []
+
+    def state_cost(self, x):
+        return 1.0 + (TURN * x[:, 1]).cos() * (1.0 + x[:, 0])
+
+    def drift(self, x):
+        self.asked.append(len(x))
+        return torch.stack([torch.zeros_like(x[:, 0]), 1.0 + 40.0 * (x[:, 0] > 0.95)], dim=-1)
+
+    def control_matrix(self, x):
+        return x.new_zeros(len(x), 2, 1)
+
+
+def test_a_few_fast_trajectories_take_finer_steps_and_the_others_none(monkeypatch):
+    """`rho int e^{-rho t} cos(2 pi (y + v t)) dt = (rho^2 cos - rho w sin)(2 pi y) / (rho^2 + w^2)`, `w = 2 pi v`."""
+    problem = Spinning()
+    found, work = [], []
+    for mostly in (0.9, 1.0):
+        monkeypatch.setattr("ocp_torch.certificate.simulated.performance.MOSTLY", mostly)
+        problem.asked.clear()
+        found.append(simulate_performance(problem, zero_policy(problem), 64, 8, 0, tolerance=1e-3).perf)
+        work.append(sum(problem.asked))
+    x, mass = starting_points(problem, 64, 8, 0)
+    rho, w = problem.discount, TURN * (1.0 + 40.0 * (x[:, 0] > 0.95))
+    wave = (rho**2 * (TURN * x[:, 1]).cos() - rho * w * (TURN * x[:, 1]).sin()) / (rho**2 + w**2)
+    exact = float((mass * (1.0 + (1.0 + x[:, 0]) * wave)).mean())
+    for perf in found:
+        assert abs(perf.value - exact) <= perf.bias
+        assert perf.bias < 0.01 * exact
+    assert work[0] < 0.5 * work[1]

@@ -51,7 +51,9 @@ def test_without_time_it_is_the_control_for_an_instant(problem):
 
 
 def test_a_limit_holds():
-    u = HeldPolicy(SWING, lambda x: 1e6 * (2.0 * math.pi * x).sin().sum(dim=-1), Pace.of(SWING))(states(SWING, 512)).detach()
+    u = HeldPolicy(SWING, lambda x: 1e6 * (2.0 * math.pi * x).sin().sum(dim=-1), Pace.of(SWING))(
+        states(SWING, 512)
+    ).detach()
     assert float(u.abs().max()) <= 1.0 + 1e-9
     assert float(u.abs().max()) > 0.9
 
