@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ocp_torch.control.pace import Pace
 from ocp_torch.maths.jets import Field, jet
+from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.generator import pull_back
 from ocp_torch.problems.problem import Problem
 
@@ -37,7 +38,8 @@ class HeldPolicy:
         moved = self.pace.move(problem, x, u)
         along = (moved - drifted) / a_step
         slopes = ((gradient * along).sum(dim=-1) for gradient in (before, jet(self.value, x + moved).gradient))
-        return kept(cost.q, cost.cost(u), *slopes).unsqueeze(-1) * u
+        price = PowerCost(cost.q).cost(u)  # within the limit already: rounding there is no infinite cost
+        return kept(cost.q, price, *slopes).unsqueeze(-1) * u
 
 
 def kept(q: float, cost: Tensor, start: Tensor, end: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from ocp_torch.export.program import STATE, Operation, Program, View
 
 ENTRYWISE = {
     "neg": "-{0}", "sin": "sin({0})", "cos": "cos({0})", "exp": "exp({0})", "log": "log({0})", "tanh": "tanh({0})",
-    "erf": "erf({0})", "sqrt": "sqrt({0})", "abs": "fabs({0})", "floor": "floor({0})", "atan": "atan({0})",
+    "tan": "tan({0})", "erf": "erf({0})", "sqrt": "sqrt({0})", "abs": "fabs({0})", "floor": "floor({0})", "atan": "atan({0})",
     "asin": "asin({0})", "acos": "acos({0})", "sinh": "sinh({0})", "cosh": "cosh({0})", "atan2": "atan2({0}, {1})",
     "add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "pow": "pow({0}, {1})",
     "maximum": "fmax({0}, {1})", "minimum": "fmin({0}, {1})", "eq": "R({0} == {1})", "ne": "R({0} != {1})",

@@ -70,7 +70,8 @@ class Writer:
     def _entrywise(self) -> dict[str, Any]:
         casadi = self.casadi
         named = {
-            n: getattr(casadi, n) for n in "sin cos exp log tanh erf sqrt floor atan asin acos sinh cosh atan2".split()
+            n: getattr(casadi, n)
+            for n in "sin cos tan exp log tanh erf sqrt floor atan asin acos sinh cosh atan2".split()
         }
         return named | {
             "abs": casadi.fabs,

@@ -24,7 +24,7 @@ COPIES = ("alias", "detach", "clone", "lift_fresh", "contiguous", "_to")
 WHOLE = (torch.int8, torch.int16, torch.int32, torch.int64, torch.uint8)
 # Act on each entry, or on the entries of operands brought to one shape.
 ENTRYWISE = """neg sin cos exp log tanh erf sqrt abs floor atan2 add sub mul div maximum minimum eq ne lt le gt ge where
-    atan asin acos sinh cosh""".split()
+    tan atan asin acos sinh cosh""".split()
 REDUCTIONS = {"sum": "sum", "amax": "max", "amin": "min"}
 SAME = {"bitwise_and": "mul", "logical_and": "mul", "bitwise_or": "maximum", "logical_or": "maximum"}
 
@@ -125,6 +125,19 @@ class Lowering:
     def _mean(self, of: View, axes: Any = None, keepdim: bool = False, **_: Any) -> View:
         total = self._reduced("sum", of, axes, keepdim)
         return self._entrywise("div", (total, of.places.numel() / total.places.numel()))
+
+    def _prod(self, of: View, axis: int | None = None, keepdim: bool = False, **_: Any) -> View:
+        factors = of.places.flatten() if axis is None else of.places.movedim(axis, -1)
+        first, *rest = (View(of.buffer, places) for places in factors.unbind(-1))
+        for factor in rest:
+            first = self._entrywise("mul", (first, factor))
+        return View(first.buffer, first.places.unsqueeze(axis)) if keepdim and axis is not None else first
+
+    def _cumsum(self, of: View, axis: int, **_: Any) -> View:
+        sums = list[View]()
+        for term in (View(of.buffer, places) for places in of.places.unbind(axis)):
+            sums.append(self._entrywise("add", (sums[-1], term)) if sums else term)
+        return self._cat([View(v.buffer, v.places.unsqueeze(axis)) for v in sums], axis)
 
     def _cat(self, parts: list, dim: int = 0) -> View:
         views = [v for v in map(self.view, parts) if v.places.numel()]

@@ -1,4 +1,8 @@
-"""A `Program` as an ONNX model of a batch of states, in single precision, by operators of the standard set alone."""
+"""A `Program` as an ONNX model of a batch of states, by operators of the standard set alone.
+
+States and results are in single precision, as most runtimes want them; what is between is in double, so that they are off by
+no more than their own rounding.
+"""
 
 import json
 from typing import Any
@@ -6,17 +10,19 @@ from typing import Any
 import numpy as np
 
 from ocp_torch.errors import InputError
+from ocp_torch.export.onnx_functions import COMPOSED
 from ocp_torch.export.program import STATE, Operand, Operation, Program, View
 
 # The operator set: that of ONNX 1.13, which runtimes have had since 2022; and the version of the file that goes with it.
 OPSET, FILE = 18, 8
 ENTRYWISE = dict(
-    neg="Neg", sin="Sin", cos="Cos", exp="Exp", log="Log", tanh="Tanh", erf="Erf", sqrt="Sqrt", abs="Abs", floor="Floor",
-    atan="Atan", asin="Asin", acos="Acos", sinh="Sinh", cosh="Cosh", add="Add", sub="Sub", mul="Mul", div="Div", pow="Pow",
-    maximum="Max", minimum="Min",
+    neg="Neg", sin="Sin", cos="Cos", exp="Exp", log="Log", tanh="Tanh", sqrt="Sqrt", abs="Abs", floor="Floor", add="Add",
+    sub="Sub", mul="Mul", div="Div", pow="Pow", maximum="Max", minimum="Min",
 )  # fmt: skip
 # Give truth values, which become numbers.
 COMPARED = dict(eq="Equal", lt="Less", le="LessOrEqual", gt="Greater", ge="GreaterOrEqual")
+# The input.
+GIVEN = "state"
 REDUCED = dict(sum="ReduceSum", max="ReduceMax", min="ReduceMin")
 
 
@@ -37,9 +43,10 @@ def onnx_model(program: Program, name: str, about: str, metadata: dict) -> Any:
     outputs = []
     for key, view in program.outputs.items():
         shape = list(view.places.shape[1:])
-        writer.node("Reshape", [writer.entries(view), writer.integers([0, *shape])], key)
+        result = writer.cast(writer.entries(view), "FLOAT")
+        writer.node("Reshape", [result, writer.integers([0, *shape])], key)
         outputs.append(helper.make_tensor_value_info(key, number, ["N", *shape]))
-    state = helper.make_tensor_value_info(writer.names[STATE], number, ["N", program.dim])
+    state = helper.make_tensor_value_info(GIVEN, number, ["N", program.dim])
     graph = helper.make_graph(writer.nodes, name, [state], outputs, writer.initializers)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="ocp_torch")
     model.ir_version, model.doc_string = FILE, about
@@ -56,7 +63,7 @@ class Writer:
         self.nodes: list[Any] = []
         self.initializers: list[Any] = []
         self._known: dict[tuple[str, bytes], str] = {}
-        self.names = {STATE: "state"}
+        self.names = {STATE: self.cast(GIVEN, "DOUBLE")}
         for operation in program.operations:
             self.names[operation.buffer] = self._result(operation)
 
@@ -66,6 +73,18 @@ class Writer:
         self.nodes.append(self.onnx.helper.make_node(kind, inputs, [output], **options))
         return output
 
+    def cast(self, name: str, kind: str) -> str:
+        """What ``name`` holds as numbers of another ``kind``, as ONNX calls it."""
+        return self.node("Cast", [name], to=getattr(self.onnx.TensorProto, kind))
+
+    def number(self, value: float) -> str:
+        """A constant for all entries of all states."""
+        return self._constant(np.full((1, 1), value, dtype=np.float64))
+
+    def table(self, values: np.ndarray) -> str:
+        """Constants ``(k,)``."""
+        return self._constant(values)
+
     def integers(self, values: list[int]) -> str:
         """A constant vector of integers."""
         return self._constant(np.array(values, dtype=np.int64))
@@ -73,7 +92,7 @@ class Writer:
     def entries(self, view: View) -> str:
         """The entries of ``view`` in row-major order, ``(N, ..)``."""
         if view.buffer in self.program.constants:
-            return self._constant(self.program.constants[view.buffer].astype(np.float32)[None, view.flat])
+            return self._constant(self.program.constants[view.buffer][None, view.flat])
         name = self.names[view.buffer]
         if view.whole(self.program.sizes[view.buffer]):
             return name
@@ -87,12 +106,12 @@ class Writer:
         return self._known[key]
 
     def _operand(self, operand: Operand) -> str:
-        return self.entries(operand) if isinstance(operand, View) else self._constant(np.float32(operand).reshape(1, 1))
+        return self.entries(operand) if isinstance(operand, View) else self.number(operand)
 
     def _matrix(self, view: View) -> str:
         """A view ``(n, k)`` as ``(N, n, k)``; a constant one as it is, ready for a product."""
         if view.buffer in self.program.constants:
-            return self._constant(self.program.constants[view.buffer].astype(np.float32)[view.places.numpy()])
+            return self._constant(self.program.constants[view.buffer][view.places.numpy()])
         return self.node("Reshape", [self.entries(view), self.integers([0, *view.places.shape])])
 
     def _result(self, operation: Operation) -> str:
@@ -107,12 +126,13 @@ class Writer:
         if name == "cat":
             return self.node("Concat", self._batched(inputs, operands), axis=1)
         if name == "ne":
-            return self._number(self.node("Not", [self.node("Equal", inputs)]))
+            return self.cast(self.node("Not", [self.node("Equal", inputs)]), "DOUBLE")
         if name in COMPARED:
-            return self._number(self.node(COMPARED[name], inputs))
+            return self.cast(self.node(COMPARED[name], inputs), "DOUBLE")
         if name == "where":
-            truth = self.node("Cast", inputs[:1], to=self.onnx.TensorProto.BOOL)
-            return self.node("Where", [truth, *inputs[1:]])
+            return self.node("Where", [self.cast(inputs[0], "BOOL"), *inputs[1:]])
+        if name in COMPOSED:
+            return COMPOSED[name](self, inputs[0])
         if name in ENTRYWISE:
             return self.node(ENTRYWISE[name], inputs)
         raise InputError(f"format=onnx has no operator for {name}; choose c or casadi.")
@@ -123,8 +143,5 @@ class Writer:
         if not any(constant):
             return inputs
         first = self.node("Gather", [self.names[STATE], self.integers([0])], axis=1)
-        zeros = self.node("Mul", [first, self._constant(np.zeros((1, 1), dtype=np.float32))])
+        zeros = self.node("Mul", [first, self.number(0.0)])
         return [self.node("Add", [name, zeros]) if c else name for name, c in zip(inputs, constant, strict=True)]
-
-    def _number(self, truth: str) -> str:
-        return self.node("Cast", [truth], to=self.onnx.TensorProto.FLOAT)

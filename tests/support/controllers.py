@@ -29,7 +29,7 @@ def controller_of(config: dict, problem: Problem | None = None) -> list[Controll
     generator = torch.Generator().manual_seed(1)
     for weight in fields.parameters():
         weight += 0.2 * torch.randn(weight.shape, generator=generator).to(weight)
-    kinds = {"value": fields.value, "density": fields.control_density}
+    kinds = {"value": fields.value, "density": fields.control_density, "trajectories": fields.trajectory_value}
     common = (problem, fields, trainer.constants, trainer.objective.occupation)
     rest = (trainer.config["model"], CERTIFICATE, trainer.config)
     return [Controller(*common, kind, *rest) for kind, field in kinds.items() if field]
