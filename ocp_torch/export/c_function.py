@@ -29,7 +29,7 @@ Statement = Callable[[str, list[str]], str]
 
 
 class Function:
-    """`void name_function(const real state[d], real output[..], ..)`."""
+    """`void name_function(const name_real state[d], name_real output[..], ..)`."""
 
     def __init__(self, program: Program, name: str, function: str) -> None:
         self.program = program
@@ -42,11 +42,12 @@ class Function:
         """The function; the constants it takes are added to ``pool``, with their labels."""
         for buffer, numbers in self.program.constants.items():
             self.labels[buffer] = pool.setdefault(numbers.tobytes(), f"c{len(pool)}")
-        lines = [f"real w[{max(1, self.space)}];"]
+        lines = [f"real x[{self.program.dim}], w[{max(1, self.space)}];"]
+        lines.append(f"for (int i = 0; i < {self.program.dim}; i++) x[i] = R(state[i]);")
         for operation in self.program.operations:
             lines += self._statements(operation)
         for key, view in self.program.outputs.items():
-            lines += self._loops([view], lambda at, of, key=key: f"{key}[{at}] = {of[0]};")  # type: ignore[misc]
+            lines += self._loops([view], lambda at, of, key=key: f"{key}[{at}] = OUT({of[0]});")  # type: ignore[misc]
         return f"{self.signature}\n{{\n{textwrap.indent(chr(10).join(lines), '    ')}\n}}\n"
 
     def _statements(self, operation: Operation) -> list[str]:
@@ -88,9 +89,7 @@ class Function:
             a, b, at = _linear(row, ["k"]), _linear(right.places.T, ["j", "k"]), _linear(out, ["j"])
             along_columns = columns > 1 and int(right.places[0, 1] - right.places[0, 0]) == 1
             if inner >= LANES and not along_columns and a is not None and b is not None and at is not None:
-                lines += self._dot(
-                    f"{self._label(left.buffer)}[{a}]", f"{self._label(right.buffer)}[{b}]", at, inner, columns
-                )
+                lines += self._dot(self._entry(left.buffer, a), self._entry(right.buffer, b), at, inner, columns)
                 continue
             lines += self._loops([View(WORK, out)], lambda at, of: f"{of[0]} = 0;")
             target = View(WORK, out.unsqueeze(0).expand(inner, -1))
@@ -121,7 +120,7 @@ class Function:
         index = [f"i{axis}" for axis in axes]
         numbered = torch.arange(views[0].places.numel()).view(shape)
         places = [p.squeeze() for p in (numbered, *(view.places for view in views))]
-        read = lambda at: [f"{self._label(view.buffer)}[{place}]" for view, place in zip(views, at, strict=True)]
+        read = lambda at: [self._entry(view.buffer, place) for view, place in zip(views, at, strict=True)]
         rules = [rule for rule in (_linear(p, index) for p in places) if rule is not None]
         if len(rules) < len(places):
             listed = zip(*(p.flatten().tolist() for p in places), strict=True)
@@ -129,10 +128,13 @@ class Function:
         lines = [f"for (int {i} = 0; {i} < {shape[axis]}; {i}++)" for i, axis in zip(index, axes, strict=True)]
         return [*lines, ("    " if lines else "") + statement(rules[0], read(rules[1:]))]
 
-    def _label(self, buffer: int) -> str:
+    def _entry(self, buffer: int, place: str) -> str:
+        """A number of ``buffer``, in the precision that is computed in."""
+        if buffer in self.labels:
+            return f"R({self.labels[buffer]}[{place}])"
         if buffer in (WORK, STATE):
-            return "w" if buffer == WORK else "state"
-        return self.labels[buffer] if buffer in self.labels else f"(w + {self.offsets[buffer]})"
+            return f"{'w' if buffer == WORK else 'x'}[{place}]"
+        return f"(w + {self.offsets[buffer]})[{place}]"
 
 
 def layout(program: Program) -> tuple[dict[int, int], int]:

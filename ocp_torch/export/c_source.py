@@ -1,4 +1,8 @@
-"""A `Program` as C99: a header and a source without dependencies or allocation, in float or in double."""
+"""A `Program` as C99: a header and a source without dependencies or allocation, in double or in float.
+
+Numbers that single precision holds exactly, as the weights of a network, are kept in it: half of the memory, and the same
+function.
+"""
 
 import json
 import math
@@ -17,11 +21,14 @@ HEADER = Template("""\
 /* $name: exported by ocp_torch.
  *
  * $about
- * Stack: $space numbers; nothing is allocated. In double, or in float if both files are compiled with -D${NAME}_FLOAT. */
+ * Stack: $space numbers; nothing is allocated. Compile both files alike:
+ *   (no flag)        states and results are doubles
+ *   -D${NAME}_FLOAT   they are floats; what is between is computed in double, so that results are off by their rounding alone
+ *   -D${NAME}_SINGLE  all is computed in float, for processors without doubles; results are off by some 1e-5 of the most */
 #ifndef ${NAME}_H
 #define ${NAME}_H
 
-#ifdef ${NAME}_FLOAT
+#if defined(${NAME}_FLOAT) || defined(${NAME}_SINGLE)
 typedef float ${name}_real;
 #else
 typedef double ${name}_real;
@@ -39,8 +46,13 @@ SOURCE = Template("""\
 
 #include <tgmath.h>
 
-typedef ${name}_real real;
+#ifdef ${NAME}_SINGLE
+typedef float real;
+#else
+typedef double real;
+#endif
 #define R(number) ((real)(number))
+#define OUT(number) ((${name}_real)(number))
 
 $constants
 
@@ -62,7 +74,7 @@ def c_source(programs: dict[str, Program], name: str, about: str, metadata: dict
         name=name,
         NAME=name.upper(),
         about="\n * ".join(textwrap.wrap(about.replace("*/", "* /"), 110)),
-        space=max(function.space for function in functions),
+        space=max(function.space + function.program.dim for function in functions),
         declarations="\n".join(f"{function.signature};" for function in functions),
         constants="\n".join(_array(label, np.frombuffer(numbers)) for numbers, label in pool.items()),
         functions="\n".join(bodies),
@@ -74,7 +86,9 @@ def c_source(programs: dict[str, Program], name: str, about: str, metadata: dict
 def _array(label: str, numbers: np.ndarray) -> str:
     exact = [_exactly(value) for value in numbers.tolist()]
     lines = (", ".join(exact[k : k + NUMBERS]) for k in range(0, len(exact), NUMBERS))
-    return f"static const real {label}[{len(exact)}] = {{\n    " + ",\n    ".join(lines) + "\n};"
+    with np.errstate(over="ignore"):
+        kind = "float" if np.array_equal(numbers.astype(np.float32), numbers, equal_nan=True) else "real"
+    return f"static const {kind} {label}[{len(exact)}] = {{\n    " + ",\n    ".join(lines) + "\n};"
 
 
 def _exactly(value: float) -> str:
