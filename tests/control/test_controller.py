@@ -1,5 +1,6 @@
 """A controller comes back from its file with the same bits, and no damaged or crafted file ever becomes one."""
 
+import copy
 import json
 import os
 import pickle
@@ -12,6 +13,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from ocp_torch import Circle, InputError, Problem, load_controller
+from ocp_torch.control.policies import trained_policies
 from ocp_torch.files.storage import DIGEST_KEY, METADATA_KEY, digest
 from support.controllers import CERTIFICATE, METHODS, SMALL, controller_of, controllers
 from support.small import configured
@@ -71,17 +73,30 @@ def test_any_real_state_is_wrapped_to_the_torus(method):
         x = states(controller.problem.dim)
         shift = torch.randint(-(10**6), 10**6, x.shape, generator=torch.Generator().manual_seed(1))
         # A sum that float64 holds exactly, and float32 could not.
-        assert torch.equal(controller(x.double() + shift), controller(x))
-        assert torch.equal(controller(shift), controller(torch.zeros_like(x)))
+        assert torch.equal(controller(x.double() + shift), controller(x.double()))
+        assert torch.equal(controller(shift), controller(torch.zeros_like(x.double())))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_controls_have_the_precision_of_the_states_and_are_off_by_their_rounding_alone(method):
+    for controller in controllers(method):
+        x = states(controller.problem.dim)
+        single, double = controller(x), controller(x.double())
+        assert (single.dtype, double.dtype) == (torch.float32, torch.float64)
+        assert torch.equal(single, double.float())
+        fields = copy.deepcopy(controller.fields).double()
+        policy = trained_policies(controller.occupation, controller.problem, fields, controller.constants)
+        with torch.no_grad():
+            assert torch.equal(double, policy[controller.kind](x.double()))
 
 
 def test_numpy_in_gives_numpy_out(saved):
     u = load_controller(saved)
     x = states(2)
     assert isinstance(u(x), torch.Tensor)
-    for array in (x.numpy(), x.double().numpy()):
-        assert isinstance(u(array), np.ndarray)
-        np.testing.assert_array_equal(u(array), u(x).numpy())
+    for given in (x, x.double()):
+        assert isinstance(u(given.numpy()), np.ndarray)
+        np.testing.assert_array_equal(u(given.numpy()), u(given).numpy())
     assert u(np.zeros((0, 2))).shape == (0, 2)
 
 

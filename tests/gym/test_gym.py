@@ -290,7 +290,7 @@ def test_a_saved_pendulum_controller_plays_gymnasiums_untouched(gymnasium, tmp_p
     policy = classical_policy(pendulum)
 
     class Classical:
-        problem = pendulum
+        problem, kind = pendulum, "classical"
 
         def __call__(self, x):
             return policy(torch.from_numpy(x)).numpy()

@@ -13,7 +13,7 @@ from ocp_torch.maths.jets import diffusion_divergences, divergence
 from ocp_torch.maths.mixtures import effective_part
 from ocp_torch.problems import Pendulum, Problem
 from ocp_torch.problems.checks.check import check_once
-from ocp_torch.problems.physical.chart import Chart
+from ocp_torch.problems.physical.chart import Chart, smooth_step
 from ocp_torch.problems.physical.start import start_density
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.starts import initial_points
@@ -133,6 +133,14 @@ def test_the_cut_off_is_1_in_the_box_0_at_the_seams_and_twice_differentiable():
     torch.testing.assert_close(chi, chart.cut(s))
     s.requires_grad_(True)
     torch.testing.assert_close(slope, torch.autograd.grad(chart.cut(s).sum(), s)[0])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rounding_takes_a_smooth_step_out_of_the_unit_interval_nowhere(dtype):
+    near = torch.logspace(-12, -1, 20000, dtype=dtype)  # the ends, where terms cancel
+    step = smooth_step(torch.cat([torch.linspace(-0.1, 1.1, 20001, dtype=dtype), near, 1.0 - near]))
+    assert float(step.min()) == 0.0
+    assert float(step.max()) == 1.0
 
 
 def test_nothing_moves_at_a_seam_and_a_state_there_costs_the_largest_cost_in_the_box():

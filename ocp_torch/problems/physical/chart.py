@@ -15,9 +15,10 @@ DESIGN, MOST_CORNERS = 31, 2**12
 
 
 def smooth_step(z: Tensor) -> Tensor:
-    """From 1 at `z <= 0` to 0 at `z >= 1`, twice differentiable: `1 - z^3 (10 - 15 z + 6 z^2)`."""
-    z = z.clamp(0.0, 1.0)
-    return 1.0 - z**3 * (10.0 - 15.0 * z + 6.0 * z**2)
+    """From 1 at `z <= 0` to 0 at `z >= 1`, twice differentiable: `t^3 (10 - 15 t + 6 t^2)` of `t = 1 - z`, a form in which
+    rounding makes no density negative."""
+    t = 1.0 - z.clamp(0.0, 1.0)
+    return (t**3 * (10.0 - 15.0 * t + 6.0 * t**2)).clamp_max(1.0)
 
 
 class Chart(Placed):
