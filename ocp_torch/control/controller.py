@@ -17,7 +17,7 @@ from ocp_torch.control.pace import Pace
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, TRAJECTORIES, Policy, trained_policies
 from ocp_torch.errors import InputError, notes, require_number
 from ocp_torch.export import export
-from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, MODELS, TRAJECTORY_VALUE, VALUE, Fields
+from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, MODELS, TRAJECTORY_VALUE, VALUE, Fields, made
 from ocp_torch.files.limits import require_held, require_modest_problem
 from ocp_torch.files.reading import FILE, FOLDER, kind
 from ocp_torch.files.storage import load_tensors, save_tensors
@@ -186,7 +186,8 @@ def _rebuilt(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
         raise InputError(f"{path} names the unknown model {model['name']!r}; known are {', '.join(MODELS)}.")
     network, options = MODELS[model["name"]], {k: v for k, v in model.items() if k != "name"}
     outputs = {CONTROL_DENSITY: problem.control_dim}  # the other fields are scalar
-    build = lambda: Fields({n: network(dim=problem.dim, outputs=outputs.get(n), **options) for n in names})
+    form = lambda name: dict(dim=problem.dim, outputs=outputs.get(name), **options)
+    build = lambda: Fields({name: made(name, network, **form(name)) for name in names})
     with torch.device("meta"):
         # Shapes first, without memory: a crafted size must not be allocated before it is refused.
         shapes = {name: t.shape for name, t in build().state_dict().items()}

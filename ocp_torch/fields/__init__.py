@@ -7,7 +7,7 @@ null.
 
 from typing import Any
 
-from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, TRAJECTORY_VALUE, VALUE, Fields
+from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, TRAJECTORY_VALUE, VALUE, Fields, made
 from ocp_torch.fields.mlp import PeriodicMLP
 from ocp_torch.fields.sobolev import SobolevField
 
@@ -22,4 +22,5 @@ __all__ = [
     "Fields",
     "PeriodicMLP",
     "SobolevField",
+    "made",
 ]

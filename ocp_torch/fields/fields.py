@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ocp_torch.errors import InputError
 from ocp_torch.fields.embedding import FourierEmbedding
+from ocp_torch.fields.logarithmic import Logarithmic
 from ocp_torch.fields.rounded import Rounded
 from ocp_torch.fields.waves import STATES, prominent_waves
 from ocp_torch.problems.problem import Problem
@@ -43,7 +44,7 @@ class Fields(nn.Module):
         forms[TRAJECTORY_VALUE] = forms[VALUE]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            fields = cls({name: network(dim=problem.dim, **forms[name]) for name in names})
+            fields = cls({name: made(name, network, dim=problem.dim, **forms[name]) for name in names})
         for embedding in (m for m in fields.modules() if isinstance(m, FourierEmbedding)):
             if embedding.mixed is not None and not embedding.mixed.is_meta:
                 embedding.mix(_waves(problem, len(embedding.mixed)))
@@ -80,6 +81,11 @@ class Fields(nn.Module):
     def parameters_of(self, names: Iterable[str]) -> list[nn.Parameter]:
         """The trainable parameters of the fields ``names``, in a fixed order."""
         return [p for name in names for p in self.networks[name].parameters() if p.requires_grad]
+
+
+def made(name: str, network: NetworkFactory, **form: Any) -> nn.Module:
+    """The network of the field ``name``, of the given ``form``."""
+    return Logarithmic.of(network, **form) if name == TRAJECTORY_VALUE else network(**form)
 
 
 # A state cost whose mean is within this factor of 1 is of an ordinary size.

@@ -23,7 +23,7 @@ def draw(reference: Reference, controller: Controller):
     learned, network = controller(x).double(), controller.fields.value
     rows = {"V": {"grid": value}, "u": {"grid": control, "network": learned, "network - grid": learned - control}}
     if network is not None:
-        learned = batched(network, x.to(controller._like), 8192).double()
+        learned = batched(network, x.to(next(network.parameters())), 8192).double()
         rows["V"] |= {"network": learned, "network - grid": learned - value}
     return (_curves if reference.problem.dim == 1 else _maps)(x, rows)
 

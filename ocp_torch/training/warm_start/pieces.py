@@ -1,4 +1,5 @@
-r"""Pieces of trajectory under the greedy controller of a `V`, and what they say of the value of every state on them."""
+r"""What the warm start learns in general: pieces of trajectory under the greedy controller of a `V`, and what they say of the
+value of every state on them."""
 
 import math
 from collections.abc import Sequence
@@ -9,9 +10,67 @@ from torch import Tensor
 
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.pace import Pace
+from ocp_torch.errors import InputError
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems import Problem
 from ocp_torch.problems.samples import Samples
+from ocp_torch.training.warm_start.settings import WarmStartSettings
+from ocp_torch.training.warm_start.targets import Targets
+
+# Parts of the pieces that start uniformly, and where earlier pieces ended; the rest start as `mu0` says.
+UNIFORM, GOING_ON = 0.125, 0.5
+# Starts that pieces draw from, for each piece.
+POOLED = 8
+
+
+class Trajectories:
+    """Returns along pieces of trajectory of ``problem``, which start among ``starts`` ``(M, d)`` and elsewhere."""
+
+    # A trial follows so many rounds; it goes on from the best at half the rate after so many that are no better.
+    trial_every, patience = 10, 3
+
+    def __init__(
+        self, problem: Problem, pace: Pace, starts: Tensor, settings: WarmStartSettings, generator: torch.Generator
+    ) -> None:
+        self.problem, self.pace, self.starts, self.settings, self.generator = problem, pace, starts, settings, generator
+        self.ends: Tensor | None = None  # (k, d), where pieces ended
+        self.largest = math.inf if problem.state_cost_bound is None else float(problem.state_cost_bound)
+        self.drawn = settings.pieces * settings.steps  # states a round
+
+    @property
+    def plan(self) -> str:
+        return f"{self.settings.pieces} pieces of {self.settings.steps} steps of {self.pace.step:.3g}"
+
+    def targets(self, average: Field) -> Targets:
+        """The states along new pieces under the controller of ``average``, and their lambda-returns."""
+        x = self._draw()
+        pieces = roll(self.problem, average, x, self.pace, self.settings.steps, self.generator)
+        # No controller that is worth having costs more than the dearest state.
+        values = pieces.values.clamp(0.0, self.largest)
+        y = lambda_returns(pieces.costs, values, self.problem.discount, self.pace.step, self.settings.trace)
+        self.ends = pieces.states[-1][self._pick(len(x), round(GOING_ON * len(x)))]
+        return Targets(pieces.states[:-1].flatten(0, 1), y.flatten(), values[:-1].flatten())
+
+    def _draw(self) -> Tensor:
+        """Where the pieces of a round start, ``(N, d)``."""
+        count = self.settings.pieces
+        ends = [] if self.ends is None else [self.ends]
+        uniform = torch.rand(round(UNIFORM * count), self.problem.dim, generator=self.generator).to(self.starts)
+        rest = count - len(uniform) - sum(map(len, ends))
+        return torch.cat([uniform, self.starts[self._pick(len(self.starts), rest)], *ends])
+
+    def _pick(self, of: int, count: int) -> Tensor:
+        return torch.randint(of, (count,), generator=self.generator).to(self.starts.device)
+
+    def state_dict(self) -> dict:
+        return {"ends": None if self.ends is None else self.ends.clone()}
+
+    def load_state_dict(self, state: dict) -> None:
+        """The way back from `state_dict`. Raises `InputError` where its states are none."""
+        ends, dim = state["ends"], self.problem.dim
+        if ends is not None and (ends.ndim != 2 or ends.shape[1] != dim or not ends.isfinite().all()):
+            raise InputError(f"the checkpoint holds ends of trajectories that are no states of {dim} coordinates.")
+        self.ends = None if ends is None else ends.to(self.starts)
 
 
 @dataclass(frozen=True)

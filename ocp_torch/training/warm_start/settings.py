@@ -11,14 +11,11 @@ from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.simulator.simulator import Simulator
 
 OFF, ON, AUTO = "off", "on", "auto"
-# A limited pendulum, of two coordinates, was no better after a minute of both than after one of `dual` alone (cost 3.27 and
-# 3.22, lower bound 2.61 and 2.77); a cart-pole, of four, was (upright from 98 % of starts after 100 s, 79 % after 165 s).
-LEAST_DIM = 3
 
 
 @dataclass(frozen=True)
 class WarmStartSettings:
-    """Whether a run begins with value iteration along trajectories, and how. Raises `InputError` on a wrong value."""
+    """Whether a run begins with value iteration, and how. Raises `InputError` on a wrong value."""
 
     mode: str  # off, on, or auto: where `pays` says so
     rounds: int  # at most
@@ -48,5 +45,5 @@ def pays(problem: Problem, constants: Constants) -> bool:
     which may be dear. What is then found to be no better than doing nothing is not used."""
     underactuated = not problem.driftless and problem.control_dim < problem.dim
     limited = math.isfinite(problem.control_cost.reach)
-    swings_up = constants.unbounded and underactuated and limited and problem.dim >= LEAST_DIM
+    swings_up = constants.unbounded and underactuated and limited
     return swings_up and not isinstance(problem, Simulator)
