@@ -32,7 +32,7 @@ class GridValues:
     """The value of every node of a grid; found when it is first asked for, always the same."""
 
     # A trial follows so many rounds; it goes on from the best at half the rate after so many that are no better.
-    trial_every, patience = 20, 1
+    trial_every, patience = 20, 2
 
     def __init__(self, problem: Problem, pace: Pace, like: Tensor) -> None:
         self.problem, self.pace, self.like = problem, pace.with_step(STEPS * pace.step), like
