@@ -1,4 +1,4 @@
-"""What a process does that torchrun started beside the first one of a run: it helps, writes nothing, and prints nothing as long as
+"""What a process does that torchrun started beside the first one of a run: it helps, writes nothing, and prints nothing while
 there is somebody else to say what is wrong."""
 
 import logging

@@ -6,6 +6,7 @@ two threads would begin theirs in another order on every process. Without torchr
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import timedelta
 from functools import cache
 from typing import Any, TypeVar
@@ -122,13 +123,9 @@ class Ranks(Alone):
             made.append(work())
         except (Exception, SystemExit) as raised:  # whatever a stranger's module may raise
             error = raised
-        sentences = [
-            sentence for sentence in self.gathered(None if error is None else str(error)) if sentence is not None
-        ]
-        if sentences and self.first:
-            raise error or InputError(sentences[0])
-        if sentences:
-            raise Left
+        failed = [told for told in self.gathered(None if error is None else str(error)) if told is not None]
+        if failed:
+            raise (error or InputError(failed[0])) if self.first else Left()
         return made[0]
 
     def fail(self, sentence: str) -> None:
@@ -137,7 +134,8 @@ class Ranks(Alone):
 
     def leave(self) -> None:
         if self.first:
-            self._store.set(LEFT, "")
+            with suppress(RuntimeError):  # torchrun itself is gone
+                self._store.set(LEFT, "")
         self._close()
 
     def _together(self, collective: Callable[[], object]) -> None:
@@ -149,15 +147,15 @@ class Ranks(Alone):
 
     def _lost(self) -> BaseException:
         """What became of the others, as far as the store tells."""
-        if self.first and self._store.check([FAILED]):
-            return ProblemError(self._store.get(FAILED).decode())
-        if self.first:
-            return LostError("another process of this run died.")
         try:
-            self._store.wait([LEFT], LAST_WORD)
-        except RuntimeError:
-            return LostError("the first process of this run died.")
-        return Left()
+            if not self.first:
+                self._store.wait([LEFT], LAST_WORD)
+                return Left()
+            if self._store.check([FAILED]):
+                return ProblemError(self._store.get(FAILED).decode())
+        except RuntimeError:  # it is not so, or torchrun itself is gone
+            pass
+        return LostError(f"{'another' if self.first else 'the first'} process of this run died.")
 
     def _close(self) -> None:
         self._steps = None

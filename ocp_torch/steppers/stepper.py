@@ -109,8 +109,8 @@ class Stepper(ABC):
         return [p.detach().clone() for p in self.fields.parameters()]
 
     def _differentiate(self, samples: Samples, phase: Phase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Set each parameter's gradient to that of its own player's loss, the mean of those of all `ranks`; losses and gradient
-        norms per player."""
+        """Set each parameter's gradient to that of its own player's loss, the mean of those of all `ranks`; losses and
+        gradient norms per player."""
         losses = self.objective.losses(self.fields, samples, phase)
         *_, last = losses
         found = [loss.detach() for loss in losses.values()]

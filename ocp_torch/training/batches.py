@@ -63,9 +63,9 @@ class Batches:
         self.states: Tensor | None = None  # (k, d), where the visited states are now
 
     def draw(self, phase: Phase) -> Samples:
-        """This process's share of the next batch, with what the objective needs at ``phase``, in the precision and on the device
-        of the fields. All draw the same states, and evaluate the problem at their own. Raises `InputError` where there are no
-        equal shares."""
+        """This process's share of the next batch, with what the objective needs at ``phase``, in the precision and on the
+        device of the fields. All draw the same states, and evaluate the problem at their own. Raises `InputError` where there
+        are no equal shares."""
         like = next(self.fields.parameters())
         part = self.visited
         if part is None:
