@@ -90,9 +90,14 @@ class Ranks(Alone):
         self._steps: Any = dist.new_group(backend="gloo", timeout=STEP)
 
     def use(self, device: torch.device) -> None:
-        if device.type == "cuda" and dist.get_backend(self._steps) != "nccl":
-            torch.cuda.set_device(int(os.environ["LOCAL_RANK"]) % torch.cuda.device_count())
-            self._steps = dist.new_group(backend="nccl", timeout=STEP)
+        """Raises `InputError` where a GPU would be that of two processes."""
+        if device.type != "cuda" or dist.get_backend(self._steps) == "nccl":
+            return
+        if (here := int(os.environ["LOCAL_WORLD_SIZE"])) > (has := torch.cuda.device_count()):
+            raise InputError(
+                f"torchrun started {here} processes on a machine with {has} GPU(s); start as many, or use cpu."
+            )
+        self._steps = dist.new_group(backend="nccl", timeout=STEP)
 
     def mean(self, tensors: Sequence[Tensor]) -> list[Tensor]:
         """One sum of one vector, which also carries the flags."""
@@ -165,7 +170,9 @@ class Ranks(Alone):
 
 @cache
 def joined() -> Alone:
-    """This process among those that torchrun started with it."""
+    """This process among those that torchrun started with it; each has a GPU of its own, where there are enough."""
     if "TORCHELASTIC_RUN_ID" not in os.environ or int(os.environ.get("WORLD_SIZE", "1")) < 2:
         return Alone()
+    if torch.cuda.is_available():
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]) % torch.cuda.device_count())
     return Ranks(*next(dist.rendezvous("env://", timeout=timedelta(minutes=5))))

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from torch import nn
 
@@ -18,8 +19,7 @@ from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import blamed
 from ocp_torch.problems.constants import Constants
-from ocp_torch.steppers import NonFiniteError, Stepper, StepReport, advance
-from ocp_torch.training.batches import Batches
+from ocp_torch.steppers import NonFiniteError, StepReport, advance
 from ocp_torch.training.checkpoint import BEST, load_checkpoint, save_checkpoint
 from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.health import Evaluation, sanity_warnings
@@ -182,7 +182,7 @@ class Trainer:
 
     def _stepped(self) -> StepReport:
         """One step. Where other processes are lost in the middle of it, all that it moved is put back."""
-        moved: Sequence[Batches | Stepper] = (self.batches, self.stepper) if self.ranks.size > 1 else ()
+        moved: Sequence[Any] = (self.batches, self.stepper, self.fields) if self.ranks.size > 1 else ()
         before = [copy.deepcopy(part.state_dict()) for part in moved]
         try:
             return advance(self.stepper, self.state.average, self.batches.draw, self.phase)

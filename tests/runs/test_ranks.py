@@ -48,8 +48,9 @@ def assert_same(folder, whole):
         torch.testing.assert_close(weights, other["fields"][name], rtol=ROUNDING, atol=ROUNDING)
     assert one["step"] == other["step"]
     assert one["samples"] == other["samples"]
-    drawn = [{k: v for k, v in state["batches"].items() if k != "states"} for state in (one, other)]
-    assert differences(*drawn) == []
+    # Visited states and boxes of importance follow from the weights, and are the same as far as these are.
+    follow = ("/states", "/sampler/boxes")
+    assert [d for d in differences(one["batches"], other["batches"]) if not d.startswith(follow)] == []
     assert differences(one["generators"], other["generators"]) == []
     for side in ("lower", "upper"):
         for name, estimate in certificate_in(whole)[side].items():

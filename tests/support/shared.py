@@ -10,7 +10,6 @@ import torch.distributed as dist
 from ocp_torch.maths.ranks import joined
 from support.forked import Command, Ended
 
-
 STORES: list[dist.Store] = []  # one for each run, kept by the tests as torchrun keeps its own
 
 
