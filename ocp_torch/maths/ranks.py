@@ -22,7 +22,7 @@ T = TypeVar("T")
 # How long a process waits for the others in a step; and for the first one, which may be making a certificate.
 STEP, WORD = timedelta(minutes=15), timedelta(days=7)
 # How long one that has lost the others waits for the first to have saved, or to say that it left.
-LAST_WORD = timedelta(seconds=5)
+LAST_WORD = timedelta(seconds=3)
 # Keys of the store that torchrun keeps: the first process needs the others no more; what failed in another one.
 LEFT, FAILED = "ocp_torch/left", "ocp_torch/failed"
 
@@ -144,11 +144,11 @@ class Ranks(Alone):
         self._close()
 
     def _together(self, collective: Callable[[], object]) -> None:
-        try:
+        with suppress(RuntimeError, ValueError):
             collective()
-        except (RuntimeError, ValueError) as error:
-            self._close()  # so that those that wait for this one see it as well
-            raise self._lost() from error
+            return
+        self._close()  # so that those that wait for this one see it as well; no traceback may hold the group
+        raise self._lost()
 
     def _lost(self) -> BaseException:
         """What became of the others, as far as the store tells."""
