@@ -25,6 +25,9 @@ WAYS = {
     "primal": ("method=primal", "stepper=extragradient"),
     "pd": ("method=pd", "method.density_batch=4", "sampler.visited=0.25", "trainer.evaluate_every=20"),
     "pd, coupled": ("method=pd", "method.coupling=1", "stepper=extragradient", "optimizer=sgd", "problem.noise=0.01"),
+    "warm start": ("warm_start.mode=on", "warm_start.rounds=3", "warm_start.pieces=16", "warm_start.steps=4"),
+    "two rounds": ("trainer.rounds=2", "trainer.good_gap=1e-6", "trainer.steps=20", "trainer.evaluate_every=10"),
+    "target gap": ("trainer.target_gap=1e-3", "trainer.evaluate_every=10", "certificate.trajectories=8", "method=pd"),
     "importance": ("method=pd", "sampler=importance", "sampler.every=10", "sampler.pool=64", "method.density_batch=8"),
 }
 # Of weights, which are about 1, after 60 steps in double precision.
