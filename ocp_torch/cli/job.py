@@ -22,6 +22,7 @@ from ocp_torch.cli.compose import resolved, run_data
 from ocp_torch.cli.outcome import Record, fail, failed, typed
 from ocp_torch.errors import InputError
 from ocp_torch.files.reading import require_unlinked
+from ocp_torch.maths.ranks import LostError
 from ocp_torch.maths.seeds import generators_kept
 from ocp_torch.problems.blame import blamed
 from ocp_torch.problems.commands import quoted
@@ -96,6 +97,8 @@ class Job:
             if isinstance(error, SystemExit):
                 raise
             if not self.sweeping:
+                if isinstance(error, LostError):
+                    fail(f"{str(error).rstrip('.')}; its state is saved, go on with: {self.again()}")
                 if isinstance(error, InputError):
                     fail(str(error))
                 raise

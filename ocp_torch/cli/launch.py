@@ -13,6 +13,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from torch.optim import Optimizer
 
+from ocp_torch.cli.assist import assist
 from ocp_torch.cli.compose import composed, configuration, parsed, register_resolvers, run_data, with_own_defaults
 from ocp_torch.cli.explain import CHECKOUT, CONFIGS, explain, is_choice, known_fields
 from ocp_torch.cli.help import help_text
@@ -21,6 +22,7 @@ from ocp_torch.cli.outcome import INTERRUPTED, Record, fail, failures, typed
 from ocp_torch.cli.single import carry_out, checked, require_places_to_write
 from ocp_torch.errors import InputError, require_flag, require_section, shown
 from ocp_torch.files.reading import require_unlinked
+from ocp_torch.maths.ranks import joined
 from ocp_torch.problems.commands import ForeignProblem
 from ocp_torch.training.stopping import Preempted
 
@@ -29,6 +31,10 @@ __all__ = ["CHECKOUT", "CONFIGS", "composed", "fail", "isolated", "job", "known_
 HELP = ("--help", "-h")
 ASKS = ("--info", "-i", "--cfg", "-c", "--hydra-help", "--version", "--shell-completion", "-sc")
 SWEEPS = ("-m", "--multirun", "hydra.mode=MULTIRUN")
+SHARED = ("train",)  # what the processes of torchrun can do together
+ONE_RUN = (
+    "the processes of torchrun share a single run of train; give no sweep and no other options, or leave torchrun out."
+)
 MOST_TRIED = 8  # jobs of a sweep that are tried for one value
 # The first optimiser of a process imports PyTorch's compiler, to tell it to leave these methods alone: 1.3 s of CPU.
 LEFT_ALONE = ("add_param_group", "state_dict", "load_state_dict", "zero_grad")
@@ -42,7 +48,7 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
     ``check`` refuses what is wrong, and builds what the work is done on, before any folder is made; a single run works on
     just that. Sweeps, and whatever else Hydra has options for, go through the Hydra ``entry``, which calls `job`. A user's
     mistake ends in one sentence on stderr and exit status 2, a signal in 143 or 130, failed jobs of a sweep in their names
-    and status 2.
+    and status 2. Of several processes that torchrun started all but the first `assist`.
     """
     spare_imports()
     register_resolvers()
@@ -54,18 +60,23 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
     sys.argv[1:] = with_own_defaults(config_name, sys.argv[1:])
     options = [a for a in sys.argv[1:] if a.startswith("-")]
     overrides = [a for a in sys.argv[1:] if not a.startswith("-")]
+    ranks = joined()
+    if not ranks.first:
+        assist(ranks, lambda: checked(overrides, config_name, check), work)
     try:
         if any(option in HELP for option in options):
             print(help_text(config_name, " ".join(typed(sys.argv[0])), overrides))
         elif any(option.split("=")[0] in ASKS for option in options):
             entry()
+        elif ranks.size > 1 and (config_name not in SHARED or options or any(a in SWEEPS for a in overrides)):
+            raise InputError(ONE_RUN)
         elif any(a in SWEEPS for a in sys.argv[1:]):
             sweep(entry, config_name, overrides, check)
         elif options:
             checked(overrides, config_name, check)
             entry()
         else:
-            carry_out(checked(overrides, config_name, check), work)
+            carry_out(ranks.alike(lambda: checked(overrides, config_name, check)), work)
     except ForeignProblem as error:
         fail(f"{str(error).rstrip('.')}; if it is yours: {shlex.join([*command, *error.arguments])}")
     except InputError as error:
@@ -74,6 +85,8 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
         sys.exit(stop.status)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+    finally:
+        ranks.leave()
 
 
 def sweep(entry: Callable, config_name: str, overrides: list[str], check: Callable[[dict], object]) -> None:

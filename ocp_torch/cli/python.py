@@ -17,6 +17,7 @@ from ocp_torch.cli.single import require_writable, told
 from ocp_torch.control.controller import load_controller
 from ocp_torch.errors import InputError, require_integer, shown
 from ocp_torch.files.reading import kind, read_json, require_unlinked
+from ocp_torch.maths.ranks import joined
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import blamed
 from ocp_torch.runs.build import build_problem, checked_problem
@@ -67,6 +68,8 @@ def train(
     raises. Ctrl-C ends the step in hand, saves what has a folder, and raises `KeyboardInterrupt`; a second one does so at
     once. Random generators, threads, signal handlers and Hydra are left as they were.
     """
+    if joined().size > 1:
+        raise InputError("torchrun shares the runs of scripts/train.py alone among processes; call train() without it.")
     short = {"method": method, "trainer.steps": steps, "seed": seed, "resume": resume, "trainer.progress": progress}
     fields = {name: value for name, value in short.items() if value is not None}
     changed = flat(settings or {})

@@ -22,11 +22,13 @@ CLOSED, SADDLE, NETWORK = "closed", "saddle", "network"
 class Phase:
     """Made by whoever trains, at each step, and passed on to losses: an objective has neither a clock nor a state.
 
-    ``constants`` are `M`, `C_V` and `C_u` in force; ``progress`` is the part of the present round that is done, in [0, 1].
+    ``constants`` are `M`, `C_V` and `C_u` in force; ``progress`` is the part of the present round that is done, in [0, 1];
+    the samples are one of ``shares`` equal parts of a batch.
     """
 
     constants: Constants
     progress: float = 1.0
+    shares: int = 1
 
 
 class Objective(ABC):

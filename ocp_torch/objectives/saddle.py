@@ -93,7 +93,8 @@ class AugmentedSaddle(Objective):
         if not self.needs_divergences(phase):
             return {"value": of_value}
         if self.coupling == 0.0:
-            samples, rows = samples.take_weighted(self.density_batch)
+            most = None if self.density_batch is None else self.density_batch // phase.shares
+            samples, rows = samples.take_weighted(most)
             generator, V = self.generator(samples), V.map(lambda part: part[rows])
         w, inflow = generator.control_inflow(self.admissible(fields))
         mu, outflow = generator.occupation_outflow(fields.log_occupation)

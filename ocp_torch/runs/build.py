@@ -17,6 +17,7 @@ from ocp_torch.fields import MODELS, TRAJECTORY_VALUE, VALUE, Fields
 from ocp_torch.fields.fields import cost_unit
 from ocp_torch.fields.waves import STATES
 from ocp_torch.files.limits import require_memory
+from ocp_torch.maths.ranks import joined
 from ocp_torch.maths.sampling import SAMPLERS, RowSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives import METHODS, Objective
@@ -119,6 +120,10 @@ def build_trainer(config: dict, problem: Problem | None = None) -> Trainer:
             f"trainer.target_gap is {settings.target_gap:g}, but {name} gives no lower bound to measure a gap by; "
             "use dual or pd."
         )
+    ranks = joined()
+    ranks.require_shares("trainer.batch", settings.batch)
+    if method.get("density_batch") is not None:
+        ranks.require_shares("method.density_batch", method["density_batch"])
     network = build_network(config["model"])
     warm_start = _warm_start(config, problem, objective, constants)
     # The last of them: the first weights of the others are what they are without it.
@@ -150,7 +155,7 @@ def build_trainer(config: dict, problem: Problem | None = None) -> Trainer:
     warm = None if warm_start is None else ValueIteration(problem, fields.trajectory_value, warm_start, seed)
     run = (problem_name(problem), name)
     state = TrainState(run, config, fields, average, stepper, batches, Health.of(problem), constants, warm=warm)
-    return Trainer(problem, objective, settings, network, seed, state)
+    return Trainer(problem, objective, settings, network, seed, state, ranks=ranks)
 
 
 def _warm_start(config: dict, problem: Problem, objective: Objective, constants: Constants) -> WarmStartSettings | None:

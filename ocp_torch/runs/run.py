@@ -5,6 +5,7 @@ import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from torch import Tensor
@@ -36,6 +37,7 @@ from ocp_torch.runs.report.report import REPORT, write_report
 from ocp_torch.runs.resume import filled_from, require_same_run, result_of
 from ocp_torch.training.checkpoint import LAST
 from ocp_torch.training.monitor import Monitor
+from ocp_torch.training.observer import Silent
 from ocp_torch.training.state import seed_generators
 from ocp_torch.training.stopping import TARGET_GAP, Signals, postpone
 from ocp_torch.training.trainer import Trainer
@@ -95,7 +97,10 @@ def training_run(config: dict, problem: Problem | None = None) -> TrainingRun:
 
 
 def train(run: TrainingRun, folder: Path) -> None:
-    """``run`` in ``folder`` to its end; one that is finished already says so, and what is missing of it is made."""
+    """``run`` in ``folder`` to its end; one that is finished already says so, and what is missing of it is made. Of several
+    processes the first does all of that, and the others `assist` it."""
+    if not run.trainer.ranks.first:
+        return assist(run.trainer)
     require_unlinked(folder)
     for note in run.notes:
         log.warning("warning: %s", note)
@@ -127,6 +132,15 @@ def run_to_end(trainer: Trainer, settings: CertificateSettings, folder: Path) ->
     if end.failed is not None:
         raise InputError(f"{end.failed.rstrip('.')}; the controller in {folder} is that of {handed_out(trainer)}.")
     return end.certificate
+
+
+def assist(trainer: Trainer) -> None:
+    """What a process does that is not the first of its run: its share of every step. It writes nothing."""
+    if trainer.fresh:
+        seed_generators(trainer.seed)
+    with Signals() as signals:
+        while trainer.fit(Silent(), signals=signals) == TARGET_GAP and not trainer.ranks.from_first(bool):
+            postpone(trainer.state)
 
 
 def handed_out(trainer: Trainer) -> str:
@@ -165,6 +179,7 @@ def ending(
                 failure = failure_of(trainer, error)
                 if failure is None:
                     raise
+                trainer.ranks.leave()
                 certificate, fields = salvaged(trainer, settings, failure, monitor)
             controller = hand_out(trainer, certificate, fields, folder, monitor, failure)
     except OSError as error:
@@ -194,7 +209,8 @@ def _trained(
         fields, note = trainer.evaluator.choose(trainer.run)
         certificate = trainer.certify(settings, fields)
         gap = certificate.gap["certified"]
-        if reason != TARGET_GAP or (gap is not None and gap <= target):
+        reached = gap is not None and target is not None and gap <= target
+        if reason != TARGET_GAP or trainer.ranks.from_first(partial(bool, reached)):
             return with_warnings(trainer, certificate, [note] if note else []), fields
         log.info("step %d: the certified gap is not %g yet; training goes on.", trainer.step, target)
         postpone(trainer.state)

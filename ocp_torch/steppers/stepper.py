@@ -14,6 +14,7 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
+from ocp_torch.maths.ranks import Alone
 from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM, NonFiniteError, first_nonfinite
@@ -65,6 +66,7 @@ class Stepper(ABC):
         self.delays = {player: objective.delays.get(player, 0.0) for player in objective.players}
         self.schedules = {player: schedule(o, self.delays[player]) for player, o in self.optimizers.items()}
         self._start = copy.deepcopy(self.state_dict())
+        self.ranks = Alone()  # those with which batches are shared
 
     @abstractmethod
     def step(self, batches: Sequence[Samples], phase: Phase) -> StepReport:
@@ -107,26 +109,34 @@ class Stepper(ABC):
         return [p.detach().clone() for p in self.fields.parameters()]
 
     def _differentiate(self, samples: Samples, phase: Phase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Set each parameter's gradient to that of its own player's loss; losses and gradient norms per player."""
+        """Set each parameter's gradient to that of its own player's loss, the mean of those of all `ranks`; losses and
+        gradient norms per player."""
         losses = self.objective.losses(self.fields, samples, phase)
         *_, last = losses
-        norms = {}
+        found = [loss.detach() for loss in losses.values()]
         for player, loss in losses.items():
             own = self.parameters[player]
             more = player != last
             gradients = torch.autograd.grad(loss / self.unit, own, retain_graph=more, allow_unused=True)
-            for parameter, gradient in zip(own, gradients, strict=True):
-                # A bias that only shifts V gets no gradient where only grad V matters.
-                parameter.grad = torch.zeros_like(parameter) if gradient is None else gradient
-            norms[player] = torch.nn.utils.get_total_norm([p.grad for p in own])
+            # A bias that only shifts V gets no gradient where only grad V matters.
+            found += [torch.zeros_like(p) if g is None else g for p, g in zip(own, gradients, strict=True)]
+        means = iter(self.ranks.mean(found))
+        losses, norms = {player: next(means) for player in losses}, {}
+        for player in losses:
+            for parameter in self.parameters[player]:
+                parameter.grad = next(means)
+            norms[player] = torch.nn.utils.get_total_norm([p.grad for p in self.parameters[player]])
         if not torch.stack([*losses.values(), *norms.values()]).isfinite().all():
-            what = first_nonfinite(self.objective, self.fields, samples, phase)
+            here = not all(part.isfinite().all() for part in found)
+            first = lambda: first_nonfinite(self.objective, self.fields, samples, phase)
+            told = self.ranks.gathered(first() if here else None)
+            what = next(filter(None, told), None) or first()
             advice = "" if what.endswith(BROKEN_PROBLEM) else "; try a smaller optimizer.lr, or stepper.clip"
             raise NonFiniteError(f"{what}{advice}.")
         if self.clip is not None:
             for player, norm in norms.items():
                 torch.nn.utils.clip_grads_with_norm_(self.parameters[player], self.clip, norm)
-        return {player: loss.detach() for player, loss in losses.items()}, norms
+        return losses, norms
 
     def _update(self, players: Iterable[str], ahead: bool = False) -> None:
         """One update of ``players`` with the gradients in place, then the projection. A player's schedule counts its own

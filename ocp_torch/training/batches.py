@@ -1,6 +1,6 @@
 """Training batches: states of a sampler and, where that pays, states that the controller in training visits."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -9,6 +9,7 @@ from torch import Tensor
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.errors import InputError, require_number
 from ocp_torch.fields import VALUE, Fields
+from ocp_torch.maths.ranks import Alone
 from ocp_torch.maths.sampling import ImportanceSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives import Objective, Phase
@@ -48,6 +49,7 @@ class Batches:
     size: int
     seed: int
     visited: float | None = None
+    ranks: Alone = field(default_factory=Alone)  # those with which each batch is shared
 
     def __post_init__(self) -> None:
         if self.visited is not None:
@@ -61,17 +63,22 @@ class Batches:
         self.states: Tensor | None = None  # (k, d), where the visited states are now
 
     def draw(self, phase: Phase) -> Samples:
-        """The next batch, with what the objective needs at ``phase``, in the precision and on the device of the fields."""
+        """This process's share of the next batch, with what the objective needs at ``phase``, in the precision and on the
+        device of the fields. All draw the same states, and evaluate the problem at their own. Raises `InputError` where there
+        are no equal shares."""
         like = next(self.fields.parameters())
         part = self.visited
         if part is None:
             part = VISITED if self._possible and phase.constants.unbounded else 0.0
         count = min(int(part * self.size), self.size - 1)
         divergences = self.objective.needs_divergences(phase)
+        self.ranks.require_shares("trainer.batch", self.size)
+        self.ranks.require_shares("the number of visited states in trainer.batch", count)
         if isinstance(self.sampler, ImportanceSampler):
             drawn = self._weighted(self.sampler, self.size - count, phase, like, divergences)
         else:
-            drawn = self.problem.samples(self.sampler.draw(self.size - count).to(like.device), divergences=divergences)
+            x = self.sampler.draw(self.size - count)[self.ranks.share]
+            drawn = self.problem.samples(x.to(like.device), divergences=divergences)
         if not self.problem.has_simulator:
             return drawn.to(like)
         return self._with_visited(drawn, count, like, divergences) if count else drawn
@@ -83,20 +90,21 @@ class Batches:
         at = lambda x: self.problem.samples(x.to(like.device), divergences=divergences)
         if sampler.due:
             x, weight = sampler.pool()
-            sampler.learn(x, weight, scores(self.objective, self.fields, at(x), phase, sampler.generator))
-        x, weight = sampler.draw_weighted(count)
+            whole = replace(phase, shares=1)
+            sampler.learn(x, weight, scores(self.objective, self.fields, at(x), whole, sampler.generator))
+        x, weight = (part[self.ranks.share] for part in sampler.draw_weighted(count))
         return replace(at(x), weight=weight.to(like))
 
     def _with_visited(self, drawn: Samples, count: int, like: Tensor, divergences: bool) -> Samples:
         if self.states is None or len(self.states) != count:
             self.states = self._uniform(count, like)
         visited = self.problem.samples(self.states.to(like), divergences=divergences)
-        spent = self._move(visited)
+        spent = self._move(visited)  # of all, on every process: where they go next is then the same everywhere
         # The drawn states stand for all integrals, as they would without the visited ones; the penalties see both.
-        share = (len(drawn) + count) / len(drawn)
-        drawn = replace(drawn, weight=share * drawn.weight, penalty_weight=drawn.weight)
+        part = self.size / (self.size - count)
+        drawn = replace(drawn, weight=part * drawn.weight, penalty_weight=drawn.weight)
         visited = replace(visited, weight=torch.zeros_like(visited.weight), penalty_weight=spent)
-        return Samples.concatenate([drawn, visited])
+        return Samples.concatenate([drawn, visited.take(self.ranks.share)])
 
     @torch.no_grad()
     def _move(self, at: Samples) -> Tensor:

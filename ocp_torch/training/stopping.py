@@ -4,6 +4,7 @@ hand finish and the state be saved, and the second stops at once."""
 import os
 import signal
 import threading
+from collections.abc import Sequence
 from types import FrameType
 
 from ocp_torch.training.settings import TrainerSettings
@@ -60,10 +61,11 @@ class Preempted(BaseException):
 class Signals:
     """While it is entered, holds back the first signal for the trainer to `take`; where no step is in hand and the state is
     saved (``saved = True``) the first one already raises `Preempted`. The second ends the process, if it is the run's own
-    (``exits``), and else raises `Preempted` too."""
+    (``exits``), and else raises `Preempted` too. Where the run is ``ending`` by itself, those that come later do nothing."""
 
     def __init__(self, exits: bool = True) -> None:
         self._exits = exits
+        self.ending = False
         self.received: int | None = None
         self.saved = False
         self._before: dict = {}
@@ -76,7 +78,7 @@ class Signals:
 
     def __exit__(self, *_) -> None:
         for number, handler in self._before.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_IGN if self.ending else handler)
 
     def _caught(self, number: int, frame: FrameType | None) -> None:
         again = self.received is not None
@@ -85,6 +87,14 @@ class Signals:
         self.received = number
         if again or self.saved:
             raise Preempted(number)
+
+    def came(self) -> list[bool]:
+        """Which of `CAUGHT`."""
+        return [number == self.received for number in CAUGHT]
+
+    def raise_first(self, came: Sequence[bool]) -> None:
+        """Raise `Preempted` by the first of `CAUGHT` that ``came``, here or to another process."""
+        raise Preempted(next(number for number, yes in zip(CAUGHT, came, strict=True) if yes))
 
     def take(self) -> None:
         """Raise `Preempted` if a signal came."""

@@ -1,10 +1,12 @@
 """The loop: draw, step, average; evaluate, log and save on the way. It does not know its method."""
 
+import copy
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from torch import nn
 
@@ -12,18 +14,19 @@ from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained
 from ocp_torch.certificate.settings import Progress, silent
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
+from ocp_torch.maths.ranks import Alone, LostError
 from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import blamed
 from ocp_torch.problems.constants import Constants
-from ocp_torch.steppers import NonFiniteError, advance
+from ocp_torch.steppers import NonFiniteError, StepReport, advance
 from ocp_torch.training.checkpoint import BEST, load_checkpoint, save_checkpoint
 from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.health import Evaluation, sanity_warnings
 from ocp_torch.training.observer import Silent
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.state import TrainState
-from ocp_torch.training.stopping import ASKED, STEPS, Signals, in_words, reason_to_stop
+from ocp_torch.training.stopping import ASKED, MAX_SECONDS, STEPS, TARGET_GAP, Signals, in_words, reason_to_stop
 
 
 @dataclass(eq=False)
@@ -39,6 +42,7 @@ class Trainer:
     tell: Progress = silent  # is given the name of each stage of the full certificate
     stopped: str = STEPS  # why
     asked: bool = False  # to stop after the step in hand
+    ranks: Alone = field(default_factory=Alone)  # the processes of this run
 
     def __post_init__(self) -> None:
         state = self.state
@@ -82,7 +86,7 @@ class Trainer:
     @property
     def phase(self) -> Phase:
         """What the next step's losses may know of time."""
-        return Phase(self.constants, self.settings.part_done(self.step, self.state.round))
+        return Phase(self.constants, self.settings.part_done(self.step, self.state.round), self.batches.ranks.size)
 
     def fit(self, monitor: Silent, checkpoint: Path | None = None, signals: Signals | None = None) -> str:
         """Train until there is a reason to stop, and return it; save to ``checkpoint`` on the way and at the end.
@@ -91,24 +95,44 @@ class Trainer:
         `target_gap`, when a quick certificate is good enough that a full one should decide: where it decides against,
         `postpone` and call again. A signal that ``signals`` caught raises `Preempted` after the step in hand, with the state
         saved. Raises `NonFiniteError` before an update that is not finite.
+
+        Of several processes each calls this; the first saves, and makes warm starts and looks while the others wait. Raises
+        `LostError`, with the state saved as it was after the last whole step, where one of them ends without a word.
         """
+        signals = signals or Signals()
         self.state.ended = False
-        self._warm_up(monitor, checkpoint, signals)
-        while self._reason is None:
-            if self.step < self.end:
-                self._advance(monitor, checkpoint)
-            elif self._wants_another_round():
-                self.state.round += 1
-                monitor.extended(self)
-            else:
-                break
-            if signals is not None and signals.received is not None:
-                self.save(checkpoint)
-                signals.take()
-        self.stopped = self._reason or STEPS
+        self.ranks.use(self.settings.torch_device)
+        self.stepper.ranks = self.batches.ranks = self.ranks
+        try:
+            self.stopped = self._until_stopped(monitor, checkpoint, signals)
+        except LostError as error:
+            signals.ending = True
+            self.save(checkpoint)
+            raise LostError(f"{str(error).rstrip('.')}, at step {self.step}.") from None
         self.state.ended = self.stopped != ASKED  # a resume then goes on
         self.save(checkpoint)
         return self.stopped
+
+    def _until_stopped(self, monitor: Silent, checkpoint: Path | None, signals: Signals) -> str:
+        """Train until there is a reason to stop, on which all processes agree."""
+        self.ranks.from_first(lambda: self._warm_up(monitor, checkpoint, signals))
+        for module in (self.fields, self.state.average):
+            module.load_state_dict(self.ranks.from_first(module.state_dict))
+        reason = self.ranks.from_first(lambda: self._reason)
+        while reason is None:
+            if self.step < self.end:
+                self._advance(monitor, checkpoint)
+            elif self.ranks.from_first(self._wants_another_round):
+                self.state.round += 1
+                monitor.extended(self)
+            else:
+                return STEPS
+            asked, over, *came = self.ranks.agree([self.asked, self._reason == MAX_SECONDS, *signals.came()])
+            if any(came):
+                self.ranks.from_first(lambda: self.save(checkpoint))
+                signals.raise_first(came)
+            reason = ASKED if asked else TARGET_GAP if self.state.pending else MAX_SECONDS if over else None
+        return reason
 
     @property
     def why_stopped(self) -> str:
@@ -119,7 +143,7 @@ class Trainer:
     def _reason(self) -> str | None:
         return ASKED if self.asked else reason_to_stop(self.settings, self.state)
 
-    def _warm_up(self, monitor: Silent, checkpoint: Path | None, signals: Signals | None) -> None:
+    def _warm_up(self, monitor: Silent, checkpoint: Path | None, signals: Signals) -> None:
         """What is left of the warm start; `V` then begins as its best one, which itself stays a candidate."""
         state, warm = self.state, self.state.warm
         while warm is not None and not warm.done and self._reason is None:
@@ -131,19 +155,17 @@ class Trainer:
             spent = time.perf_counter() - started
             state.seconds, state.elapsed = state.seconds + spent, state.elapsed + spent
             monitor.warmed(self, looked)
-            stop = signals is not None and signals.received is not None
-            if looked or stop:
+            if looked or signals.received is not None:
                 self.save(checkpoint)
-            if stop and signals is not None:
-                signals.take()
+            signals.take()
 
     def _advance(self, monitor: Silent, checkpoint: Path | None) -> None:
         """One step, and what is due after it."""
         settings, state = self.settings, self.state
         started = time.perf_counter()
-        report = advance(self.stepper, state.average, self.batches.draw, self.phase)
+        report = self._stepped()
         state.step += 1
-        state.samples += report.samples
+        state.samples += self.ranks.size * report.samples
         state.seconds += time.perf_counter() - started
         due = lambda every: every > 0 and state.step % every == 0
         last = state.step == self.end
@@ -153,13 +175,24 @@ class Trainer:
                 monitor.noticed(sentence)
         monitor.stepped(self, report, log)
         if due(settings.evaluate_every) and not (last and state.round + 1 == settings.rounds):
-            self._evaluate(monitor, checkpoint)
+            state.pending = self.ranks.from_first(lambda: self._evaluate(monitor, checkpoint))
         state.elapsed += time.perf_counter() - started
         if due(settings.checkpoint_every) or state.pending:
             self.save(checkpoint)
 
-    def _evaluate(self, monitor: Silent, checkpoint: Path | None) -> None:
-        """A quick certificate: keep the state if it is the best so far, and see whether it is good enough."""
+    def _stepped(self) -> StepReport:
+        """One step. Where other processes are lost in the middle of it, all that it moved is put back."""
+        moved: Sequence[Any] = (self.batches, self.stepper, self.fields) if self.ranks.size > 1 else ()
+        before = [copy.deepcopy(part.state_dict()) for part in moved]
+        try:
+            return advance(self.stepper, self.state.average, self.batches.draw, self.phase)
+        except LostError:
+            for part, state in zip(moved, before, strict=True):
+                part.load_state_dict(state)
+            raise
+
+    def _evaluate(self, monitor: Silent, checkpoint: Path | None) -> bool:
+        """A quick certificate: keep the state if it is the best so far, and see whether it may be good enough to end."""
         self.state.require_finite()
         certificate = self.evaluator.evaluate(self.run)
         monitor.evaluated(self, certificate)
@@ -174,6 +207,7 @@ class Trainer:
         self.state.pending = target is not None and gap is not None and gap <= target and not tried
         if best and checkpoint is not None:
             save_checkpoint(checkpoint.with_name(BEST), self.state_dict())
+        return self.state.pending
 
     def _wants_another_round(self) -> bool:
         """Whether rounds are left and the gap is not good yet; never without both bounds to measure it by."""

@@ -1,0 +1,178 @@
+"""The processes that torchrun starts for one run: which of them this one is, and what they tell one another.
+
+The first writes, prints and decides; the others take their shares of each batch. Collectives are for the main thread alone:
+two threads would begin theirs in another order on every process. Without torchrun a process is `Alone`, at no cost.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from datetime import timedelta
+from functools import cache
+from typing import Any, TypeVar
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from ocp_torch.errors import InputError, ProblemError
+
+T = TypeVar("T")
+
+# How long a process waits for the others in a step; and for the first one, which may be making a certificate.
+STEP, WORD = timedelta(minutes=15), timedelta(days=7)
+# How long one that has lost the others waits for the first to have saved, or to say that it left.
+LAST_WORD = timedelta(seconds=3)
+# Keys of the store that torchrun keeps: the first process needs the others no more; what failed in another one.
+LEFT, FAILED = "ocp_torch/left", "ocp_torch/failed"
+
+
+class LostError(InputError):
+    """Another process of the run ended without a word, or does not answer."""
+
+
+class Left(BaseException):
+    """The first process needs the others no more. No `Exception`: nothing on the way may swallow it."""
+
+
+class Alone:
+    """The only process."""
+
+    first, size, share = True, 1, slice(None)
+
+    def use(self, device: torch.device) -> None:
+        """Take the means of what is on ``device``."""
+
+    def require_shares(self, name: str, count: int) -> None:
+        """Raise `InputError` where ``count``, which ``name`` was given as, cannot be shared equally."""
+        if count % self.size:
+            raise InputError(
+                f"{name} is {count}, which {self.size} processes cannot share equally; give a multiple of {self.size}."
+            )
+
+    def mean(self, tensors: Sequence[Tensor]) -> list[Tensor]:
+        """The means over all processes of each of ``tensors``, of one precision and on one device."""
+        return list(tensors)
+
+    def agree(self, flags: Sequence[bool]) -> list[bool]:
+        """Which of ``flags`` any process has raised, in time for the last `mean`: that is the same everywhere."""
+        return list(flags)
+
+    def from_first(self, work: Callable[[], T]) -> T:
+        """What ``work``, which only the first process does, gives there."""
+        return work()
+
+    def gathered(self, value: T) -> list[T]:
+        """The ``value`` of each process."""
+        return [value]
+
+    def alike(self, work: Callable[[], T]) -> T:
+        """What ``work`` gives here, once all have done it; where it fails in any, it fails in the first, and all others have
+        `Left`."""
+        return work()
+
+    def fail(self, sentence: str) -> None:
+        """Have the first process raise `ProblemError` with ``sentence``."""
+
+    def leave(self) -> None:
+        """Part for good: what the others still wait for ends."""
+
+
+class Ranks(Alone):
+    """One of several. A collective raises `LostError` where others are lost, and `Left` where the first one left."""
+
+    def __init__(self, store: Any, rank: int, size: int) -> None:
+        self.first, self.size, self.share = rank == 0, size, slice(rank, None, size)
+        self._store, self._said, self._heard = store, list[bool](), list[bool]()
+        dist.init_process_group(
+            "gloo", store=dist.PrefixStore("ocp_torch", store), rank=rank, world_size=size, timeout=WORD
+        )
+        self._steps: Any = dist.new_group(backend="gloo", timeout=STEP)
+
+    def use(self, device: torch.device) -> None:
+        """Raises `InputError` where a GPU would be that of two processes."""
+        if device.type != "cuda" or dist.get_backend(self._steps) == "nccl":
+            return
+        if (here := int(os.environ["LOCAL_WORLD_SIZE"])) > (has := torch.cuda.device_count()):
+            raise InputError(
+                f"torchrun started {here} processes on a machine with {has} GPU(s); start as many, or use cpu."
+            )
+        self._steps = dist.new_group(backend="nccl", timeout=STEP)
+
+    def mean(self, tensors: Sequence[Tensor]) -> list[Tensor]:
+        """One sum of one vector, which also carries the flags."""
+        said = tensors[0].new_tensor(self._said, dtype=tensors[0].dtype)
+        flat = torch.cat([*(t.detach().flatten() for t in tensors), said])
+        self._together(lambda: dist.all_reduce(flat, group=self._steps))
+        *parts, heard = flat.split([*(t.numel() for t in tensors), len(said)])
+        self._heard = (heard > 0.0).tolist()
+        return [(part / self.size).view_as(t) for part, t in zip(parts, tensors, strict=True)]
+
+    def agree(self, flags: Sequence[bool]) -> list[bool]:
+        self._said = list(flags)
+        return [*self._heard, *[False] * len(flags)][: len(flags)]
+
+    def from_first(self, work: Callable[[], T]) -> T:
+        told: list[Any] = [work() if self.first else None]
+        self._together(lambda: dist.broadcast_object_list(told, src=0))
+        return told[0]
+
+    def gathered(self, value: T) -> list[T]:
+        values: list[Any] = [None] * self.size
+        self._together(lambda: dist.all_gather_object(values, value))
+        return values
+
+    def alike(self, work: Callable[[], T]) -> T:
+        made, error = list[T](), None
+        try:
+            made.append(work())
+        except (Exception, SystemExit) as raised:  # whatever a stranger's module may raise
+            error = raised
+        failed = [told for told in self.gathered(None if error is None else str(error)) if told is not None]
+        if failed:
+            raise (error or InputError(failed[0])) if self.first else Left()
+        return made[0]
+
+    def fail(self, sentence: str) -> None:
+        self._store.set(FAILED, sentence)
+        self._close()
+
+    def leave(self) -> None:
+        if self.first:
+            with suppress(RuntimeError):  # torchrun itself is gone
+                self._store.set(LEFT, "")
+        self._close()
+
+    def _together(self, collective: Callable[[], object]) -> None:
+        with suppress(RuntimeError, ValueError):
+            collective()
+            return
+        self._close()  # so that those that wait for this one see it as well; no traceback may hold the group
+        raise self._lost()
+
+    def _lost(self) -> BaseException:
+        """What became of the others, as far as the store tells."""
+        try:
+            if not self.first:
+                self._store.wait([LEFT], LAST_WORD)
+                return Left()
+            if self._store.check([FAILED]):
+                return ProblemError(self._store.get(FAILED).decode())
+        except RuntimeError:  # it is not so, or torchrun itself is gone
+            pass
+        return LostError(f"{'another' if self.first else 'the first'} process of this run died.")
+
+    def _close(self) -> None:
+        self._steps = None
+        if dist.is_initialized():
+            dist.destroy_process_group()
+
+
+@cache
+def joined() -> Alone:
+    """This process among those that torchrun started with it; each has a GPU of its own, where there are enough."""
+    if "TORCHELASTIC_RUN_ID" not in os.environ or int(os.environ.get("WORLD_SIZE", "1")) < 2:
+        return Alone()
+    if torch.cuda.is_available():
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]) % torch.cuda.device_count())
+    return Ranks(*next(dist.rendezvous("env://", timeout=timedelta(minutes=5))))
