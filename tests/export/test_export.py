@@ -12,6 +12,7 @@ import torch
 from ocp_torch import InputError
 from ocp_torch.control.described import described
 from ocp_torch.control.exported import PHYSICAL, TORUS, exported_function
+from ocp_torch.control.policies import trained_policies
 from support.controllers import METHODS, SMALL, controller_of, controllers
 from support.small import configured
 from support.systems import Cart
@@ -80,8 +81,15 @@ def agree(got, wanted, tolerance, rounded=None):
         assert float((found - value).abs().max()) <= tolerance * max(1.0, float(value.abs().max())) + own, name
 
 
+@torch.no_grad()
 def rounded_by_pytorch(controller, states):
-    return (controller.physical if controller.problem.measures else controller)(states).double()
+    """What its networks give in the single precision they are trained in; a controller itself computes in double."""
+    problem = controller.problem
+    known = trained_policies(controller.occupation, problem, controller.fields, controller.constants)
+    policy = known[controller.kind]
+    if not problem.measures:
+        return policy(states.remainder(1.0)).double()
+    return problem.from_controls(policy(problem.to_torus(problem.chart.nearest(states)))).double()
 
 
 def through_c(folder, name, wanted, states, precision=None):
