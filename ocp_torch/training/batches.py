@@ -49,7 +49,7 @@ class Batches:
     size: int
     seed: int
     visited: float | None = None
-    ranks: Alone = field(default_factory=Alone)  # those with which each batch is shared
+    ranks: Alone = field(default_factory=Alone, init=False)  # those with which each batch is shared
 
     def __post_init__(self) -> None:
         if self.visited is not None:
