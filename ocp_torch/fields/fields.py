@@ -16,7 +16,7 @@ from ocp_torch.fields.waves import STATES, prominent_waves
 from ocp_torch.problems.problem import Problem
 
 VALUE, CONTROL_DENSITY, LOG_OCCUPATION = "value", "control_density", "log_occupation"
-# A second `V`, from values of trajectories: what controls best and what bounds best differ. No player moves it.
+# A second `V`, from values of trajectories or of a grid: what controls best and what bounds best differ. No player moves it.
 TRAJECTORY_VALUE = "trajectory_value"
 # Builds a network from (dim, outputs, shift, scale); outputs None means a scalar field.
 NetworkFactory = Callable[..., nn.Module]

@@ -1,12 +1,10 @@
 """The loop: draw, step, average; evaluate, log and save on the way. It does not know its method."""
 
-import copy
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from torch import nn
 
@@ -19,7 +17,7 @@ from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import blamed
 from ocp_torch.problems.constants import Constants
-from ocp_torch.steppers import NonFiniteError, StepReport, advance
+from ocp_torch.steppers import NonFiniteError, advance
 from ocp_torch.training.checkpoint import BEST, load_checkpoint, save_checkpoint
 from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.health import Evaluation, sanity_warnings
@@ -27,6 +25,7 @@ from ocp_torch.training.observer import Silent
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.state import TrainState
 from ocp_torch.training.stopping import ASKED, MAX_SECONDS, STEPS, TARGET_GAP, Signals, in_words, reason_to_stop
+from ocp_torch.training.whole_step import whole_step
 
 
 @dataclass(eq=False)
@@ -163,7 +162,7 @@ class Trainer:
         """One step, and what is due after it."""
         settings, state = self.settings, self.state
         started = time.perf_counter()
-        report = self._stepped()
+        report = whole_step(self.state, self.phase, self.ranks)
         state.step += 1
         state.samples += self.ranks.size * report.samples
         state.seconds += time.perf_counter() - started
@@ -179,17 +178,6 @@ class Trainer:
         state.elapsed += time.perf_counter() - started
         if due(settings.checkpoint_every) or state.pending:
             self.save(checkpoint)
-
-    def _stepped(self) -> StepReport:
-        """One step. Where other processes are lost in the middle of it, all that it moved is put back."""
-        moved: Sequence[Any] = (self.batches, self.stepper, self.fields) if self.ranks.size > 1 else ()
-        before = [copy.deepcopy(part.state_dict()) for part in moved]
-        try:
-            return advance(self.stepper, self.state.average, self.batches.draw, self.phase)
-        except LostError:
-            for part, state in zip(moved, before, strict=True):
-                part.load_state_dict(state)
-            raise
 
     def _evaluate(self, monitor: Silent, checkpoint: Path | None) -> bool:
         """A quick certificate: keep the state if it is the best so far, and see whether it may be good enough to end."""

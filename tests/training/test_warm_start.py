@@ -118,13 +118,15 @@ def test_the_controller_of_the_warm_start_is_a_candidate_and_can_be_handed_out(t
     )
     fields = trainer.averaged_fields
     x = states(trainer.problem, 16, dtype=torch.float32)
-    best = HeldPolicy(trainer.problem, fields.trajectory_value, Pace.of(trainer.problem))(x)
-    assert (best != HeldPolicy(trainer.problem, fields.value, Pace.of(trainer.problem))(x)).any()
+    exact = copy.deepcopy(fields).double()  # as controllers compute
+    of = lambda V: HeldPolicy(trainer.problem, V, Pace.of(trainer.problem))(x.double()).float()
+    best = of(exact.trajectory_value)
+    assert (best != of(exact.value)).any()
     made = Controller(
         trainer.problem, fields, trainer.constants, None, "trajectories", trainer.config["model"], {}, trainer.config
     )
     made.save(tmp_path / "other.safetensors")
-    torch.testing.assert_close(load_controller(tmp_path / "other.safetensors")(x), best, rtol=1e-3, atol=1e-4)
+    assert torch.equal(load_controller(tmp_path / "other.safetensors")(x), best)
 
 
 def test_auto_stays_out_where_mass_cannot_gather_and_changes_no_bit_there():
@@ -198,7 +200,7 @@ def test_the_best_controller_is_kept_and_gone_back_to_and_no_improvement_is_the_
     assert differences(fields.trajectory_value.state_dict(), warm.best) == []
     x = torch.rand(512, 1)
     wanted = fields.trajectory_value(x)
-    assert float((fields.value(x) - wanted).square().mean().sqrt()) < 0.05 * float(wanted.std())
+    assert float((fields.value(x) - wanted).detach().square().mean().sqrt()) < 0.05 * float(wanted.std())
 
 
 @pytest.mark.nightly

@@ -31,7 +31,8 @@ SWEEPS, SETTLED, MOST_POLICIES = 25, 0.002, 200
 class GridValues:
     """The value of every node of a grid; found when it is first asked for, always the same."""
 
-    # A trial follows so many rounds; it goes on from the best at half the rate after so many that are no better.
+    # A trial follows so many rounds, whose fits take about as long as it does; it goes on from the best at half the rate
+    # after so many that are no better.
     trial_every, patience = 20, 2
 
     def __init__(self, problem: Problem, pace: Pace, like: Tensor) -> None:

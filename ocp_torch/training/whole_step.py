@@ -1,0 +1,23 @@
+"""A step that is made whole or not at all, whatever becomes of the other processes of the run."""
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+from ocp_torch.maths.ranks import Alone, LostError
+from ocp_torch.objectives import Phase
+from ocp_torch.steppers import StepReport, advance
+from ocp_torch.training.state import TrainState
+
+
+def whole_step(state: TrainState, phase: Phase, ranks: Alone) -> StepReport:
+    """One step of ``state`` at ``phase``. Where others of ``ranks`` are lost in the middle of it, all that it moved is put
+    back, and `LostError` raised. Raises `NonFiniteError` as `Stepper.step` does."""
+    moved: Sequence[Any] = (state.batches, state.stepper, state.fields) if ranks.size > 1 else ()
+    before = [copy.deepcopy(part.state_dict()) for part in moved]
+    try:
+        return advance(state.stepper, state.average, state.batches.draw, phase)
+    except LostError:
+        for part, was in zip(moved, before, strict=True):
+            part.load_state_dict(was)
+        raise
