@@ -4,6 +4,8 @@ The greedy control at a state, `grad R*(-B^T grad V / rho)`, is best for an inst
 path to a goal, an instant later it may be the opposite: held for a step it overshoots, and applied at all times it trembles.
 """
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -16,6 +18,10 @@ from ocp_torch.problems.problem import Problem
 # Newton's steps to the part of the control that is kept, where the exponent is not 2 and it has no closed form: four leave
 # less than a millionth of its cost.
 NEWTON = 4
+# Parts of the limit, along the greedy control and against it, that are tried as well. Without them a pendulum in
+# Gymnasium lost 8 to 300 % of the return, as the greedy control of a `V` with ridges is often none at all; with them 1.7 to
+# 5 %, and with halves and quarters beside them no less.
+TRIED = (-1.0, 0.0, 1.0)
 
 
 class HeldPolicy:
@@ -23,7 +29,8 @@ class HeldPolicy:
 
     The direction is the greedy control `u_0` where `x` drifts to without control. Along `s u_0`, `0 <= s <= 1`, the end of
     the step moves from there to `x_h(u_0)`, on a straight line for a short step, and the slope of `V` along it is taken to
-    change evenly: so `s` follows from the two gradients at its ends, exactly for a quadratic `V`.
+    change evenly: so `s` follows from the two gradients at its ends, exactly for a quadratic `V`. Where controls have a
+    limit, the farthest ones along that direction, either way, and none at all are compared with it.
     """
 
     def __init__(self, problem: Problem, value: Field, pace: Pace) -> None:
@@ -38,8 +45,34 @@ class HeldPolicy:
         moved = self.pace.move(problem, x, u)
         along = (moved - drifted) / a_step
         slopes = ((gradient * along).sum(dim=-1) for gradient in (before, jet(self.value, x + moved).gradient))
-        price = PowerCost(cost.q).cost(u)  # within the limit already: rounding there is no infinite cost
-        return kept(cost.q, price, *slopes).unsqueeze(-1) * u
+        part = kept(cost.q, self._price(u), *slopes).unsqueeze(-1) * u
+        return part if math.isinf(cost.reach) else self._best(x, part, farthest(cost, u))
+
+    def _best(self, x: Tensor, u: Tensor, most: Tensor) -> Tensor:
+        """``u``, or a part of ``most``, whichever is best ``(N, m)``."""
+        least = self._merit(x, u)
+        for part in TRIED:
+            other = part * most
+            merit = self._merit(x, other)
+            better = merit < least
+            u, least = torch.where(better.unsqueeze(-1), other, u), torch.where(better, merit, least)
+        return u
+
+    def _merit(self, x: Tensor, u: Tensor) -> Tensor:
+        """What is minimised, ``(N,)``."""
+        end = (x + self.pace.move(self.problem, x, u)).remainder(1.0)
+        return self._price(u) + self.value(end) / (self.problem.discount * self.pace.step)
+
+    def _price(self, u: Tensor) -> Tensor:
+        return PowerCost(self.problem.control_cost.q).cost(
+            u
+        )  # within the limit already: rounding there is no infinite cost
+
+
+def farthest(cost: PowerCost, u: Tensor) -> Tensor:
+    """How far the limit of ``cost`` lets controls go in the direction of each of ``u`` ``(N, m)``; 0 where that is 0."""
+    size = u.norm(dim=-1, keepdim=True)
+    return cost.within(2.0 * cost.reach * u / torch.where(size > 0.0, size, 1.0), 1.0)
 
 
 def kept(q: float, cost: Tensor, start: Tensor, end: Tensor) -> Tensor:

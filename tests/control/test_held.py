@@ -5,11 +5,12 @@ import math
 import pytest
 import torch
 
-from ocp_torch.control.greedy import HeldPolicy, kept
+from ocp_torch.control.greedy import HeldPolicy, farthest, kept
 from ocp_torch.control.pace import Pace
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields import PeriodicMLP
 from ocp_torch.problems import Circle, Pendulum
+from ocp_torch.problems.control_limit import BoxLimitedCost, LimitedCost
 from support.zoo import NATURAL, on, states
 
 SWING = Pendulum(control_limit=1.0)
@@ -38,6 +39,22 @@ def test_it_beats_the_control_for_an_instant_and_comes_near_to_the_best_of_all(p
     ).amin(dim=0)
     lost = [float((paid(problem, V, pace, x, c) - best).clamp_min(0.0).mean()) for c in (u, pointwise)]
     assert lost[0] < 0.5 * lost[1]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_within_a_limit_neither_its_ends_nor_nothing_are_better(seed):
+    V, x, pace = bumpy(SWING, seed), states(SWING, 256), Pace(0.08, 2)
+    u = HeldPolicy(SWING, V, pace)(x).detach()
+    for c in (-1.0, 0.0, 1.0):
+        assert (paid(SWING, V, pace, x, u) <= paid(SWING, V, pace, x, torch.full_like(u, c)) + 1e-9).all()
+
+
+def test_the_farthest_controls_in_a_direction():
+    u = torch.tensor([[0.3, -0.4], [0.0, 0.0]], dtype=torch.float64)
+    torch.testing.assert_close(farthest(LimitedCost(2.0, 2.0), u), torch.tensor([[1.2, -1.6], [0.0, 0.0]]).double())
+    torch.testing.assert_close(
+        farthest(BoxLimitedCost(2.0, [3.0, 0.5]), u), torch.tensor([[3.0, -0.5], [0.0, 0.0]]).double()
+    )
 
 
 @on(NATURAL)

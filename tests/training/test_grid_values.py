@@ -7,7 +7,7 @@ import torch
 
 from ocp_torch.control.pace import Pace
 from ocp_torch.problems import PROBLEMS
-from ocp_torch.training.warm_start.grid import CONTROLS, SIDE, GridValues, solved, stencil
+from ocp_torch.training.warm_start.grid import CONTROLS, SIDE, GridValues, slopes, solved, stencil
 from support.zoo import fresh
 
 
@@ -15,7 +15,7 @@ def off(problem, part: float = 1.0) -> float:
     """By what part of the exact value's spread the grid's is off, for steps of a ``part`` of the usual."""
     pace = Pace.of(problem)
     source = GridValues(problem, pace.with_step(part * pace.step), torch.zeros(1, dtype=torch.float64))
-    x, V, _ = source.targets(lambda x: x)
+    x, V, *_ = source.targets(lambda x: x)
     exact = problem.exact_value(x)
     return float((V - exact).square().mean().sqrt() / exact.std())
 
@@ -28,6 +28,13 @@ def test_a_stencil_interpolates_what_is_bilinear_and_wraps():
     torch.testing.assert_close((weight * of(nodes)[index]).sum(dim=-1), of(points).mean(dim=0))
     index, weight = stencil(torch.full((1, 1, 2), 1.0 - 0.25 / SIDE, dtype=torch.float64))
     assert float(weight[index == 0].sum()) == pytest.approx(0.75**2)
+
+
+def test_slopes_are_derivatives_that_wrap():
+    x = torch.cartesian_prod(*[torch.arange(SIDE, dtype=torch.float64) / SIDE] * 2)
+    a, b = (2.0 * math.pi * x).unbind(-1)
+    exact = 2.0 * math.pi * torch.stack([a.cos() * b.cos(), -a.sin() * b.sin()], dim=-1)
+    torch.testing.assert_close(slopes(a.sin() * b.cos()), exact, rtol=0.0, atol=2e-3)
 
 
 def test_the_fixed_point_is_that_of_plain_value_iteration():

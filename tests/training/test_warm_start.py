@@ -83,7 +83,7 @@ class Stop(Silent):
 
 PLAIN = ("problem=circle", "method=dual")
 NOISY = pytest.param(("problem=cart_pole", "method=pd", "problem.noise=1e-3"), marks=pytest.mark.nightly)
-ON_A_GRID = pytest.param((*SWING, "method=dual", "warm_start.rounds=22"), marks=pytest.mark.nightly)
+ON_A_GRID = pytest.param((*SWING, "method=dual", "warm_start.rounds=42"), marks=pytest.mark.nightly)
 
 
 @pytest.mark.parametrize("way", [PLAIN, NOISY, ON_A_GRID])

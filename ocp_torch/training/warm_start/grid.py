@@ -31,9 +31,9 @@ SWEEPS, SETTLED, MOST_POLICIES = 25, 0.002, 200
 class GridValues:
     """The value of every node of a grid; found when it is first asked for, always the same."""
 
-    # A trial follows so many rounds, whose fits take about as long as it does; it goes on from the best at half the rate
-    # after so many that are no better.
-    trial_every, patience = 20, 2
+    # A trial follows so many rounds, whose fits take about as long as it does (with a discount of 0.1 per second half as
+    # long); it goes on from the best at half the rate after so many that are no better.
+    trial_every, patience = 40, 2
 
     def __init__(self, problem: Problem, pace: Pace, like: Tensor) -> None:
         self.problem, self.pace, self.like = problem, pace.with_step(STEPS * pace.step), like
@@ -50,12 +50,13 @@ class GridValues:
         return f"fits to a grid of {SIDE} x {SIDE} nodes"
 
     def targets(self, average: Field) -> Targets:
-        """All nodes and the values there, whatever the ``average``."""
+        """All nodes, the values there and their gradients, whatever the ``average``."""
         self.drawn, self.asked = 0 if self.asked else CONTROLS * SIDE**DIM, True
         if not self._found:
             x, V = self._solved()
+            gradients = slopes(V).to(self.like)
             x, V = x.to(self.like), V.to(self.like)
-            self._found.append(Targets(x, V, V))
+            self._found.append(Targets(x, V, V, gradients))
         return self._found[0]
 
     @torch.no_grad()
@@ -89,6 +90,12 @@ class GridValues:
     def load_state_dict(self, state: dict) -> None:
         """The way back from `state_dict`: values are found anew, but their states are not counted again."""
         self.asked = bool(state["asked"])
+
+
+def slopes(V: Tensor) -> Tensor:
+    """The gradient ``(N, d)`` at all nodes of what is ``V`` ``(N,)`` there, by central differences."""
+    cube = V.reshape((SIDE,) * DIM)
+    return torch.stack([0.5 * SIDE * (cube.roll(-1, k) - cube.roll(1, k)) for k in range(DIM)], dim=-1).flatten(0, -2)
 
 
 def stencil(points: Tensor) -> tuple[Tensor, Tensor]:

@@ -6,8 +6,10 @@ from torch import Tensor
 
 
 class Targets(NamedTuple):
-    """States ``(N, d)``, what `V` is to be there, and about what it is, in which chance has no part, both ``(N,)``."""
+    """States ``(N, d)``, what `V` is to be there, and about what it is, in which chance has no part, both ``(N,)``; and its
+    gradient ``(N, d)``, where that is known as well."""
 
     x: Tensor
     y: Tensor
     values: Tensor
+    gradients: Tensor | None = None
