@@ -27,6 +27,10 @@ DIM, SIDE, CONTROLS, STEPS = 2, 192, 17, 2.0
 # of its largest value, were it made for ever; or after so many policies.
 SWEEPS, SETTLED, MOST_POLICIES = 25, 0.002, 200
 
+# The first learning rate of a fit to them, in units of that of a fit to what moves from round to round. As nothing moves here,
+# it falls to 0: the pendulum in Gymnasium lost 1.6 % of the return then, and 4 % at the usual rate throughout.
+FASTEST = 2.5
+
 
 class GridValues:
     """The value of every node of a grid; found when it is first asked for, always the same."""
@@ -44,6 +48,11 @@ class GridValues:
         """Whether a grid is cheap: two coordinates and one control with a limit, of a problem that is no simulator."""
         one = problem.dim == DIM and problem.control_dim == 1
         return one and math.isfinite(problem.control_cost.reach) and not isinstance(problem, Simulator)
+
+    @staticmethod
+    def rate(part: float) -> float:
+        """The learning rate, in units of the usual one, when a ``part`` of the rounds is over."""
+        return FASTEST * 0.5 * (1.0 + math.cos(math.pi * part))
 
     @property
     def plan(self) -> str:

@@ -60,6 +60,9 @@ class ValueIteration:
         """One round; whether a trial was made after it."""
         if self.round == 0:
             self.least = self.trial.cost_of_nothing()
+        if isinstance(self.source, GridValues):
+            for group in self.optimizer.param_groups:
+                group["lr"] = RATE * self.source.rate(self.round / self.settings.rounds)
         self._fit(self.source.targets(self.average))
         self.round += 1
         due = self.round % self.source.trial_every == 0 or self.round >= self.settings.rounds or self.done
@@ -86,7 +89,7 @@ class ValueIteration:
 
     def _squares(self, to: Targets, rows: Tensor) -> Tensor:
         """Of what is off at ``rows`` of ``to``, ``(N,)``; of gradients, over the way of a step: they decide on the control
-        (in 1,500 steps a pendulum in Gymnasium lost 1.7 % of the return with them, 5 % and more without)."""
+        (a pendulum in Gymnasium lost 1.7 % of the return with them, 5 % and more without)."""
         if to.gradients is None:
             return (self.network(to.x[rows]) - to.y[rows]).square()
         found = self.network.jet(to.x[rows])
