@@ -27,8 +27,8 @@ DIM, SIDE, CONTROLS, STEPS = 2, 192, 17, 2.0
 # of its largest value, were it made for ever; or after so many policies.
 SWEEPS, SETTLED, MOST_POLICIES = 25, 0.002, 200
 
-# The first learning rate of a fit to them, in units of that of a fit to what moves from round to round. As nothing moves here,
-# it falls to 0: the pendulum in Gymnasium lost 1.6 % of the return then, and 4 % at the usual rate throughout.
+# The first learning rate of a fit to them, in units of that of a fit to what moves from round to round. Nothing moves here,
+# and it falls to 0: the pendulum in Gymnasium lost 1.6 % of the return then, and 4 % at the usual rate throughout.
 FASTEST = 2.5
 
 
