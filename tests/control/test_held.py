@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from ocp_torch.certificate.checks.observed import largest_jump
 from ocp_torch.control.greedy import HeldPolicy, farthest, kept
 from ocp_torch.control.pace import Pace
 from ocp_torch.control.policies import ValuePolicy
@@ -47,6 +48,11 @@ def test_within_a_limit_neither_its_ends_nor_nothing_are_better(seed):
     u = HeldPolicy(SWING, V, pace)(x).detach()
     for c in (-1.0, 0.0, 1.0):
         assert (paid(SWING, V, pace, x, u) <= paid(SWING, V, pace, x, torch.full_like(u, c)) + 1e-9).all()
+
+
+def test_its_jumps_are_found_so_that_no_bound_rests_on_its_divergence():
+    policy = HeldPolicy(SWING, bumpy(SWING, 0), Pace.of(SWING))
+    assert largest_jump(policy, SWING.dim, problem=SWING).what == "controller"
 
 
 def test_the_farthest_controls_in_a_direction():

@@ -303,8 +303,8 @@ def test_a_saved_pendulum_controller_plays_gymnasiums_untouched(gymnasium, tmp_p
     folder = tmp_path / "run"
     few = ("certificate.points=64", "certificate.trajectories=4", "certificate.ascents=2", "trainer.figures=false")
     small_run = ("trainer.steps=5", "trainer.batch=32", "trainer.rounds=1", "model.width=16", "model.waves=0")
-    few += ("warm_start.rounds=2", "problem.discount=8.0")  # a short horizon: the networks are hardly trained
-    session(small("experiment=gymnasium_pendulum", *small_run, *few), folder)
+    short = ("warm_start.rounds=2", "problem.discount=8.0")  # controllers that are hardly trained take long to simulate
+    session(small("experiment=gymnasium_pendulum", *small_run, *short, *few), folder)
     played = asked(folder, env="Pendulum-v1", episodes=2).run()
     assert (played.lengths == 200).all()
     assert np.isfinite(played.returns).all()

@@ -9,11 +9,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.control.greedy import HeldPolicy
-from ocp_torch.control.pace import Pace
+from ocp_torch.control.pace import MOVED, Pace
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.fields.fields import typical_sizes
 from ocp_torch.fields.logarithmic import Logarithmic
+from ocp_torch.maths.jets import jet
+from ocp_torch.problems import PROBLEMS
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.runs.run import run_to_end
 from ocp_torch.training.monitor import Silent
@@ -21,6 +23,7 @@ from ocp_torch.training.warm_start.grid import GridValues
 from ocp_torch.training.warm_start.iteration import ValueIteration
 from ocp_torch.training.warm_start.pieces import Trajectories, lambda_returns, roll
 from ocp_torch.training.warm_start.settings import WarmStartSettings
+from ocp_torch.training.warm_start.targets import Targets
 from support.bits import differences
 from support.small import SMALL, configured, small, state_of
 from support.zoo import FEW_SMOOTH, NATURAL, QUIET, fresh, on, states
@@ -163,6 +166,30 @@ def logarithmic(dim: int, width: int) -> Logarithmic:
         return Logarithmic(PeriodicMLP(dim, width=width), 0.1)
 
 
+def test_a_gradient_that_is_off_counts_over_the_way_of_a_step():
+    problem = PROBLEMS["pendulum"](control_limit=1.0)
+    warm = ValueIteration(problem, logarithmic(2, 8), WarmStartSettings("on", 10, 8, 1, 0.5), 0)
+    x, all_rows = torch.rand(64, 2), torch.arange(64)
+    own = jet(warm.network, x)
+    found = lambda gradients: warm._squares(Targets(x, own.value, own.value, gradients), all_rows)
+    assert float(found(own.gradient).detach().abs().max()) == 0.0
+    torch.testing.assert_close(found(own.gradient + 3.0), torch.full((64,), 2 * (3.0 * MOVED) ** 2))
+
+
+def test_fits_to_a_grid_end_at_no_rate_however_trials_turn_out():
+    problem = PROBLEMS["pendulum"](control_limit=1.0)
+    warm = ValueIteration(problem, logarithmic(2, 8), WarmStartSettings("on", 10, 8, 1, 0.5), 0)
+    warm.source.trial_every, warm.trial, rates = 1, Told(*[6.0] * 10), []
+    x = torch.rand(64, 2)
+    warm.source._found.append(Targets(x, x[:, 0], x[:, 0], torch.zeros_like(x)))
+    while not warm.done:
+        warm.advance()
+        rates.append(warm.optimizer.param_groups[0]["lr"])
+    assert rates[0] == 2.5 * 2e-3
+    assert rates == sorted(rates, reverse=True)
+    assert (len(rates), rates[-1] < 0.1 * rates[0]) == (10, True)
+
+
 class Told:
     """A trial whose outcomes are known beforehand."""
 
@@ -189,7 +216,7 @@ def test_the_best_controller_is_kept_and_gone_back_to_and_no_improvement_is_the_
     warm = warmed_up_to(4.0, 2.0, 3.0, 3.0, 2.0, 1.0, 1.5, 1.0, 1.0)
     assert (warm.least, warm.trial.costs, warm.round, warm.found) == (1.0, [], 90, True)
     assert differences(warm.best, warm.average.state_dict()) == []
-    assert warm.optimizer.param_groups[0]["lr"] == 5e-4  # halved twice
+    assert warm.optimizer.param_groups[0]["lr"] == 1e-3  # half of it since it went back; the second time was the end
     useless = warmed_up_to(*[6.0] * 6)
     assert (useless.found, useless.least) == (False, 5.0)
     fields = Fields({"value": PeriodicMLP(1, width=16), "trajectory_value": logarithmic(1, 4)})

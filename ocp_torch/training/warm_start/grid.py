@@ -26,7 +26,6 @@ DIM, SIDE, CONTROLS, STEPS = 2, 192, 17, 2.0
 # A policy is followed for so many sweeps before it is improved. It is over when an improvement moves V by less than this part
 # of its largest value, were it made for ever; or after so many policies.
 SWEEPS, SETTLED, MOST_POLICIES = 25, 0.002, 200
-
 # The first learning rate of a fit to them, in units of that of a fit to what moves from round to round. Nothing moves here,
 # and it falls to 0: the pendulum in Gymnasium lost 1.6 % of the return then, and 4 % at the usual rate throughout.
 FASTEST = 2.5
@@ -36,8 +35,8 @@ class GridValues:
     """The value of every node of a grid; found when it is first asked for, always the same."""
 
     # A trial follows so many rounds, whose fits take about as long as it does (with a discount of 0.1 per second half as
-    # long); it goes on from the best at half the rate after so many that are no better.
-    trial_every, patience = 40, 2
+    # long). However they turn out all rounds are made: the last ones, at the lowest rates, gain most.
+    trial_every, patience = 40, math.inf
 
     def __init__(self, problem: Problem, pace: Pace, like: Tensor) -> None:
         self.problem, self.pace, self.like = problem, pace.with_step(STEPS * pace.step), like

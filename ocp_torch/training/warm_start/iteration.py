@@ -60,9 +60,8 @@ class ValueIteration:
         """One round; whether a trial was made after it."""
         if self.round == 0:
             self.least = self.trial.cost_of_nothing()
-        if isinstance(self.source, GridValues):
-            for group in self.optimizer.param_groups:
-                group["lr"] = RATE * self.source.rate(self.round / self.settings.rounds)
+        for group in self.optimizer.param_groups:
+            group["lr"] = RATE * self.source.rate(self.round / self.settings.rounds) * 0.5**self.restarts
         self._fit(self.source.targets(self.average))
         self.round += 1
         due = self.round % self.source.trial_every == 0 or self.round >= self.settings.rounds or self.done
@@ -107,8 +106,6 @@ class ValueIteration:
             self.stale, self.restarts = 0, self.restarts + 1
             for module in (self.network, self.average) if self.found else ():
                 module.load_state_dict(self.best)
-            for group in self.optimizer.param_groups:
-                group["lr"] *= 0.5
         self.done |= self.round >= self.settings.rounds
 
     @property
