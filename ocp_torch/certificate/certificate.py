@@ -28,8 +28,9 @@ class Certificate:
     the level of the intervals; ``subject`` names the controller in ``perf`` that all this is about, by default the best of
     them. ``contradiction`` is the sentence that says why nothing counts, where two bounds exclude each other; ``refuted``
     are the names of guesses that another bound excludes. ``outside`` is the part of the discounted time that the controller
-    spends outside the box of a system in physical units; ``occupation`` is the density that was fitted to its closed loop,
-    to draw.
+    spends outside the box of a system in physical units. ``held_for`` is the time for which it holds each control, `None`
+    where it acts at every instant; ``followed`` is the one whose closed loop was fitted, by the density ``occupation``, to
+    draw.
     """
 
     run: Run
@@ -48,6 +49,8 @@ class Certificate:
     contradiction: str | None = None
     refuted: frozenset[str] = frozenset()
     outside: Estimate | None = None
+    held_for: float | None = None
+    followed: str | None = None
     occupation: Field | None = field(default=None, compare=False)
 
     def needs(self, name: str) -> tuple[Need, ...]:

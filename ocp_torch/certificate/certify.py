@@ -71,6 +71,8 @@ def certify(context: Context) -> Certificate:
         subject=context.kind if context.recorded or context.external else None,
         perf_lower=perf_lower,
         outside=outside,
+        held_for=context.held_for,
+        followed=context.followed,
         occupation=None if context.closed_loop is None else context.closed_loop.occupation,
     )
     return examined(certificate)

@@ -71,6 +71,16 @@ class Context:
         def remarks(self) -> list[str]: ...
 
     @property
+    def followed(self) -> str | None:
+        """The controller whose closed loop is looked at and fitted: the one handed out, where that acts at every instant."""
+        return self.kind
+
+    @property
+    def held_for(self) -> float | None:
+        """For how long the controller handed out holds its control; `None` for one that acts at every instant."""
+        return None
+
+    @property
     def notes(self) -> list[str]:
         return []
 
@@ -149,7 +159,7 @@ class Context:
         `E[V mu0]` per set, if that is known from more states."""
         loop, ascents = ClosedLoop(self.problem, policy), self.settings.ascents
         judge = lambda sets: closed_loop_bounds(
-            loop, value, log_occupation, loop.samples_of(sets), ascents, self.kind, initial, self.odd
+            loop, value, log_occupation, loop.samples_of(sets), ascents, self.followed, initial, self.odd
         )
         return sharpened(judge, self.problem, self.few, self.seed)
 
@@ -189,11 +199,11 @@ class Context:
 
     @cached_property
     def takes_fitted_J(self) -> bool:
-        """Whether the `J` of the closed loop is shown: unless that of the trained densities is of the controller handed out,
-        with a `C_V` that holds, and no larger."""
+        """Whether the `J` of the closed loop is shown: unless that of the trained densities is of the same controller, with a
+        `C_V` that holds, and no larger."""
         if self.closed_loop is None:
             return False
-        own = self.densities if self.kind == "density" and self.checked.value_holds else None
+        own = self.densities if self.followed == "density" and self.checked.value_holds else None
         return own is None or not own.J.value <= self.closed_loop.J.value
 
     @cached_property

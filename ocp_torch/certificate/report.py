@@ -44,6 +44,7 @@ def to_dict(certificate: Certificate) -> dict:
         "exact": certificate.exact,
         "confidence": certificate.confidence,
         "controller": certificate.controller,
+        **({} if certificate.held_for is None else {"held_for": certificate.held_for}),
         **{side: {n: bound(n, e) for n, e in getattr(certificate, side).items()} for side in (LOWER, UPPER)},
         **{group: {n: one(e) for n, e in getattr(certificate, group).items()} for group in ("perf", "baseline")},
         "gap": certificate.gap,
@@ -130,9 +131,17 @@ def in_words(certificate: dict) -> list[str]:
     parts = [f"at most {percent(most)}"] if most is not None else []
     if least:
         parts.append(f"at least {percent(least)}")
-    if not parts:
+    worse = f"the controller is {' and '.join(parts)} worse than the optimum ({taking(certificate)})"
+    return ([worse] if parts else []) + holding(certificate)
+
+
+def holding(certificate: dict) -> list[str]:
+    """How a controller is meant that holds its control: a sentence, or none."""
+    held = certificate.get("held_for")
+    if held is None:
         return []
-    return [f"the controller is {' and '.join(parts)} worse than the optimum ({taking(certificate)})"]
+    how = "J and the Lagrangian bound are of another one, which acts at every instant"
+    return [f"the controller holds each control for {held:.3g} units of time, and is simulated so; {how}"]
 
 
 def taking(certificate: dict) -> str:

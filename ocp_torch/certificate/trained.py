@@ -17,6 +17,7 @@ from ocp_torch.certificate.simulated.candidates import Candidate
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
 from ocp_torch.certificate.upper.penalised import DensityBounds, density_bounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
+from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.policies import (
     TRAJECTORIES,
     Density,
@@ -106,9 +107,23 @@ class TrainedContext(FieldsContext):
 
     @cached_property
     def kind(self) -> str:
-        """The controller with the lower performance, or the first where none is known."""
-        known = {name: found.perf.above for name, found in self.simulated[0].items() if found.perf.finite}
-        return min(known, key=known.__getitem__, default=next(iter(self.policies)))
+        """The controller with the lowest performance."""
+        return self._best_of(list(self.policies))
+
+    @cached_property
+    def followed(self) -> str:
+        return self._best_of([n for n, p in self.policies.items() if not isinstance(p, HeldPolicy)] or [self.kind])
+
+    def _best_of(self, names: list[str]) -> str:
+        """Of the controllers ``names`` the one with the lowest performance, or the first where none is known."""
+        found = self.simulated[0]
+        known = {name: found[name].perf.above for name in names if name in found and found[name].perf.finite}
+        return min(known, key=known.__getitem__, default=names[0])
+
+    @property
+    def held_for(self) -> float | None:
+        policy = self.policies[self.kind]
+        return policy.pace.step if isinstance(policy, HeldPolicy) else None
 
     @property
     def has_densities(self) -> bool:
@@ -130,10 +145,10 @@ class TrainedContext(FieldsContext):
 
     @cached_property
     def _fit(self) -> tuple[ClosedLoopBounds | None, list[str]]:
-        """The bounds of `mu` fitted to the closed loop of the controller handed out, or a warning that says why not."""
+        """The bounds of `mu` fitted to the closed loop of the controller that is followed, or a warning that says why not."""
         if not self.settings.stage.steps:
             return None, []
-        kind = self.kind  # before this part is announced: it may have to be simulated
+        kind = self.followed  # before this part is announced: it may have to be simulated
         self.progress("closed-loop fit")
         if unknown := self.problem.unknown_divergences:
             return None, [f"no upper bound without simulation: this problem gives no divergences of {unknown}."]
@@ -159,18 +174,18 @@ class TrainedContext(FieldsContext):
 
     @cached_property
     def observed(self) -> Observed:
-        found = self.simulated[0].get(self.kind)
+        found = self.simulated[0].get(self.followed)
         self.progress("assumptions")
         usable = found if found is not None and found.perf.finite else None
         states, together = self.settings.occupation_states, self.problem.concurrent  # networks of ours are pure
-        return observe(self.problem, self.policies[self.kind], usable, self.few, states, together)
+        return observe(self.problem, self.policies[self.followed], usable, self.few, states, together)
 
     @property
     def notes(self) -> list[str]:
         notes = list(self._fit[1])
         with torch.no_grad():
             empty = (bool((self._mu(samples.x[:LOOKED_AT]) <= 0.0).any()) for samples in self.few)
-            if self.kind == "density" and self.densities is not None and any(empty):
+            if self.followed == "density" and self.densities is not None and any(empty):
                 what = "where w / mu is not regular: J and G may miss what it costs there"
                 notes.insert(0, f"mu is 0 at sampled states, {what}.")
         return notes

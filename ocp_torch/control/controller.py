@@ -72,6 +72,12 @@ class Controller:
             u = policy(states.to(next(self._exact.parameters())).remainder(1.0)).to(states.dtype)
         return u.cpu().numpy() if isinstance(x, np.ndarray) else u
 
+    @property
+    def held_for(self) -> float | None:
+        """For how many units of time each control is meant to be held, and was in the simulations of the certificate; `None`
+        for a controller that acts at every instant."""
+        return self._policy.pace.step if isinstance(self._policy, HeldPolicy) else None
+
     def held(self, x: States, step: float) -> States:
         """Controls ``(N, m)`` at states ``(N, d)`` that are best where each is held for ``step`` units of time, from the `V`.
 
@@ -124,7 +130,7 @@ class Controller:
         """
         problem, place = self.problem, coordinates_of(self.problem, coordinates)
         function = exported_function(problem, self.fields, self.kind, self.occupation, self.constants, place)
-        inside = {"coordinates": place, "problem": described(problem), "policy": self.kind}
+        inside = {"coordinates": place, "problem": described(problem), "policy": self.kind, "held_for": self.held_for}
         inside |= {"certificate": self.certificate, "config": self.config}
         return export(function, example_states(problem, place), Path(out), format, about(problem, place), inside)
 

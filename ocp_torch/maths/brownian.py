@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.maths.cores import in_pieces
-from ocp_torch.maths.runge_kutta import Dynamics
+from ocp_torch.maths.runge_kutta import Dynamics, Switched
 from ocp_torch.maths.seeds import Branch, derive_seed
 
 # What a rate counts at a part of each of the horizons ``(N,)``.
@@ -99,10 +99,13 @@ def path_integral(
     d)``.
 
     ``noise`` gives `sigma` ``(N, d, k)``; ``moves`` ``(steps, N, k)`` are the increments. The rule is the trapezoidal one.
+    Where dynamics are `Switched` the rate is that after the jump: what is wrong with it is of the order that halved steps
+    and extrapolation take off.
     """
     parts, x, total = grid.parts, x0, torch.zeros_like(grid.horizon)
     widths = torch.nn.functional.pad(parts.diff(), (1, 1))
     for k, part in enumerate(parts.tolist()):
+        x = Switched.before(dynamics, k, grid.steps, x) if k < grid.steps else x
         velocity, rate = dynamics(x)
         total = total + 0.5 * float(widths[k] + widths[k + 1]) * weight(grid.horizon, part) * rate
         if k < grid.steps:

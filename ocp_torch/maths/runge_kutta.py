@@ -6,6 +6,7 @@ libraries choose one step for a whole batch, so that a single trajectory at a ju
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -25,6 +26,26 @@ GOOD_PART = 0.1
 AUDITED, AUDIT_FACTOR = 64, 4
 
 
+@dataclass(frozen=True)
+class Switched:
+    """``dynamics`` whose states jump ``count`` times, at 0 and then evenly, to what ``renewed`` gives: those of a control
+    that is held in between."""
+
+    dynamics: Dynamics
+    renewed: Callable[[Tensor], Tensor]
+    count: int
+
+    def __call__(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return self.dynamics(x)
+
+    @staticmethod
+    def before(dynamics: Dynamics, step: int, steps: int, x: Tensor) -> Tensor:
+        """The state from which ``step`` of ``steps``, a multiple of the ``count``, is made; ``x`` where nothing jumps."""
+        if not isinstance(dynamics, Switched) or step % (steps // dynamics.count):
+            return x
+        return dynamics.renewed(x)
+
+
 @torch.no_grad()
 def discounted_integral(
     dynamics: Dynamics, x0: Tensor, rho: float, horizon: float, steps: int, wrap: bool = True, grading: float = 1.0
@@ -32,14 +53,16 @@ def discounted_integral(
     r"""`int_0^T rho e^{-rho t} rate(x_t) dt` ``(N,)`` and the end states ``(N, d)``, by classical RK4 with equal steps of
     `s` in `[0, 1]`, where `t = T s^p` and `p` is the ``grading``: above 1 it makes early steps short and late ones long.
 
-    End states are wrapped to the unit cell unless ``wrap`` is false: not every coordinate need be an angle. The discount
-    multiplies the rate inside the scheme, so that state and integral are one smooth system of order 4.
+    Dynamics that are `Switched` jump at even times, and take a ``grading`` of 1. End states are wrapped to the unit cell
+    unless ``wrap`` is false: not every coordinate need be an angle. The discount multiplies the rate inside the scheme, so
+    that state and integral are one smooth system of order 4.
     """
     time = lambda s: horizon * s**grading
     pace = lambda s: horizon * grading * s ** (grading - 1.0)
     weight = lambda s: rho * math.exp(-rho * time(s)) * pace(s)
     x, total, ds = x0, x0.new_zeros(()), 1.0 / steps
     for k in range(steps):
+        x = Switched.before(dynamics, k, steps, x)
         start, middle, end = k * ds, (k + 0.5) * ds, (k + 1.0) * ds
         x, (r1, r2, r3, r4) = _step(dynamics, x, tuple(ds * pace(s) for s in (start, middle, end)))
         total = total + ds / 6.0 * (weight(start) * r1 + 2.0 * weight(middle) * (r2 + r3) + weight(end) * r4)

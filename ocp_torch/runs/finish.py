@@ -107,7 +107,9 @@ def hand_out(
         drawn = {"certificate": interval_figure(certificate.to_dict())}
         with unless_it_failed(failure, trainer):
             how = trainer.constants, trainer.objective.occupation
-            drawn |= Shown(trainer.problem, fields, *how, kind, certificate.occupation).figures()
+            drawn |= Shown(
+                trainer.problem, fields, *how, certificate.followed or kind, certificate.occupation
+            ).figures()
             moved = motion(trainer.problem, policy_of(controller), trainer.seed)
             drawn |= {} if moved is None else {"motion": moved}
         canvas.save(drawn, folder / "figures")

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate import Trained
-from ocp_torch.certificate.simulated.trajectories import closed_loop_dynamics
+from ocp_torch.certificate.simulated.loops import loop_of
 from ocp_torch.control.policies import admissible_density, occupation_density, trained_policies
 from ocp_torch.maths.brownian import Grid, discounted, increments, path_integral
 from ocp_torch.maths.quantiles import upper_quantile
@@ -84,15 +84,14 @@ class RunningEstimates:
         """What the controller costs beyond `E[V mu0]`, or in all where there is no `V`."""
         problem, fields, rho = self.problem, self.trained.fields, self.problem.discount
         policy = next(iter(trained_policies(self.trained.occupation, problem, fields, constants).values()))
-        dynamics = closed_loop_dynamics(problem, policy, fields.value)
+        dynamics = loop_of(problem, policy, fields.value)
         (x0, mass), horizon = self._starts, HORIZON / rho
         if problem.noisy:
             grid, sigma = Grid(torch.full_like(mass, horizon), STEPS, 1.0), cast(Tensor, problem.noise(x0[:1]))
             moves = increments(grid, sigma.shape[-1], 0, self.seed, 0)
             integral, _ = path_integral(dynamics, problem.noise, x0, grid, moves, discounted(rho))
         else:
-            state = x0 if fields.value is None else torch.cat([x0, fields.value(x0).unsqueeze(-1)], dim=-1)
-            rates, _ = discounted_integral(dynamics, state, rho, horizon, STEPS, wrap=False)
+            rates, _ = discounted_integral(dynamics, dynamics.start(x0), rho, horizon, STEPS, wrap=False)
             integral = rates if fields.value is None else rates[:, 0]
         whole = 1.0 if fields.value is not None else -1.0 / math.expm1(-HORIZON)
         return whole * float((mass * integral).mean())

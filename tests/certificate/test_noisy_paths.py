@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from ocp_torch.certificate.simulated import candidates
+from ocp_torch.certificate.simulated.backward import _noisy_piece, backward_flow
 from ocp_torch.certificate.simulated.candidates import Candidate, simulate_candidates
 from ocp_torch.certificate.simulated.performance import simulate_performance
-from ocp_torch.certificate.simulated.trajectories import _noisy_piece, backward_flow
 from ocp_torch.maths.differences import STEPS
 from ocp_torch.problems import Manufactured, Problem
 from ocp_torch.problems.generator import Generator

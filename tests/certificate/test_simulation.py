@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from ocp_torch.certificate.simulated.backward import backward_flow, settled_occupation
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
-from ocp_torch.certificate.simulated.trajectories import backward_flow, settled_occupation
 from ocp_torch.control.policies import zero_policy
 from ocp_torch.maths import cores
 from ocp_torch.maths.cores import in_pieces
@@ -213,7 +213,7 @@ class Step(Problem):
 @zoo.on(("manufactured 2-d q=1.5", "noisy 1-d"))
 def test_a_density_followed_back_on_several_cores_is_the_same(problem, monkeypatch):
     """To the bit whatever the number of cores, and to rounding that of all states at once."""
-    monkeypatch.setattr("ocp_torch.certificate.simulated.trajectories.in_pieces", partial(in_pieces, size=32))
+    monkeypatch.setattr("ocp_torch.certificate.simulated.backward.in_pieces", partial(in_pieces, size=32))
     x = zoo.states(problem, 48)
 
     def found(cores: int, together: bool):

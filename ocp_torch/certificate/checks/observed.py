@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
+from ocp_torch.certificate.simulated.backward import a_priori_sup_occupation, estimated_sup_occupation
 from ocp_torch.certificate.simulated.performance import Simulated
-from ocp_torch.certificate.simulated.trajectories import a_priori_sup_occupation, estimated_sup_occupation
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import batched

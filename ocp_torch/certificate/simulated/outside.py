@@ -1,5 +1,6 @@
 """What part of the discounted time a controller spends outside the box of a system, where the model is not the user's."""
 
+import copy
 from dataclasses import replace
 
 import torch
@@ -9,8 +10,8 @@ from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.simulated.candidates import BASELINE_PART
 from ocp_torch.certificate.simulated.performance import simulate_performance
-from ocp_torch.control.policies import Policy, zero_policy
-from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.control.policies import Policy
+from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import fits
@@ -23,16 +24,20 @@ FEWEST = 8
 LEVEL = 1.05
 
 
-class _Clock(ClosedLoop):
-    """The closed loop, at a rate of 1 in the box and of 2 outside: a simulation of what it costs is one of where it is."""
+class _Free(PowerCost):
+    """Control at no cost."""
 
-    def __init__(self, problem: System, policy: Policy) -> None:
-        super().__init__(problem, policy)
-        self.system = problem
-        self._fits = fits(problem)  # it starts where the problem does
+    def cost(self, u: Tensor) -> Tensor:
+        return torch.zeros_like(u[:, 0])
 
-    def state_cost(self, x: Tensor) -> Tensor:
-        return torch.where(self.system.outside(x), 2.0, 1.0).to(x)
+
+def _clock(problem: System) -> System:
+    """``problem`` with a cost of 1 in the box and of 2 outside: a simulation of what it costs is one of where it is."""
+    fits(problem)  # found once for both: it starts where the problem does
+    clock = copy.copy(problem)
+    clock.control_cost = _Free(problem.exponent)
+    vars(clock)["state_cost"] = lambda x: torch.where(problem.outside(x), 2.0, 1.0).to(x)
+    return clock
 
 
 def time_outside(problem: Problem, policy: Policy, settings: CertificateSettings, seed: int) -> Estimate | None:
@@ -41,11 +46,10 @@ def time_outside(problem: Problem, policy: Policy, settings: CertificateSettings
     few = settings.trajectories // BASELINE_PART
     if not isinstance(problem, System) or not problem.chart.boxed or few < FEWEST:
         return None
-    loop = _Clock(problem, policy)
     effort = few, settings.replicates, seed
     found = simulate_performance(
-        loop,
-        zero_policy(loop),
+        _clock(problem),
+        policy,
         *effort,
         lambda x: torch.full_like(x[:, 0], LEVEL),
         [LEVEL],

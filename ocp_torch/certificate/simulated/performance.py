@@ -14,12 +14,21 @@ from torch import Tensor
 from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
-from ocp_torch.certificate.simulated.trajectories import Sliding, closed_loop_dynamics
+from ocp_torch.certificate.simulated.held import held_integrals
+from ocp_torch.certificate.simulated.loops import FeedbackLoop, HeldLoop, Loop, Sliding, loop_of
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.brownian import Grid, at_random_times, discounted, expectation
 from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.jets import Field
-from ocp_torch.maths.runge_kutta import Dynamics, Integrate, discounted_integral, in_finer_steps, rate_at, refined
+from ocp_torch.maths.runge_kutta import (
+    Dynamics,
+    Integrate,
+    Switched,
+    discounted_integral,
+    in_finer_steps,
+    rate_at,
+    refined,
+)
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import initial_points
@@ -92,6 +101,33 @@ def paced(speeds: Tensor, together: bool) -> tuple[float, Tensor]:
     return most, (speeds / most).ceil().clamp_min(1.0).long()
 
 
+@dataclass(frozen=True)
+class Steps:
+    """``count`` steps up to ``horizon``, graded, of which each trajectory takes ``multiples`` ``(N,)`` times as many; a
+    control that is held is renewed at ``renewals`` of them, 0 for one that is not."""
+
+    horizon: float
+    count: int
+    grading: float
+    multiples: Tensor
+    renewals: int = 0
+
+    @classmethod
+    def of(cls, loop: Loop, horizon: float, velocity: Tensor) -> "Steps":
+        """The first ones, an even number per hold, for ``loop``, which moves with ``velocity`` ``(N, d)`` at its starts."""
+        rho, together = loop.problem.discount, torch.ones(len(velocity), dtype=torch.long)
+        if isinstance(loop, HeldLoop):
+            holds = math.ceil(horizon / loop.hold)
+            return cls(holds * loop.hold, 2 * holds * math.ceil(0.5 * loop.substeps), 1.0, together, holds)
+        speed, multiples = paced(velocity.norm(dim=-1), loop.problem.noisy)
+        steps = 2 * math.ceil(0.5 * horizon * max(rho / DISCOUNTED, speed / MOVED))
+        return cls(horizon, max(FEWEST_STEPS, steps), GRADING, multiples)
+
+    def taken_by(self, loop: Loop) -> Dynamics:
+        """The dynamics of ``loop``, with its renewals."""
+        return Switched(loop, loop.renewed, self.renewals) if self.renewals else loop
+
+
 def simulate_performance(
     problem: Problem,
     policy: Policy,
@@ -112,27 +148,29 @@ def simulate_performance(
     beside the standard error. ``rounded``, the controller and `V` in single precision, takes their place where it agrees well
     enough with them at the starts; a few trajectories are exact, and what they differ by goes into the ``bias``. That is the
     error of integration (`refined`, with noise `expectation`) plus, where the ``horizon`` is truncated, the discount left
-    there times the rate's supremum as met along the trajectories, with head-room.
+    there times the rate's supremum as met along the trajectories, with head-room. A `HeldPolicy` is simulated as one: its
+    control changes only when it is renewed, always up to a truncated horizon.
     """
     dim, rho = problem.dim, problem.discount
-    random = horizon == RANDOM
+    dynamics = loop_of(problem, policy, value)
+    random = horizon == RANDOM and not isinstance(dynamics, HeldLoop)
     points, mass = starting_points(problem, trajectories, replicates, seed, extra=int(random))
     x0 = points[:, :dim]
-    dynamics = closed_loop_dynamics(problem, policy, value)
+    along, beside = (None, value) if isinstance(dynamics, HeldLoop) else (value, None)  # of rates; of whole pieces
     with torch.no_grad():
-        base = value(x0) if value is not None else torch.zeros_like(x0[:, 0])
-        state = x0 if value is None or problem.noisy else torch.cat([x0, base.unsqueeze(-1)], dim=-1)
+        base = along(x0) if along is not None else torch.zeros_like(x0[:, 0])
+        state = dynamics.start(x0)
         velocity, rate = dynamics(state)
-        if value is not None:
-            paid = closed_loop_dynamics(problem, policy, None)(x0)[1]
+        if along is not None:
+            paid = loop_of(problem, policy, None)(state)[1]
             if not float((mass * rate.reshape(len(x0), -1)[:, 0]).abs().mean()) <= NO_VARIATE * float(
                 (mass * paid).mean()
             ):
                 plain = None if rounded is None else (rounded[0], None)
                 effort = trajectories, replicates, seed
                 return simulate_performance(problem, policy, *effort, None, None, horizon, tolerance, plain)
-        quick = dynamics if rounded is None else closed_loop_dynamics(problem, *rounded)
-        off = (quick(state)[1] - rate).abs().mean()
+        quick = dynamics if rounded is None else loop_of(problem, *rounded)
+        off = (quick(quick.renewed(state))[1] - rate).abs().mean()
         velocity, rate = velocity[:, :dim], rate.reshape(len(x0), -1)[:, 0]
     if not (torch.isfinite(velocity).all() and torch.isfinite(rate).all()):
         return Simulated(Estimate(math.nan, math.nan), math.nan, x0)
@@ -143,41 +181,46 @@ def simulate_performance(
     together = rounded is not None and problem.concurrent  # networks of ours are pure functions
     times = -torch.log1p(-points[:, dim]) / rho if random else torch.zeros_like(mass)
     longest = float(times.max()) if random else max(math.log(max(largest_rate / (TAIL * size), math.e)), 1.0) / rho
-
-    sliding = None if value is None or problem.noisy else Sliding(len(x0), tolerance * size)
+    steps = Steps.of(dynamics, longest, velocity)
+    sliding = Sliding(len(x0), tolerance * size) if isinstance(dynamics, FeedbackLoop) and dynamics.summed else None
 
     def integrated(by: Dynamics) -> Integrate:
         def some(rows: Tensor, count: int) -> tuple[Tensor, Tensor]:
             if random:
                 return rate_at(by, state[rows], rho, times[rows], count, wrap=False)
-            return discounted_integral(by, state[rows], rho, longest, count, wrap=False, grading=GRADING)
+            return discounted_integral(by, state[rows], rho, steps.horizon, count, wrap=False, grading=steps.grading)
 
-        finer = in_finer_steps(some, multiples)
+        finer = in_finer_steps(some, steps.multiples)
         all_rows = lambda rows, count: cast(tuple[Tensor, Tensor], in_pieces(lambda n: finer(n, count), rows, together))
         return all_rows if sliding is None else sliding.by(all_rows)
 
-    speed, multiples = paced(velocity.norm(dim=-1), problem.noisy)
-    steps = max(FEWEST_STEPS, 2 * math.ceil(0.5 * longest * max(rho / DISCOUNTED, speed / MOVED)))
+    swift, exact = steps.taken_by(quick), None if quick is dynamics else steps.taken_by(dynamics)
     means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
     if problem.noisy:
-        grid = Grid(times, steps, 1.0) if random else Grid(torch.full_like(mass, longest), steps, GRADING)
+        horizons, grading = (times, 1.0) if random else (torch.full_like(mass, steps.horizon), steps.grading)
+        grid = Grid(horizons, steps.count, grading)
         how = at_random_times(rho) if random else discounted(rho), tolerance * size, seed
-        audit = None if quick is dynamics else dynamics
-        found = expectation(quick, problem.noise, x0, mass, replicates, grid, *how, audit, together)
+        found = expectation(swift, dynamics.noise, state, mass, replicates, grid, *how, exact, together)
         result, refinement, end, bias = found
+        result = result if beside is None else result - beside(x0)
+    elif isinstance(dynamics, HeldLoop) and isinstance(quick, HeldLoop):
+        loops, sets = (dynamics, quick, beside), (state, mass, replicates)
+        result, end, bias = held_integrals(*loops, *sets, steps.horizon, tolerance * size, seed, together)
+        refinement = torch.zeros_like(means(result))
     else:
         generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT))
         error = lambda results: Estimate.of(means(results).tolist()).se
-        exact = None if quick is dynamics else integrated(dynamics)
-        result, end, bias = refined(integrated(quick), mass, steps, tolerance * size, generator, error, exact)
+        audit = None if exact is None else integrated(exact)
+        result, end, bias = refined(integrated(swift), mass, steps.count, tolerance * size, generator, error, audit)
         refinement = torch.zeros_like(means(result))
     ended = end[:, :dim].remainder(1.0)
     with torch.no_grad():
         rate = dynamics(end)[1]
         rate = rate if sliding is None else sliding.corrected(rate, torch.arange(len(rate)))
-        largest_rate = max(largest_rate, RATE_ROOM * float(rate.abs().max()))
+        left = 0.0 if beside is None else beside(ended).abs()
+        largest_rate = max(largest_rate, RATE_ROOM * float((rate.abs() + left).max()))
     if not random:
-        bias += math.exp(-rho * longest) * largest_rate * float(mass.mean())
+        bias += math.exp(-rho * steps.horizon) * largest_rate * float(mass.mean())
     bias += UNSEEN_ROOM * unseen_cost(problem, x0, mass, seed)
     parts = (means(result) + refinement).tolist()
     totals = [part + (initial[r % len(initial)] if initial else 0.0) for r, part in enumerate(parts)]
@@ -186,7 +229,8 @@ def simulate_performance(
     perf = widened(perf, [mass * result])
     # One path with noise is off its mean, `V^u`; the largest of `N` by some `sqrt(2 log N)` standard deviations.
     chance = float(result.std()) * math.sqrt(2.0 * math.log(len(result))) if problem.noisy else 0.0
-    return Simulated(perf, None if random else float((base + result).max()) - chance, ended)
+    largest = None if random or isinstance(dynamics, HeldLoop) else float((base + result).max()) - chance
+    return Simulated(perf, largest, ended)
 
 
 def stratum_error(results: Tensor, replicates: int) -> float:

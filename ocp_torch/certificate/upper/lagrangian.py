@@ -110,7 +110,7 @@ def closed_loop_bounds(
 
 
 class Lagrangian(Bound):
-    """The Lagrangian bound of the controller handed out, from the density that was fitted to its closed loop."""
+    """The Lagrangian bound of the controller that is followed, from the density that was fitted to its closed loop."""
 
     name, side, label = "lagrangian", UPPER, "Lagrangian"
 
@@ -119,6 +119,9 @@ class Lagrangian(Bound):
 
     def evaluate(self, context: "Context") -> Estimate | None:
         return context.closed_loop.lagrangian if context.closed_loop else None
+
+    def speaks(self, context: "Context") -> bool:
+        return context.followed == context.kind
 
     def searches(self, context: "Context") -> list[str]:
         return slack_searches(context.closed_loop)

@@ -90,7 +90,7 @@ class PenalisedPrimal(Bound):
 
     def speaks(self, context: "Context") -> bool:
         """`J` bounds the performance of `w / mu`, or of the controller whose closed loop was fitted; of nothing else."""
-        return context.takes_fitted_J or context.kind == "density"
+        return context.kind == (context.followed if context.takes_fitted_J else "density")
 
     def notes(self, context: "Context", shown: Estimate | None) -> list[str]:
         notes = []

@@ -8,6 +8,7 @@ from functools import singledispatch
 import torch
 from torch import Tensor
 
+from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.physical.system import System
@@ -62,22 +63,31 @@ class Path:
 def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, steps: int, samples: int = 1) -> Path:
     r"""From ``x0`` ``(N, d)`` for ``duration``, by RK4 with a control recomputed at each stage; with noise ``samples``
     paths from each start, by the midpoint rule and what the noise does in a step, which is the same for all controllers.
+    A `HeldPolicy` is asked no less often than it is meant to be, and its controls are held in between.
 
     The cost is `int_0^T rho e^{-rho t} (f + R(u)) dt` by the trapezoidal rule: good to a few digits, where the certificate's
     performance has an error bound.
     """
-    h, rho = duration / steps, problem.discount
-    velocity = lambda x: problem.velocity(x, policy(x))
+    holds, substeps = 1, 1  # of each step
+    if isinstance(policy, HeldPolicy):
+        holds, substeps = math.ceil(duration / steps / policy.pace.step), policy.pace.substeps
+    finer = holds * substeps
+    h, rho = duration / (steps * finer), problem.discount
+    control = policy
+    velocity = lambda x: problem.velocity(x, control(x))
     rate = lambda x, u: problem.state_cost(x) + problem.control_cost.cost(u)
-    times = h * torch.arange(steps + 1, dtype=x0.dtype)
+    times = h * torch.arange(steps * finer + 1, dtype=x0.dtype)
     weight = rho * h * (-rho * times).exp()
     weight[0], weight[-1] = 0.5 * weight[0], 0.5 * weight[-1]
     samples, generator = samples if problem.noisy else 1, fixed_generator()
     x0 = x0.repeat_interleave(samples, dim=0)
     x, states = x0, [x0.remainder(1.0)]
     cost = torch.zeros_like(x0[:, 0])
-    for k in range(steps):
-        u = policy(x)
+    for k in range(steps * finer):
+        if isinstance(policy, HeldPolicy) and k % substeps == 0:
+            held = policy(x)
+            control = lambda at, u=held: u  # type: ignore[misc]
+        u = control(x)
         cost = cost + weight[k] * rate(x, u)
         v1 = problem.velocity(x, u)
         v2 = velocity(x + 0.5 * h * v1)
@@ -89,8 +99,9 @@ def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, step
             drawn = torch.randn(len(x), sigma.shape[-1], dtype=x.dtype, generator=generator)
             x = x + h * v2 + h**0.5 * torch.einsum("ndk,nk->nd", sigma, drawn)
         x = x.remainder(1.0)
-        states.append(x)
-    return Path(times, torch.stack(states), cost + weight[-1] * rate(x, policy(x)), samples)
+        if (k + 1) % finer == 0:
+            states.append(x)
+    return Path(times[::finer], torch.stack(states), cost + weight[-1] * rate(x, policy(x)), samples)
 
 
 def admissible(problem: Problem, x: Tensor) -> Tensor:

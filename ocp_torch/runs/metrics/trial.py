@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.policies import Policy, zero_policy
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.maths.seeds import Branch, derive_seed
@@ -54,8 +55,9 @@ def metrics(problem: Problem, policy: Policy, seed: int = 0, starts: int = START
     steps = max(STEPS, math.ceil(duration * _pace(problem) / LONGEST_STEP))
     policies = {"controller": policy, "zero": zero_policy(problem), "classical": classical_policy(problem)}
     found = {}
-    # A classical policy knows no limit of the control, and others round.
-    within = lambda each: lambda x: problem.control_cost.within(each(x), torch.ones_like(x[:, 0]))
+    # A classical policy knows no limit of the control, and others round; one that is held is within it.
+    cut = lambda each: lambda x: problem.control_cost.within(each(x), torch.ones_like(x[:, 0]))
+    within = lambda each: each if isinstance(each, HeldPolicy) else cut(each)
     for name, each in policies.items():
         if each is not None:
             path = simulate(problem, within(each), x0, duration, steps)

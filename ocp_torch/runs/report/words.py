@@ -4,7 +4,7 @@ import math
 
 from ocp_torch.certificate import bounds
 from ocp_torch.certificate.bound import LOWER, UPPER
-from ocp_torch.certificate.report import MEANS
+from ocp_torch.certificate.report import MEANS, holding
 from ocp_torch.errors import visible
 from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED
 
@@ -111,6 +111,7 @@ def trust(certificate: dict) -> list[str]:
         found.append(
             had if max(shares) > 0.0 else "It is not certain that the controller gains anything over doing nothing."
         )
+    found += map(sentence, holding(certificate))
     if (outside := certificate.get("outside_box")) is not None:
         found.append(
             f"{percent(outside['value'])} of the discounted time is spent outside the box, where the model ends."

@@ -1,17 +1,4 @@
-r"""The closed loop along its trajectories: forwards what it costs, with `V` as control variate; backwards its density.
-
-For any smooth `V`, `V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt` exactly along the closed loop, with the Bellman slack
-`Q_u = V - f - R(u) - grad V . (a + B u) / rho`. So `Perf(u) = E[V mu0] - E int rho e^{-rho t} Q_u`, and what is left to
-simulate, with all its errors, is as small as `Q_u`.
-
-With noise `Q_u` has `D : hess V` in it, and the identity a martingale of mean 0 (Ito's formula), which is left out: paths are
-those of the SDE, and what is averaged along them is `Q_u` alone (`ocp_torch.maths.brownian`).
-
-For every `z` with `z = V` at the start, the integral of `f + R(u) - z + z' / rho`, discounted, is the cost less that `V`. On
-a sliding mode, where a controller jumps to and fro at a kink of `V`, no step is small enough for `grad V . g` to be the rate
-at which `V` changes: there `z`, the sum of `grad V . g` along the trajectory, takes the place of `V`. Along smooth
-trajectories `z - V` vanishes with the steps.
-"""
+"""Where a closed loop leads: its occupation density, found backwards in time along trajectories, and the largest of it."""
 
 import math
 from typing import cast
@@ -19,21 +6,16 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from ocp_torch.control.policies import Policy, ValuePolicy
+from ocp_torch.control.policies import Policy
 from ocp_torch.maths.brownian import Grid, discounted, increments, path_integral
 from ocp_torch.maths.cores import in_pieces
-from ocp_torch.maths.jets import Field
-from ocp_torch.maths.runge_kutta import Dynamics, Integrate, discounted_integral
+from ocp_torch.maths.runge_kutta import Dynamics, discounted_integral
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.sums import summed
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.closed_loop import ClosedLoop
-from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
-from ocp_torch.problems.samples import Samples
 
-# `z - V` must shrink to that part of it when steps are halved; a sixteenth is expected of a method of order four.
-SETTLING = 0.25
 # The integral over the past is taken in pieces of so many discount times, until the last one adds next to nothing; what
 # has not settled after so many pieces is extrapolated.
 PIECE, PIECES, SETTLED = 5.0, 8, 1e-2
@@ -51,56 +33,6 @@ TOP, NEARBY = 6, 48
 ASCENTS, ASCENT_STEPS = 16, 20
 # Step of a difference quotient of the velocity: truncation is then about 1e-7 of its second derivatives, rounding 1e-9.
 DIFFERENCE = 1e-7
-
-
-def closed_loop_dynamics(problem: Problem, policy: Policy, value: Field | None) -> Dynamics:
-    """The closed loop and what it costs; with ``value`` its slack `-Q_u`, and, without noise, as one more coordinate `z`, the
-    sum of `grad V . g` from `V` at the start on, with `z - V` as a second rate."""
-    cost, noisy = problem.control_cost, problem.noisy
-
-    def dynamics(state: Tensor) -> tuple[Tensor, Tensor]:
-        if value is None:
-            u = policy(state)
-            return problem.velocity(state, u), problem.state_cost(state) + cost.cost(u)
-        x, summed = (state, None) if noisy else (state[:, :-1], state[:, -1])
-        samples = Samples.of(problem, x, divergences=False)
-        generator = Generator.of(problem, samples)
-        V = generator.jet(value)
-        u = policy.control(samples.B, V) if isinstance(policy, ValuePolicy) and policy.value is value else policy(x)
-        velocity = samples.a + torch.einsum("ndm,nm->nd", samples.B, u)
-        slack = generator.bellman_slack(V, u)
-        if summed is None:
-            return velocity, -slack
-        change = (V.gradient * velocity).sum(dim=-1, keepdim=True)
-        return torch.cat([velocity, change], dim=-1), torch.stack([-slack, summed - V.value], dim=-1)
-
-    return dynamics
-
-
-class Sliding:
-    """Results of ``count`` trajectories, by `-Q_u`, or with `z - V` taken off where that stays above ``allowed`` however fine
-    the steps."""
-
-    def __init__(self, count: int, allowed: float) -> None:
-        self.allowed = allowed
-        self.off = torch.full((count,), math.inf, dtype=torch.float64)
-        self.stays = torch.zeros(count, dtype=torch.bool)
-
-    def by(self, integrate: Integrate) -> Integrate:
-        """The results of ``integrate``, of whose columns the first is `-Q_u` and the second `z - V`."""
-
-        def corrected(rows: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-            rates, end = integrate(rows, steps)
-            off = rates[:, 1].abs()
-            self.stays[rows] = (off > self.allowed) & (off > SETTLING * self.off[rows])
-            self.off[rows] = off
-            return self.corrected(rates, rows), end
-
-        return corrected
-
-    def corrected(self, rates: Tensor, rows: Tensor) -> Tensor:
-        """The first column of ``rates`` ``(n, 2)`` of ``rows``, less the second where that is to be taken off."""
-        return torch.where(self.stays[rows], rates[:, 0] - rates[:, 1], rates[:, 0])
 
 
 def backward_flow(problem: Problem, policy: Policy, together: bool = False) -> Dynamics:
