@@ -6,6 +6,7 @@ from typing import NamedTuple
 from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.simulated.performance import Simulated, simulate_performance
+from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.policies import Policy, zero_policy
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.problem import Problem
@@ -13,7 +14,8 @@ from ocp_torch.problems.problem import Problem
 # Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
 # a controller that another one clearly beats; but without noise so few in all as the second number take hardly longer than a
 # part of them (with noise the finest steps take longest: 2.2 s for the worse controller of a pendulum in a look of 5.3 s).
-# Their steps need not be as fine either: the third is by how many times.
+# Their steps need not be as fine either: the third is by how many times. Where one controller holds its control, another one
+# that acts at every instant often trembles at the same ridges, and takes minutes on fine steps.
 BASELINE_PART, CHEAP, ROUGH = 4, 256, 200.0
 
 
@@ -39,7 +41,8 @@ def simulate_candidates(
         return simulate_performance(problem, policy, *effort, value, initial, *how)
 
     few = max(2, settings.trajectories // BASELINE_PART)
-    many = problem.noisy or settings.trajectories * settings.replicates > CHEAP
+    held = any(isinstance(candidate.policy, HeldPolicy) for candidate in candidates.values())
+    many = problem.noisy or held or settings.trajectories * settings.replicates > CHEAP
     pays = best_only and len(candidates) > 1 and many
     found = {name: simulate(candidate, few, ROUGH) for name, candidate in candidates.items()} if pays else {}
     best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
