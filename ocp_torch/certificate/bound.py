@@ -47,9 +47,9 @@ class Bound(ABC):
         """Whether nothing that was found shows the number to be wrong. One that is wrong is not shown at all."""
         return True
 
-    def speaks(self, context: Context) -> bool:
-        """Of an upper bound: whether it bounds the performance of the controller that is handed out, not `OPT` alone."""
-        return True
+    def about(self, context: Context) -> str | None:
+        """Of an upper bound: the controller whose performance it bounds; `None` where it bounds `OPT` alone."""
+        return context.kind
 
     def notes(self, context: Context, shown: Estimate | None) -> list[str]:
         """What a user should be told beside the number that is ``shown``."""

@@ -24,13 +24,12 @@ class Certificate:
 
     ``lower``, ``upper``, ``perf_lower`` (bounds of the listed sides, see `ocp_torch.certificate.bounds`), ``perf`` and
     ``baseline`` (simulated) map the names of `certificate.json` to estimates; ``searches`` says how each supremum behind
-    them was found, ``speaks`` by name whether an upper bound is about the controller that is handed out. ``confidence`` is
-    the level of the intervals; ``subject`` names the controller in ``perf`` that all this is about, by default the best of
-    them. ``contradiction`` is the sentence that says why nothing counts, where two bounds exclude each other; ``refuted``
-    are the names of guesses that another bound excludes. ``outside`` is the part of the discounted time that the controller
-    spends outside the box of a system in physical units. ``held_for`` is the time for which it holds each control, `None`
-    where it acts at every instant; ``followed`` is the one whose closed loop was fitted, by the density ``occupation``, to
-    draw.
+    them was found, ``about`` by name which controller's performance an upper bound bounds, if any. ``confidence`` is the
+    level of the intervals; ``subject`` names the controller in ``perf`` that is handed out, by default the best of them.
+    ``contradiction`` is the sentence that says why nothing counts, where two bounds exclude each other; ``refuted`` are the
+    names of guesses that another bound excludes. ``outside`` is the part of the discounted time that the controller spends
+    outside the box of a system in physical units. ``held_for`` is the time for which it holds each control, `None` where it
+    acts at every instant; ``followed`` is the one whose closed loop was fitted, by the density ``occupation``, to draw.
     """
 
     run: Run
@@ -42,7 +41,7 @@ class Certificate:
     assumptions: Assumptions
     warnings: list[str] = field(default_factory=list)
     searches: list[str] = field(default_factory=list)
-    speaks: dict[str, bool] = field(default_factory=dict)
+    about: dict[str, str | None] = field(default_factory=dict)
     confidence: float = CONFIDENCE
     subject: str | None = None
     perf_lower: dict[str, Estimate | None] = field(default_factory=dict)
@@ -80,7 +79,24 @@ class Certificate:
     @property
     def best_upper(self) -> Side | None:
         """The bound on the controller handed out that counts with the lowest upper end, and that end; no simulation."""
-        return self._lowest(self.upper, lambda name: self.counts(name) and self.speaks.get(name, True))
+        return self.best_upper_of(self.subject)
+
+    def best_upper_of(self, controller: str | None) -> Side | None:
+        """The same of any ``controller``."""
+        about = lambda name: self.about.get(name, controller) == controller
+        return self._lowest(self.upper, lambda name: self.counts(name) and about(name))
+
+    @property
+    def certified(self) -> dict[str, float | None]:
+        """The certified gap of each controller that is known."""
+        return {name: relative_gap(self.best_lower, self.best_upper_of(name)) for name in known_of(self.perf)}
+
+    @property
+    def best_certified(self) -> str | None:
+        """The controller with the lowest upper bound that counts."""
+        found = {name: self.best_upper_of(name) for name in known_of(self.perf)}
+        ends = {name: side[1] for name, side in found.items() if side is not None}
+        return min(ends, key=ends.__getitem__, default=None)
 
     @property
     def best_perf(self) -> Side | None:
@@ -105,6 +121,7 @@ class Certificate:
             "certified": relative_gap(lower, upper),
             "simulated": relative_gap(lower, perf),
             "conditional": min(both, default=None),
+            "certified_of": self.certified,
             "lower_from": lower[0] if lower else None,
             "upper_from": upper[0] if upper else None,
         }

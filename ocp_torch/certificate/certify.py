@@ -14,7 +14,7 @@ from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate, known_of
 from ocp_torch.certificate.external.controller import ControllerContext
 from ocp_torch.certificate.external.dataset import RecordedContext
-from ocp_torch.certificate.settings import CertificateSettings, Progress, Run, silent
+from ocp_torch.certificate.settings import CERTIFIED, CertificateSettings, Progress, Run, silent
 from ocp_torch.certificate.simulated.outside import outside_note
 from ocp_torch.certificate.trained import FieldsContext, Trained, TrainedContext
 from ocp_torch.control.policies import Policy
@@ -42,7 +42,6 @@ def certify(context: Context) -> Certificate:
         assumptions = context.assumptions  # before the lower side, whose `M` may follow from what is met here
         context.progress("bounds")
         lower = evaluated(LOWER)
-        outside = context.outside
     sides = {LOWER: lower, UPPER: upper, PERFORMANCE: perf_lower}
     certificate = Certificate(
         run=context.run,
@@ -63,19 +62,25 @@ def certify(context: Context) -> Certificate:
                 if estimate is not None and estimate.bias
             ),
             *context.remarks,
-            *outside_note(context.problem, outside),
         ],
         searches=list(dict.fromkeys(line for bound in bounds for line in bound.searches(context))),
-        speaks={bound.name: bound.speaks(context) for bound in bounds if bound.side == UPPER},
+        about={bound.name: bound.about(context) for bound in bounds if bound.side == UPPER},
         confidence=context.settings.confidence,
-        subject=context.kind if context.recorded or context.external else None,
+        subject=context.kind,
         perf_lower=perf_lower,
-        outside=outside,
-        held_for=context.held_for,
         followed=context.followed,
         occupation=None if context.closed_loop is None else context.closed_loop.occupation,
     )
-    return examined(certificate)
+    return handed_out(examined(certificate), context)
+
+
+def handed_out(certificate: Certificate, context: Context) -> Certificate:
+    """``certificate`` with the controller that is handed out as its subject, and what is known of that one alone."""
+    best = certificate.best_certified if context.settings.prefer == CERTIFIED else None
+    subject = certificate.subject if best is None else best
+    outside, held_for = context.outside(subject), context.held_for(subject)
+    warnings = [*certificate.warnings, *outside_note(context.problem, outside)]
+    return replace(certificate, subject=subject, outside=outside, held_for=held_for, warnings=warnings)
 
 
 def shown(bound: Bound, context: Context) -> Estimate | None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from torch import Tensor
 
-from ocp_torch.certificate.checks.assumptions import Assumptions, check_assumptions
+from ocp_torch.certificate.checks.assumptions import Assumptions, check_assumptions, value_holds
 from ocp_torch.certificate.checks.hidden import Hidden
 from ocp_torch.certificate.checks.observed import Observed
 from ocp_torch.certificate.checks.tails import sharpened
@@ -20,7 +20,7 @@ from ocp_torch.certificate.simulated.outside import time_outside
 from ocp_torch.certificate.simulated.performance import Simulated
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.upper.penalised import DensityBounds
-from ocp_torch.control.policies import Policy
+from ocp_torch.control.policies import DENSITY, Policy
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import Constants
@@ -75,10 +75,14 @@ class Context:
         """The controller whose closed loop is looked at and fitted: the one handed out, where that acts at every instant."""
         return self.kind
 
-    @property
-    def held_for(self) -> float | None:
-        """For how long the controller handed out holds its control; `None` for one that acts at every instant."""
+    def held_for(self, name: str | None) -> float | None:
+        """For how long the controller ``name`` holds its control; `None` for one that acts at every instant."""
         return None
+
+    def value_holds_of(self, name: str) -> bool:
+        """Whether no simulated value of the controller ``name`` exceeds `C_V`."""
+        found = self.simulated[0].get(name)
+        return found is None or value_holds(found.largest_value, self.constants)
 
     @property
     def notes(self) -> list[str]:
@@ -146,10 +150,9 @@ class Context:
         self.progress("simulation")
         return simulate_candidates(self.problem, candidates, self.settings, self.seed, best_only=not self.external)
 
-    @cached_property
-    def outside(self) -> Estimate | None:
-        """The part of the discounted time that the controller handed out spends outside the box of a system."""
-        handed_out = self.candidates.get(self.kind) if self.kind in self.simulated[0] else None
+    def outside(self, name: str | None) -> Estimate | None:
+        """The part of the discounted time that the controller ``name`` spends outside the box of a system."""
+        handed_out = self.candidates.get(name) if name in self.simulated[0] else None
         return handed_out and time_outside(self.problem, handed_out.policy, self.settings, self.seed)
 
     def bounds_of(
@@ -203,7 +206,7 @@ class Context:
         `C_V` that holds, and no larger."""
         if self.closed_loop is None:
             return False
-        own = self.densities if self.followed == "density" and self.checked.value_holds else None
+        own = self.densities if self.followed == DENSITY and self.checked.value_holds else None
         return own is None or not own.J.value <= self.closed_loop.J.value
 
     @cached_property

@@ -18,6 +18,12 @@ if TYPE_CHECKING:
 SCHEMA = 2
 # A gap above this says nothing as a percentage, and is told as a multiple.
 MEANS = 1.0
+# What the controllers of a run are called in sentences.
+CONTROLLERS = {
+    "value": "controller from V",
+    "density": "controller w/mu",
+    "trajectories": "controller from trajectories",
+}
 
 
 def to_dict(certificate: Certificate) -> dict:
@@ -34,7 +40,8 @@ def to_dict(certificate: Certificate) -> dict:
         return {
             **estimate.to_dict(certificate.confidence),
             "rests_on": {need.name: need.basis for need in needs},
-            "counts": certificate.counts(name) and certificate.speaks.get(name, True),
+            "counts": certificate.counts(name)
+            and certificate.about.get(name, certificate.subject) == certificate.subject,
             **({"if": " and ".join(supposed)} if supposed else {}),
         }
 
@@ -100,6 +107,9 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
             had = share[kind] is not None and share[kind] > 0.0
             part = f", {100 * share[kind]:.2f}% of the gain over doing nothing" if had else ""
             lines.append(f"gap, {kind}: {gap_in_words(gap[kind])}{part}")
+    for other, found in gap.get("certified_of", {}).items():
+        if found is not None and other != certificate["controller"]:
+            lines.append(f"gap, certified, of the {CONTROLLERS.get(other, other)}: {gap_in_words(found)}")
     if gap.get("conditional") is not None:
         guesses = dict.fromkeys(visible(b["if"]) for b in certificate["lower"].values() if b and "if" in b)
         lines.append(f"gap, if {' and '.join(guesses)}: {gap_in_words(gap['conditional'])}, which rests on a guess")
@@ -131,8 +141,9 @@ def in_words(certificate: dict) -> list[str]:
     parts = [f"at most {percent(most)}"] if most is not None else []
     if least:
         parts.append(f"at least {percent(least)}")
-    worse = f"the controller is {' and '.join(parts)} worse than the optimum ({taking(certificate)})"
-    return ([worse] if parts else []) + holding(certificate)
+    if parts:
+        parts = [f"the controller is {' and '.join(parts)} worse than the optimum ({taking(certificate)})"]
+    return parts + holding(certificate)
 
 
 def holding(certificate: dict) -> list[str]:

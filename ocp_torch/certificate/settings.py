@@ -14,6 +14,8 @@ from ocp_torch.problems.problem import Problem
 LONGEST_NAME = 120
 # How performance deals with the infinite horizon: stop late and bound the rest, or stop at an exponential time.
 TRUNCATED, RANDOM = "truncated", "random"
+# Which controller is handed out: the one with the lowest simulated performance, or with the lowest bound without simulation.
+SIMULATED, CERTIFIED = "simulated", "certified"
 # Bytes of a number; and numbers that a simulated trajectory and a state of the occupation's supremum have in memory at once,
 # at least, per coordinate of states and controls: those of a Runge-Kutta step.
 DOUBLE, AT_ONCE = 8, 4
@@ -64,6 +66,7 @@ class CertificateSettings:
     confidence: float = CONFIDENCE  # how often an interval covers the truth, by Student's t over the replicates
     tolerance: float = 5e-5  # relative; a trajectory's steps are halved until its cost changes by less
     horizon: str = TRUNCATED  # truncated: bounded tail in `bias`; random: an exponential time, no tail and more noise
+    prefer: str = SIMULATED  # hand out the controller of the lowest performance, simulated or certified
     stage: StageSettings = field(default_factory=StageSettings)  # the fit to the closed loop
 
     def __post_init__(self) -> None:
@@ -76,6 +79,7 @@ class CertificateSettings:
         require_number("certificate.confidence", self.confidence, above=0.0, at_most=0.999999)
         require_number("certificate.tolerance", self.tolerance, above=0.0)
         require_choice("certificate.horizon", self.horizon, (TRUNCATED, RANDOM))
+        require_choice("certificate.prefer", self.prefer, (SIMULATED, CERTIFIED))
 
     def searches(self, constants: Constants) -> bool:
         """Whether the bound without `M` is sought among functions made of `V` too, for a problem of these ``constants``."""

@@ -19,7 +19,9 @@ from ocp_torch.certificate.upper.penalised import DensityBounds, density_bounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.policies import (
+    DENSITY,
     TRAJECTORIES,
+    VALUE,
     Density,
     Policy,
     admissible_density,
@@ -56,7 +58,7 @@ class FieldsContext(Context):
 
     trained: Trained
 
-    listed = ("value", "density")
+    listed = (VALUE, DENSITY)
 
     @property
     def occupation(self) -> str | None:
@@ -120,9 +122,8 @@ class TrainedContext(FieldsContext):
         known = {name: found[name].perf.above for name in names if name in found and found[name].perf.finite}
         return min(known, key=known.__getitem__, default=names[0])
 
-    @property
-    def held_for(self) -> float | None:
-        policy = self.policies[self.kind]
+    def held_for(self, name: str | None) -> float | None:
+        policy = self.policies.get(name or self.kind)
         return policy.pace.step if isinstance(policy, HeldPolicy) else None
 
     @property
@@ -185,7 +186,7 @@ class TrainedContext(FieldsContext):
         notes = list(self._fit[1])
         with torch.no_grad():
             empty = (bool((self._mu(samples.x[:LOOKED_AT]) <= 0.0).any()) for samples in self.few)
-            if self.followed == "density" and self.densities is not None and any(empty):
+            if self.followed == DENSITY and self.densities is not None and any(empty):
                 what = "where w / mu is not regular: J and G may miss what it costs there"
                 notes.insert(0, f"mu is 0 at sampled states, {what}.")
         return notes

@@ -17,8 +17,9 @@ from ocp_torch.problems.generator import Generator, pull_back
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# The controller from the `V` of a warm start, which the values of trajectories under held controls were fitted to.
-TRAJECTORIES = "trajectories"
+# The controllers of trained fields: from `V`; from `w / mu`; and from the `V` of a warm start, which the values of
+# trajectories under held controls were fitted to.
+VALUE, DENSITY, TRAJECTORIES = "value", "density", "trajectories"
 
 # A policy maps states (N, d) to controls (N, m); a density maps them to (N,).
 Policy = Callable[[Tensor], Tensor]
@@ -86,11 +87,11 @@ def trained_policies(kind: str | None, problem: Problem, fields: Fields, constan
     they hold the `V` of a warm start."""
     policies: dict[str, Policy] = {}
     if fields.value is not None:
-        policies["value"] = ValuePolicy(problem, fields.value)
+        policies[VALUE] = ValuePolicy(problem, fields.value)
     # Lemmas 2 and 3 give mu from the cost at the state itself.
     if fields.control_density is not None and (kind == NETWORK or problem.has_simulator):
         mu = occupation_density(kind, problem, fields, constants)
-        policies["density"] = density_policy(fields.control_density, mu, problem.control_cost)
+        policies[DENSITY] = density_policy(fields.control_density, mu, problem.control_cost)
     if fields.trajectory_value is not None:
         policies[TRAJECTORIES] = HeldPolicy(problem, fields.trajectory_value, Pace.of(problem))
     return policies

@@ -94,7 +94,7 @@ def faults_of_idling(certificate, problem, name) -> list[str]:
     if certificate.controller not in (name, None):
         return found
     for of, b in certificate.upper.items():
-        mine = certificate.speaks.get(of, True) and (b is None or b.controller in (None, name))
+        mine = certificate.about.get(of, name) == name and (b is None or b.controller in (None, name))
         if known(b) and certificate.counts(of) and mine and b.value + slack(b) < least:
             found.append(f"{of} of idling: {b.value:.6g} + {slack(b):.2g}, but it costs {least:.6g}")
     for of, b in certificate.perf_lower.items():

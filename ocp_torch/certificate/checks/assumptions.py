@@ -117,8 +117,8 @@ def check_assumptions(
         warnings.append(
             f"F_M is a bound only if sup mu* <= {constants.M:.4g}{how} a guess: no gap that counts uses it."
         )
-    value_holds = reached is None or reached <= constants.C_V * (1.0 + ROUGH)
-    if uses_C_V and not value_holds:
+    C_V_holds = value_holds(reached, constants)
+    if uses_C_V and not C_V_holds:
         warnings.append(
             f"J with C_V = {constants.C_V:.4g} and G are not used: the controller's value reaches {reached:.4g}."
         )
@@ -139,7 +139,7 @@ def check_assumptions(
         observed.sup_occupation,
         observed.sup_control,
         occupation_holds=M_holds or not uses_M,
-        value_holds=value_holds or not uses_C_V,
+        value_holds=C_V_holds or not uses_C_V,
         control_holds=control_holds or not uses_C_V,
         regular_holds=not jumps and posed.smooth_seam,
         cost_holds=posed.nonnegative,
@@ -153,6 +153,11 @@ def check_assumptions(
         M_is=M_is,
         warnings=warnings,
     )
+
+
+def value_holds(reached: float | None, constants: Constants) -> bool:
+    """Whether the value that a controller ``reached``, if one was looked for, does not exceed `C_V`."""
+    return reached is None or reached <= constants.C_V * (1.0 + ROUGH)
 
 
 def occupation_holds(

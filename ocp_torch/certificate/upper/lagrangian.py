@@ -120,8 +120,8 @@ class Lagrangian(Bound):
     def evaluate(self, context: "Context") -> Estimate | None:
         return context.closed_loop.lagrangian if context.closed_loop else None
 
-    def speaks(self, context: "Context") -> bool:
-        return context.followed == context.kind
+    def about(self, context: "Context") -> str | None:
+        return context.followed
 
     def searches(self, context: "Context") -> list[str]:
         return slack_searches(context.closed_loop)

@@ -4,7 +4,8 @@ from ocp_torch.certificate.bound import UPPER, Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.control.policies import CLOSED
+from ocp_torch.certificate.settings import CERTIFIED
+from ocp_torch.control.policies import CLOSED, DENSITY
 from ocp_torch.problems.needs import Need
 
 
@@ -25,11 +26,12 @@ class MinimisedPrimal(Bound):
         jumps = jump is not None and jump.in_problem
         return context.hidden is None and not jumps and context.posed.smooth_seam
 
-    def speaks(self, context: Context) -> bool:
-        """`G` bounds the performance of `w` over the `mu` of Lemma 2; of nothing else."""
-        return context.kind == "density" and context.occupation == CLOSED and context.checked.value_holds
+    def about(self, context: Context) -> str | None:
+        """`G` bounds the performance of `w` over the `mu` of Lemma 2, where no value of that exceeds `C_V`."""
+        return DENSITY if context.occupation == CLOSED and context.value_holds_of(DENSITY) else None
 
     def notes(self, context: Context, shown: Estimate | None) -> list[str]:
-        if shown is None or self.speaks(context):
+        about = self.about(context)
+        if shown is None or about == context.kind or about and context.settings.prefer == CERTIFIED:
             return []
         return ["G bounds OPT, but not the controller that is handed out: the gap does not use it."]

@@ -10,7 +10,7 @@ from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.checks.hidden import Flux, Hidden, hidden_divergence
 from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.control.policies import Density
+from ocp_torch.control.policies import DENSITY, Density
 from ocp_torch.maths.jets import CHUNK, Field
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.needs import Need
@@ -88,9 +88,9 @@ class PenalisedPrimal(Bound):
     def valid(self, context: "Context") -> bool:
         return context.hidden is None
 
-    def speaks(self, context: "Context") -> bool:
-        """`J` bounds the performance of `w / mu`, or of the controller whose closed loop was fitted; of nothing else."""
-        return context.kind == (context.followed if context.takes_fitted_J else "density")
+    def about(self, context: "Context") -> str | None:
+        """`J` bounds the performance of the controller whose closed loop was fitted, or of `w / mu` if that was looked at."""
+        return context.followed if context.takes_fitted_J or context.followed == DENSITY else None
 
     def notes(self, context: "Context", shown: Estimate | None) -> list[str]:
         notes = []

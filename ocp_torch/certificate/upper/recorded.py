@@ -47,8 +47,8 @@ class RecordedPrimal(PenalisedPrimal):
     def valid(self, context: "Context") -> bool:
         return context.hidden is None and context.checked.regular_holds
 
-    def speaks(self, context: "Context") -> bool:
-        return True
+    def about(self, context: "Context") -> str | None:
+        return context.kind
 
     def notes(self, context: "Context", shown: Estimate | None) -> list[str]:
         if context.hidden is not None:
