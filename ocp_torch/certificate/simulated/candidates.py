@@ -14,8 +14,7 @@ from ocp_torch.problems.problem import Problem
 # Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
 # a controller that another one clearly beats; but without noise so few in all as the second number take hardly longer than a
 # part of them (with noise the finest steps take longest: 2.2 s for the worse controller of a pendulum in a look of 5.3 s).
-# Their steps need not be as fine either: the third is by how many times. Where one controller holds its control, another one
-# that acts at every instant often trembles at the same ridges, and takes minutes on fine steps.
+# Their steps need not be as fine either: the third is by how many times.
 BASELINE_PART, CHEAP, ROUGH = 4, 256, 200.0
 
 
@@ -33,7 +32,9 @@ def simulate_candidates(
     problem: Problem, candidates: dict[str, Candidate], settings: CertificateSettings, seed: int, best_only: bool
 ) -> tuple[dict[str, Simulated], Estimate]:
     """Performance of each of ``candidates``, and of doing nothing. With ``best_only`` one that is clearly worse than another
-    on a quarter of the trajectories gets no more of them, where that saves time."""
+    on a quarter of the trajectories gets no more of them, where that saves time. Beside one that holds its control, and takes
+    as long for a few trajectories, any worse one is left at that: acting at every instant it trembles where the other jumps,
+    and would take minutes on fine steps."""
 
     def simulate(candidate: Candidate, trajectories: int, room: float = 1.0) -> Simulated:
         policy, value, initial, rounded = candidate
@@ -41,13 +42,17 @@ def simulate_candidates(
         return simulate_performance(problem, policy, *effort, value, initial, *how)
 
     few = max(2, settings.trajectories // BASELINE_PART)
-    held = any(isinstance(candidate.policy, HeldPolicy) for candidate in candidates.values())
+    held = [name for name, candidate in candidates.items() if isinstance(candidate.policy, HeldPolicy)]
     many = problem.noisy or held or settings.trajectories * settings.replicates > CHEAP
-    pays = best_only and len(candidates) > 1 and many
-    found = {name: simulate(candidate, few, ROUGH) for name, candidate in candidates.items()} if pays else {}
+    quickly = [name for name in candidates if name not in held] if best_only and len(candidates) > 1 and many else []
+    found = {
+        name: simulate(candidate, *((few, ROUGH) if name in quickly else (settings.trajectories,)))
+        for name, candidate in candidates.items()
+    }
     best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
-    for name, candidate in candidates.items():
-        if name not in found or not found[name].perf.interval(CONFIDENCE)[0] > best:
-            found[name] = simulate(candidate, settings.trajectories)
+    for name in quickly:
+        perf = found[name].perf
+        if not (perf.above if held else perf.interval(CONFIDENCE)[0]) > best:
+            found[name] = simulate(candidates[name], settings.trajectories)
     nothing = zero_policy(problem)  # the same in any precision
     return found, simulate(Candidate(nothing, None, None, (nothing, None)), few, ROUGH).perf

@@ -40,9 +40,10 @@ GRADING = 2.0
 FEWEST_STEPS, DISCOUNTED, MOVED = 8, 0.4, 0.2
 # Simulation sets come after those of the bounds in the stream of evaluation points.
 SIMULATION_REPLICATE = 1000
-# What is left of the discount when simulation stops, times the rate's supremum, relative to the answer; which is taken to be
-# at least the second part of the mean state cost at the starts.
-TAIL, LEAST = 2e-5, 0.1
+# What is left of the discount when simulation stops, times the rate's supremum, relative to the answer: that part of the
+# tolerance, and so much at least and at most. The answer is taken to be at least the last part of the mean state cost at the
+# starts.
+TAIL_PART, SMALLEST_TAIL, LARGEST_TAIL, LEAST = 0.4, 2e-5, 0.02, 0.1
 # States to which the starts' mean cost is compared, how many standard errors apart the two must be, and by how many times
 # that the interval is widened: trajectories may stay where no start was.
 COMPARED, UNLIKELY, UNSEEN_ROOM = 2**15, 2.5, 2.0
@@ -180,7 +181,8 @@ def simulate_performance(
     quick = quick if float(off) <= ROUNDED * tolerance * size else dynamics
     together = rounded is not None and problem.concurrent  # networks of ours are pure functions
     times = -torch.log1p(-points[:, dim]) / rho if random else torch.zeros_like(mass)
-    longest = float(times.max()) if random else max(math.log(max(largest_rate / (TAIL * size), math.e)), 1.0) / rho
+    tail = min(max(TAIL_PART * tolerance, SMALLEST_TAIL), LARGEST_TAIL)
+    longest = float(times.max()) if random else max(math.log(max(largest_rate / (tail * size), math.e)), 1.0) / rho
     steps = Steps.of(dynamics, longest, velocity)
     sliding = Sliding(len(x0), tolerance * size) if isinstance(dynamics, FeedbackLoop) and dynamics.summed else None
 
