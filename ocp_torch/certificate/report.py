@@ -22,6 +22,7 @@ MEANS = 1.0
 CONTROLLERS = {
     "value": "controller from V",
     "density": "controller w/mu",
+    "minimised": "controller w/mu, mu of Lemma 2",
     "trajectories": "controller from trajectories",
 }
 
@@ -94,6 +95,7 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
         lines.append(f"{'OPT (exact)':26}{exact:14.8f}")
     row("Perf: controller from V", certificate["perf"].get("value"))
     row("Perf: controller w/mu", certificate["perf"].get("density"))
+    row("Perf: w/mu, mu of Lemma 2", certificate["perf"].get("minimised"))
     row("Perf: from trajectories", certificate["perf"].get("trajectories"))
     for kind, estimate in certificate.get(PERFORMANCE, {}).items():
         row(f"Perf, at least: {visible(kind, LONGEST_NAME)}", estimate)

@@ -13,6 +13,7 @@ from ocp_torch.certificate.checks.observed import Observed, observe
 from ocp_torch.certificate.checks.tails import sharpened
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.context import Context
+from ocp_torch.certificate.settings import CERTIFIED
 from ocp_torch.certificate.simulated.candidates import Candidate
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
 from ocp_torch.certificate.upper.penalised import DensityBounds, density_bounds
@@ -76,7 +77,8 @@ class FieldsContext(Context):
 
     def policies_of(self, fields: Fields) -> dict[str, Policy]:
         """The controllers that the trained ``fields`` give, in their precision, by name."""
-        return trained_policies(self.occupation, self.problem, fields, self.constants)
+        every = self.settings.prefer == CERTIFIED
+        return trained_policies(self.occupation, self.problem, fields, self.constants, every)
 
     @cached_property
     def policies(self) -> dict[str, Policy]:

@@ -57,7 +57,8 @@ class Controller:
 
     def __post_init__(self) -> None:
         self._exact = copy.deepcopy(self.fields).double()
-        self._policy = trained_policies(self.occupation, self.problem, self._exact, self.constants)[self.kind]
+        how = self.occupation, self.problem, self._exact, self.constants
+        self._policy = trained_policies(*how, every=True)[self.kind]
 
     def __call__(self, x: States) -> States:
         """Controls ``(N, m)`` at states ``(N, d)``: any reals, wrapped to the torus; NumPy in gives NumPy out, and floats of

@@ -61,7 +61,7 @@ def exported_function(
     """States ``(N, d)`` to ``control`` ``(N, m)`` and, where the controller holds a `V`, its ``value`` ``(N,)`` and
     ``gradient`` ``(N, d)``, in float64. In physical units a state beyond the box is taken for the nearest one in it."""
     fields = copy.deepcopy(fields).to("cpu").double()
-    policy = trained_policies(occupation, problem, fields, constants)[kind]
+    policy = trained_policies(occupation, problem, fields, constants, every=True)[kind]
     field = policy.value if isinstance(policy, ValuePolicy | HeldPolicy) else fields.value
 
     def on_torus(x: Tensor) -> Outputs:

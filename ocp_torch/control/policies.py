@@ -17,9 +17,9 @@ from ocp_torch.problems.generator import Generator, pull_back
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# The controllers of trained fields: from `V`; from `w / mu`; and from the `V` of a warm start, which the values of
-# trajectories under held controls were fitted to.
-VALUE, DENSITY, TRAJECTORIES = "value", "density", "trajectories"
+# The controllers of trained fields: from `V`; from `w / mu`; from the `V` of a warm start, which the values of trajectories
+# under held controls were fitted to; and from `w` and the `mu` of Lemma 2 where training takes another: `G` bounds its cost.
+VALUE, DENSITY, TRAJECTORIES, MINIMISED = "value", "density", "trajectories", "minimised"
 
 # A policy maps states (N, d) to controls (N, m); a density maps them to (N,).
 Policy = Callable[[Tensor], Tensor]
@@ -82,9 +82,11 @@ def occupation_density(kind: str | None, problem: Problem, fields: Fields, const
     return {CLOSED: closed, SADDLE: saddle, NETWORK: network}[kind or NETWORK]
 
 
-def trained_policies(kind: str | None, problem: Problem, fields: Fields, constants: Constants) -> dict[str, Policy]:
+def trained_policies(
+    kind: str | None, problem: Problem, fields: Fields, constants: Constants, every: bool = False
+) -> dict[str, Policy]:
     """The controllers trained fields give: ``value`` if they hold `V`, ``density`` if they hold `w`, and ``trajectories`` if
-    they hold the `V` of a warm start."""
+    they hold the `V` of a warm start; or ``every`` one, ``minimised`` too."""
     policies: dict[str, Policy] = {}
     if fields.value is not None:
         policies[VALUE] = ValuePolicy(problem, fields.value)
@@ -92,6 +94,9 @@ def trained_policies(kind: str | None, problem: Problem, fields: Fields, constan
     if fields.control_density is not None and (kind == NETWORK or problem.has_simulator):
         mu = occupation_density(kind, problem, fields, constants)
         policies[DENSITY] = density_policy(fields.control_density, mu, problem.control_cost)
+        if every and problem.still and kind != CLOSED:
+            mu = occupation_density(CLOSED, problem, fields, constants)
+            policies[MINIMISED] = density_policy(fields.control_density, mu, problem.control_cost)
     if fields.trajectory_value is not None:
         policies[TRAJECTORIES] = HeldPolicy(problem, fields.trajectory_value, Pace.of(problem))
     return policies

@@ -124,22 +124,24 @@ def refined(
     generator: torch.Generator,
     standard_error: Callable[[Tensor], float] = lambda results: 0.0,
     audit: Integrate | None = None,
+    doublings: int = MAX_DOUBLINGS,
 ) -> tuple[Tensor, Tensor, float]:
     r"""Results and end states of all trajectories, and a bound on the error of the results' mean by ``weights`` ``(N,)``.
 
     While the mean change is above ``tolerance``, or a tenth of it and of the ``standard_error`` of the results, those that
-    still change by more than ``tolerance`` on halving the step are halved again: those that cross a jump or a kink of the
-    controller, or slide along one. The error has three parts: the last change of each trajectory; what its slow decay
-    leaves to come (`r/(1-r)` of it, at ratio `r`: a jump makes the order 1, not 4); and, because a trajectory may agree
-    with itself by missing a feature twice, what a random few of all of them change on far finer steps. Where ``integrate``
-    rounds these few are all integrated by ``audit``, which does not, on steps that are no coarser.
+    still change by more than ``tolerance`` on halving the step are halved again, ``doublings`` times at most: those that
+    cross a jump or a kink of the controller, or slide along one. The error has three parts: the last change of each
+    trajectory; what its slow decay leaves to come (`r/(1-r)` of it, at ratio `r`: a jump makes the order 1, not 4); and,
+    because a trajectory may agree with itself by missing a feature twice, what a random few of all of them change on far
+    finer steps. Where ``integrate`` rounds these few are all integrated by ``audit``, which does not, on steps that are no
+    coarser.
     """
     everything = torch.arange(len(weights))
     coarse, _ = integrate(everything, steps // 2)
     result, end = integrate(everything, steps)
     change, factor = (result - coarse).abs(), torch.ones_like(result)
     taken, finest = torch.full(weights.shape, steps), AUDIT_FACTOR * steps
-    for _ in range(MAX_DOUBLINGS):
+    for _ in range(doublings):
         active = (change > tolerance).nonzero().squeeze(-1)
         good = min(tolerance, GOOD_PART * max(tolerance, standard_error(result)))
         if not len(active) or float((weights * change * factor).mean()) <= good:

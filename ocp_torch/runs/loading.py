@@ -21,7 +21,8 @@ log = logging.getLogger(__name__)
 def policy_of(controller: Controller) -> Policy:
     """The policy that ``controller`` follows, in float64."""
     fields = in_float64(controller.fields)
-    return trained_policies(controller.occupation, controller.problem, fields, controller.constants)[controller.kind]
+    how = controller.occupation, controller.problem, fields, controller.constants
+    return trained_policies(*how, every=True)[controller.kind]
 
 
 def load_policy(source: str, problem: Problem) -> Callable | Controller:

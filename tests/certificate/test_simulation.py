@@ -189,7 +189,8 @@ class Even(Problem):
 
 
 def test_what_the_truncation_leaves_out_is_within_the_bias_with_noise(monkeypatch):
-    monkeypatch.setattr("ocp_torch.certificate.simulated.performance.TAIL", 0.05)  # much more than the steps' own error
+    for name in ("SMALLEST_TAIL", "LARGEST_TAIL"):  # much more than the steps' own error
+        monkeypatch.setattr(f"ocp_torch.certificate.simulated.performance.{name}", 0.05)
     problem = Even()
     found = simulate_performance(problem, lambda x: torch.zeros_like(x), 8, 2, seed=0, tolerance=1e-7).perf
     assert 0.01 < 1.0 - found.value <= found.bias < 0.1
@@ -383,7 +384,7 @@ def test_a_few_fast_trajectories_take_finer_steps_and_the_others_none(monkeypatc
     problem = Spinning()
     found, work = [], []
     for mostly in (0.9, 1.0):
-        monkeypatch.setattr("ocp_torch.certificate.simulated.performance.MOSTLY", mostly)
+        monkeypatch.setattr("ocp_torch.certificate.simulated.steps.MOSTLY", mostly)
         problem.asked.clear()
         found.append(simulate_performance(problem, zero_policy(problem), 64, 8, 0, tolerance=1e-3).perf)
         work.append(sum(problem.asked))

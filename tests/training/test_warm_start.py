@@ -7,6 +7,8 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from ocp_torch.certificate.report import table
+from ocp_torch.certificate.trained import TrainedContext
 from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.pace import MOVED, Pace
@@ -112,6 +114,9 @@ def test_the_controller_of_the_warm_start_is_a_candidate_and_can_be_handed_out(t
     trainer = small(*WARM, "method=dual", "trainer.figures=false")
     certificate = run_to_end(trainer, build_certificate_settings(trainer.config), tmp_path)
     assert {name for name, perf in certificate.perf.items() if perf is not None} == {"value", "trajectories"}
+    # The bounds that take a divergence are of the controller that acts at every instant.
+    assert certificate.followed == "value"
+    assert certificate.about["lagrangian"] in ("value", None)
     events = EventAccumulator(str(tmp_path))
     events.Reload()
     assert (
@@ -129,7 +134,30 @@ def test_the_controller_of_the_warm_start_is_a_candidate_and_can_be_handed_out(t
         trainer.problem, fields, trainer.constants, None, "trajectories", trainer.config["model"], {}, trainer.config
     )
     made.save(tmp_path / "other.safetensors")
-    assert torch.equal(load_controller(tmp_path / "other.safetensors")(x), best)
+    loaded = load_controller(tmp_path / "other.safetensors")
+    assert torch.equal(loaded(x), best)
+    assert loaded.held_for == Pace.of(trainer.problem).step
+    handed_out = load_controller(tmp_path)
+    assert (handed_out.held_for is None) == (handed_out.kind != "trajectories")
+    assert handed_out.certificate.get("held_for") == handed_out.held_for
+
+
+def test_no_bound_with_a_divergence_speaks_of_a_controller_that_holds_its_control(monkeypatch):
+    trainer = small(*SWING, *WARM, "method=dual", "certificate.stage.steps=20", "certificate.stage.rounds=1")
+    fit = lambda: trainer.certify(build_certificate_settings(trainer.config))
+    monkeypatch.setattr(TrainedContext, "kind", "value")
+    of_value = fit()
+    monkeypatch.setattr(TrainedContext, "kind", "trajectories")
+    certificate = fit()
+    said = certificate.to_dict()
+    assert (of_value.held_for, said["held_for"]) == (None, Pace.of(trainer.problem).step)
+    assert "holds each control for" in table(said)
+    assert "holds each control for" not in table(of_value.to_dict())
+    assert certificate.about["lagrangian"] == certificate.about["J"] == "value"
+    assert certificate.gap["certified"] is None
+    assert certificate.upper == of_value.upper
+    for name, bound in said["upper"].items():
+        assert bound is None or not bound["counts"], name
 
 
 def test_auto_stays_out_where_mass_cannot_gather_and_changes_no_bit_there():

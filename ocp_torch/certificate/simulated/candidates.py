@@ -9,13 +9,14 @@ from ocp_torch.certificate.simulated.performance import Simulated, simulate_perf
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.policies import Policy, zero_policy
 from ocp_torch.maths.jets import Field
+from ocp_torch.maths.runge_kutta import MAX_DOUBLINGS
 from ocp_torch.problems.problem import Problem
 
 # Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
 # a controller that another one clearly beats; but without noise so few in all as the second number take hardly longer than a
 # part of them (with noise the finest steps take longest: 2.2 s for the worse controller of a pendulum in a look of 5.3 s).
-# Their steps need not be as fine either: the third is by how many times.
-BASELINE_PART, CHEAP, ROUGH = 4, 256, 200.0
+# Their steps need not be as fine either: the third is by how many times, and the last how often they are halved at most.
+BASELINE_PART, CHEAP, ROUGH, HALVED = 4, 256, 200.0, 1
 
 
 class Candidate(NamedTuple):
@@ -36,23 +37,22 @@ def simulate_candidates(
     as long for a few trajectories, any worse one is left at that: acting at every instant it trembles where the other jumps,
     and would take minutes on fine steps."""
 
-    def simulate(candidate: Candidate, trajectories: int, room: float = 1.0) -> Simulated:
+    def simulate(candidate: Candidate, roughly: bool = False) -> Simulated:
         policy, value, initial, rounded = candidate
-        effort, how = (trajectories, settings.replicates, seed), (settings.horizon, room * settings.tolerance, rounded)
-        return simulate_performance(problem, policy, *effort, value, initial, *how)
+        effort, tolerance, doublings = settings.trajectories, settings.tolerance, MAX_DOUBLINGS
+        if roughly:
+            effort, tolerance, doublings = max(2, effort // BASELINE_PART), ROUGH * tolerance, HALVED
+        sets, how = (settings.replicates, seed, value, initial), (settings.horizon, tolerance, rounded, doublings)
+        return simulate_performance(problem, policy, effort, *sets, *how)
 
-    few = max(2, settings.trajectories // BASELINE_PART)
     held = [name for name, candidate in candidates.items() if isinstance(candidate.policy, HeldPolicy)]
     many = problem.noisy or held or settings.trajectories * settings.replicates > CHEAP
     quickly = [name for name in candidates if name not in held] if best_only and len(candidates) > 1 and many else []
-    found = {
-        name: simulate(candidate, *((few, ROUGH) if name in quickly else (settings.trajectories,)))
-        for name, candidate in candidates.items()
-    }
+    found = {name: simulate(candidate, name in quickly) for name, candidate in candidates.items()}
     best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
     for name in quickly:
         perf = found[name].perf
         if not (perf.above if held else perf.interval(CONFIDENCE)[0]) > best:
-            found[name] = simulate(candidates[name], settings.trajectories)
+            found[name] = simulate(candidates[name])
     nothing = zero_policy(problem)  # the same in any precision
-    return found, simulate(Candidate(nothing, None, None, (nothing, None)), few, ROUGH).perf
+    return found, simulate(Candidate(nothing, None, None, (nothing, None)), roughly=True).perf

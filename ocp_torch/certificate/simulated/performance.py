@@ -15,15 +15,16 @@ from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
 from ocp_torch.certificate.simulated.held import held_integrals
-from ocp_torch.certificate.simulated.loops import FeedbackLoop, HeldLoop, Loop, Sliding, loop_of
+from ocp_torch.certificate.simulated.loops import FeedbackLoop, HeldLoop, Sliding, loop_of
+from ocp_torch.certificate.simulated.steps import Steps
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.brownian import Grid, at_random_times, discounted, expectation
 from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.runge_kutta import (
+    MAX_DOUBLINGS,
     Dynamics,
     Integrate,
-    Switched,
     discounted_integral,
     in_finer_steps,
     rate_at,
@@ -33,11 +34,6 @@ from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import initial_points
 
-# A kink of V is met at the start of a trajectory or never, and what is late counts little: early steps are shorter.
-GRADING = 2.0
-# The first steps, before any is halved: so many at least, in each of which no more than that part of a discount time passes,
-# and no trajectory moves farther than that part of a turn. Coarser ones are halved more often, finer ones cost more at once.
-FEWEST_STEPS, DISCOUNTED, MOVED = 8, 0.4, 0.2
 # Simulation sets come after those of the bounds in the stream of evaluation points.
 SIMULATION_REPLICATE = 1000
 # What is left of the discount when simulation stops, times the rate's supremum, relative to the answer: that part of the
@@ -54,9 +50,6 @@ ROUNDED = 0.1
 # to the simulation changes faster than what it takes off. From values of trajectories it was .7 on a pendubot and 2 on a
 # quadrotor, and asked for 15,000 steps where the cost asks for 800; .003 to .08 for `V` of `dual` and `pd`.
 NO_VARIATE = 0.5
-# Steps follow from the speed that so many trajectories do not exceed at their starts, where the fastest is more than so many
-# times as fast: what is faster takes as many times more of them. A double pendulum's fastest start is ten times as fast.
-MOSTLY, RARELY = 0.9, 2.0
 # Head-room on the rate's supremum, met at starts and ends, for the states after the end.
 RATE_ROOM = 2.0
 
@@ -93,42 +86,6 @@ def unseen_cost(problem: Problem, x0: Tensor, mass: Tensor, seed: int) -> float:
     return off if off > UNLIKELY * noise + 1e-9 * float(there.abs().mean()) else 0.0
 
 
-def paced(speeds: Tensor, together: bool) -> tuple[float, Tensor]:
-    """The speed that steps follow from, and how many times as many each trajectory takes, ``(N,)``, for ``speeds`` ``(N,)``
-    at the starts: one number for all where they must go ``together``, or none is much faster than most."""
-    most, fastest = float(speeds.sort().values[int(MOSTLY * (len(speeds) - 1))]), float(speeds.max())
-    if together or not fastest > RARELY * most > 0.0:
-        return fastest, torch.ones_like(speeds, dtype=torch.long)
-    return most, (speeds / most).ceil().clamp_min(1.0).long()
-
-
-@dataclass(frozen=True)
-class Steps:
-    """``count`` steps up to ``horizon``, graded, of which each trajectory takes ``multiples`` ``(N,)`` times as many; a
-    control that is held is renewed at ``renewals`` of them, 0 for one that is not."""
-
-    horizon: float
-    count: int
-    grading: float
-    multiples: Tensor
-    renewals: int = 0
-
-    @classmethod
-    def of(cls, loop: Loop, horizon: float, velocity: Tensor) -> "Steps":
-        """The first ones, an even number per hold, for ``loop``, which moves with ``velocity`` ``(N, d)`` at its starts."""
-        rho, together = loop.problem.discount, torch.ones(len(velocity), dtype=torch.long)
-        if isinstance(loop, HeldLoop):
-            holds = math.ceil(horizon / loop.hold)
-            return cls(holds * loop.hold, 2 * holds * math.ceil(0.5 * loop.substeps), 1.0, together, holds)
-        speed, multiples = paced(velocity.norm(dim=-1), loop.problem.noisy)
-        steps = 2 * math.ceil(0.5 * horizon * max(rho / DISCOUNTED, speed / MOVED))
-        return cls(horizon, max(FEWEST_STEPS, steps), GRADING, multiples)
-
-    def taken_by(self, loop: Loop) -> Dynamics:
-        """The dynamics of ``loop``, with its renewals."""
-        return Switched(loop, loop.renewed, self.renewals) if self.renewals else loop
-
-
 def simulate_performance(
     problem: Problem,
     policy: Policy,
@@ -140,17 +97,19 @@ def simulate_performance(
     horizon: str = TRUNCATED,
     tolerance: float = CertificateSettings.tolerance,
     rounded: tuple[Policy, Field | None] | None = None,
+    doublings: int = MAX_DOUBLINGS,
 ) -> Simulated:
     """Perf of ``policy`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts, near `mu0`.
 
     With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is added;
     unless the slack is so large that the cost itself is simulated with less effort.
-    Steps are halved until a trajectory changes by less than ``tolerance``, relative to the answer, or all of them by little
-    beside the standard error. ``rounded``, the controller and `V` in single precision, takes their place where it agrees well
-    enough with them at the starts; a few trajectories are exact, and what they differ by goes into the ``bias``. That is the
-    error of integration (`refined`, with noise `expectation`) plus, where the ``horizon`` is truncated, the discount left
-    there times the rate's supremum as met along the trajectories, with head-room. A `HeldPolicy` is simulated as one: its
-    control changes only when it is renewed, always up to a truncated horizon.
+    Steps are halved, without noise ``doublings`` times at most, until a trajectory changes by less than ``tolerance``,
+    relative to the answer, or all of them by little beside the standard error. ``rounded``, the controller and `V` in single
+    precision, takes their place where it agrees well enough with them at the starts; a few trajectories are exact, and what
+    they differ by goes into the ``bias``. That is the error of integration (`refined`, with noise `expectation`) plus, where
+    the ``horizon`` is truncated, the discount left there times the rate's supremum as met along the trajectories, with
+    head-room. A `HeldPolicy` is simulated as one: its control changes only when it is renewed, always up to a truncated
+    horizon.
     """
     dim, rho = problem.dim, problem.discount
     dynamics = loop_of(problem, policy, value)
@@ -169,7 +128,7 @@ def simulate_performance(
             ):
                 plain = None if rounded is None else (rounded[0], None)
                 effort = trajectories, replicates, seed
-                return simulate_performance(problem, policy, *effort, None, None, horizon, tolerance, plain)
+                return simulate_performance(problem, policy, *effort, None, None, horizon, tolerance, plain, doublings)
         quick = dynamics if rounded is None else loop_of(problem, *rounded)
         off = (quick(quick.renewed(state))[1] - rate).abs().mean()
         velocity, rate = velocity[:, :dim], rate.reshape(len(x0), -1)[:, 0]
@@ -213,7 +172,8 @@ def simulate_performance(
         generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT))
         error = lambda results: Estimate.of(means(results).tolist()).se
         audit = None if exact is None else integrated(exact)
-        result, end, bias = refined(integrated(swift), mass, steps.count, tolerance * size, generator, error, audit)
+        accuracy = tolerance * size, generator, error, audit, doublings
+        result, end, bias = refined(integrated(swift), mass, steps.count, *accuracy)
         refinement = torch.zeros_like(means(result))
     ended = end[:, :dim].remainder(1.0)
     with torch.no_grad():

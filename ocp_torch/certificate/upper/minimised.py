@@ -5,7 +5,7 @@ from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import CERTIFIED
-from ocp_torch.control.policies import CLOSED, DENSITY
+from ocp_torch.control.policies import CLOSED, DENSITY, MINIMISED
 from ocp_torch.problems.needs import Need
 
 
@@ -28,7 +28,8 @@ class MinimisedPrimal(Bound):
 
     def about(self, context: Context) -> str | None:
         """`G` bounds the performance of `w` over the `mu` of Lemma 2, where no value of that exceeds `C_V`."""
-        return DENSITY if context.occupation == CLOSED and context.value_holds_of(DENSITY) else None
+        name = DENSITY if context.occupation == CLOSED else MINIMISED
+        return name if name in context.candidates and context.value_holds_of(name) else None
 
     def notes(self, context: Context, shown: Estimate | None) -> list[str]:
         about = self.about(context)

@@ -13,6 +13,7 @@ NARROW, FAR = 0.01, 2.0
 PERFORMANCES = {
     "value": "controller from V",
     "density": "controller w / mu",
+    "minimised": "controller w / mu, mu of Lemma 2",
     "trajectories": "controller from V of trajectories",
     "given": "this controller",
 }

@@ -1,0 +1,53 @@
+"""Which controller is handed out: of the lowest simulated performance, or of the lowest bound without simulation."""
+
+import pytest
+import torch
+
+from ocp_torch import load_controller
+from ocp_torch.certificate.estimate import known_of
+from ocp_torch.control.policies import density_policy, occupation_density
+from support.small import outcome, session, small
+from support.zoo import states
+
+SMALL = ("problem=torus", "method=pd", "trainer.steps=60", "certificate.trajectories=16", "certificate.points=512")
+
+
+def test_of_the_lowest_bound(tmp_path):
+    """Without a fitted density `G` alone bounds what a controller costs: that of `w` over the `mu` of Lemma 2."""
+    trainer = small(*SMALL, "certificate.prefer=certified", "certificate.stage.steps=0")
+    certificate = session(trainer, tmp_path)
+    assert certificate.controller == certificate.subject == certificate.best_certified == "minimised"
+    assert certificate.best_upper[0] == "G"
+    assert not any(warning.startswith("G bounds OPT, but") for warning in certificate.warnings)
+    controller, x = load_controller(tmp_path), states(trainer.problem, 64)
+    assert controller.kind == "minimised"
+    fields = controller.fields.double()
+    mu = occupation_density("closed", trainer.problem, fields, controller.constants)
+    expected = density_policy(fields.control_density, mu, trainer.problem.control_cost)(x)
+    torch.testing.assert_close(controller(x), expected, rtol=1e-5, atol=1e-6)
+    perf, G = certificate.perf["minimised"], certificate.upper["G"]
+    assert perf.interval(0.999)[0] <= G.interval(0.999)[1]
+    assert perf.value == pytest.approx(G.value, rel=0.2)
+
+
+@pytest.mark.parametrize("prefer", ["simulated", "certified"])
+def test_gaps_are_those_of_each_controller(tmp_path, prefer):
+    certificate = session(small(*SMALL, f"certificate.prefer={prefer}"), tmp_path)
+    assert ("minimised" in certificate.perf) == (prefer == "certified")
+    perfs = {name: perf.interval(certificate.confidence)[1] for name, perf in known_of(certificate.perf).items()}
+    gaps = certificate.gap["certified_of"]
+    assert gaps.keys() == perfs.keys()
+    known = {name: gap for name, gap in gaps.items() if gap is not None}
+    assert certificate.gap["certified"] == gaps[certificate.controller]
+    if prefer == "simulated":
+        assert perfs[certificate.controller] == min(perfs.values())
+    elif known:
+        assert gaps[certificate.controller] == min(known.values())
+    for name, estimate in known_of(certificate.upper).items():
+        about = certificate.about[name]
+        if about is not None and certificate.counts(name):
+            assert known_of(certificate.perf)[about].interval(0.999)[0] <= estimate.interval(0.999)[1]
+
+
+def test_another_word_is_refused():
+    assert "certificate.prefer" in outcome(*SMALL, "certificate.prefer=best")
