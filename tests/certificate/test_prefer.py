@@ -9,7 +9,14 @@ from ocp_torch.control.policies import density_policy, occupation_density
 from support.small import outcome, session, small
 from support.zoo import states
 
-SMALL = ("problem=torus", "method=pd", "trainer.steps=60", "certificate.trajectories=16", "certificate.points=512")
+SMALL = (
+    "problem=circle",
+    "method=pd",
+    "method.value_bound=0.4",
+    "trainer.steps=150",
+    "certificate.trajectories=16",
+    "certificate.points=512",
+)
 
 
 def test_of_the_lowest_bound(tmp_path):
