@@ -141,6 +141,11 @@ class Context:
         """Within it a second core works on the lower side, beside simulation and the upper one."""
         return contextlib.nullcontext() if self.sampled_value is None else self.sampled_value.ahead()
 
+    @property
+    def known(self) -> dict[str, Simulated]:
+        """What an earlier certificate has found of controllers that are the same."""
+        return {}
+
     @cached_property
     def simulated(self) -> tuple[dict[str, Simulated], Estimate | None]:
         """What simulation shows of the controllers, by name, and what doing nothing costs."""
@@ -148,7 +153,8 @@ class Context:
         if not candidates:
             return {}, None
         self.progress("simulation")
-        return simulate_candidates(self.problem, candidates, self.settings, self.seed, best_only=not self.external)
+        how = self.settings, self.seed, not self.external
+        return simulate_candidates(self.problem, candidates, *how, self.known)
 
     def outside(self, name: str | None) -> Estimate | None:
         """The part of the discounted time that the controller ``name`` spends outside the box of a system."""

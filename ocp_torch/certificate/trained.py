@@ -2,8 +2,9 @@
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from hashlib import sha256
 from typing import TypeVar
 
 import torch
@@ -13,8 +14,10 @@ from ocp_torch.certificate.checks.observed import Observed, observe
 from ocp_torch.certificate.checks.tails import sharpened
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.context import Context
+from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import CERTIFIED
 from ocp_torch.certificate.simulated.candidates import Candidate
+from ocp_torch.certificate.simulated.performance import Simulated
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
 from ocp_torch.certificate.upper.penalised import DensityBounds, density_bounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
@@ -46,11 +49,15 @@ def in_float64(fields: M) -> M:
 
 @dataclass(frozen=True)
 class Trained:
-    """What training hands over: the fields, how they give `mu` (see `trained_policies`), and the network they are made of."""
+    """What training hands over: the fields, how they give `mu` (see `trained_policies`), and the network they are made of.
+
+    The `V` of a warm start stays as it is while others are trained: ``memory`` keeps what was simulated of its controller.
+    """
 
     fields: Fields
     occupation: str | None
     network: Callable[..., nn.Module]
+    memory: dict = field(default_factory=dict, compare=False, repr=False)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -108,6 +115,25 @@ class TrainedContext(FieldsContext):
             beside = (rounded[TRAJECTORIES][0], single.trajectory_value)
             found[TRAJECTORIES] = Candidate(self.policies[TRAJECTORIES], own, initial, beside)
         return found
+
+    @property
+    def known(self) -> dict[str, Simulated]:
+        found = self.trained.memory.get(self._remembered_as)
+        return {} if found is None else {TRAJECTORIES: found}
+
+    @cached_property
+    def simulated(self) -> tuple[dict[str, Simulated], Estimate | None]:
+        found, zero = super().simulated
+        if TRAJECTORIES in found:
+            self.trained.memory[self._remembered_as] = found[TRAJECTORIES]
+        return found, zero
+
+    @cached_property
+    def _remembered_as(self) -> tuple:
+        """All that the simulation of the warm start's controller depends on, within a run."""
+        own, s = self.fields.trajectory_value, self.settings
+        weights = b"" if own is None else b"".join(p.numpy().tobytes() for p in own.parameters())
+        return sha256(weights).digest(), self.seed, s.trajectories, s.replicates, s.points, s.tolerance, s.horizon
 
     @cached_property
     def kind(self) -> str:

@@ -1,6 +1,8 @@
 """Which of the controllers is simulated how long: all of them shortly, and the better ones at length."""
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
@@ -30,12 +32,17 @@ class Candidate(NamedTuple):
 
 
 def simulate_candidates(
-    problem: Problem, candidates: dict[str, Candidate], settings: CertificateSettings, seed: int, best_only: bool
+    problem: Problem,
+    candidates: dict[str, Candidate],
+    settings: CertificateSettings,
+    seed: int,
+    best_only: bool,
+    known: Mapping[str, Simulated] = MappingProxyType({}),
 ) -> tuple[dict[str, Simulated], Estimate]:
     """Performance of each of ``candidates``, and of doing nothing. With ``best_only`` one that is clearly worse than another
     on a quarter of the trajectories gets no more of them, where that saves time. Beside one that holds its control, and takes
     as long for a few trajectories, any worse one is left at that: acting at every instant it trembles where the other jumps,
-    and would take minutes on fine steps."""
+    and would take minutes on fine steps. What is ``known`` is not simulated again."""
 
     def simulate(candidate: Candidate, roughly: bool = False) -> Simulated:
         policy, value, initial, rounded = candidate
@@ -48,7 +55,7 @@ def simulate_candidates(
     held = [name for name, candidate in candidates.items() if isinstance(candidate.policy, HeldPolicy)]
     many = problem.noisy or held or settings.trajectories * settings.replicates > CHEAP
     quickly = [name for name in candidates if name not in held] if best_only and len(candidates) > 1 and many else []
-    found = {name: simulate(candidate, name in quickly) for name, candidate in candidates.items()}
+    found = {name: known.get(name) or simulate(candidate, name in quickly) for name, candidate in candidates.items()}
     best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
     for name in quickly:
         perf = found[name].perf
