@@ -32,9 +32,9 @@ BUDGETS = (
     Budget(math.inf, steps=1200, batch=512, good_gap=0.02, stage_steps=800, stage_lr=5e-3),
 )
 
-# Where no M is known the bound is decided by the worst state: that wants more states at once, and, without noise, longer. With
-# noise two coordinates want less: after rounds of 600 and 1,200 steps a pendulum's certified gap is .55 % and an arm's 1.0 % at
-# 1e-3, after 900 and 1,800 .45 and .85 %, for 25 s more of 145.
+# Where no M is known the bound is decided by the worst state: that wants more states at once, and, without noise, longer.
+# With noise two coordinates want less: after rounds of 600 and 1,200 steps a pendulum's certified gap is .55 % and an arm's
+# 1.0 % at 1e-3, after 900 and 1,800 .45 and .85 %, for 25 s more of 145.
 LARGE_BATCH, MANY_STEPS, FEW_STEPS = 1024, 1200, 600
 # In one dimension with noise, where networks are given more modes.
 NOISY_STEPS = 2000
