@@ -39,7 +39,7 @@ SIMULATION_REPLICATE = 1000
 # What is left of the discount when simulation stops, times the rate's supremum, relative to the answer: that part of the
 # tolerance, and so much at least and at most. The answer is taken to be at least the last part of the mean state cost at the
 # starts.
-TAIL_PART, SMALLEST_TAIL, LARGEST_TAIL, LEAST = 0.4, 2e-5, 0.02, 0.1
+TAIL_PART, SMALLEST_TAIL, LARGEST_TAIL, LEAST = 0.04, 2e-5, 0.02, 0.1
 # States to which the starts' mean cost is compared, how many standard errors apart the two must be, and by how many times
 # that the interval is widened: trajectories may stay where no start was.
 COMPARED, UNLIKELY, UNSEEN_ROOM = 2**15, 2.5, 2.0
