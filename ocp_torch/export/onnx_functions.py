@@ -46,11 +46,18 @@ def _table() -> np.ndarray:
     return np.array([math.erf(k / PLACES) for k in range(-reach, reach + 1)])
 
 
+def cos(graph: Nodes, x: str) -> str:
+    """`1 - 2 sin^2(x / 2)`: some runtimes have the sine in double precision, but not the cosine."""
+    half = graph.node("Sin", [graph.node("Mul", [x, graph.number(0.5)])])
+    twice = graph.node("Mul", [graph.node("Mul", [half, half]), graph.number(2.0)])
+    return graph.node("Sub", [graph.number(1.0), twice])
+
+
 def atan(graph: Nodes, x: str) -> str:
     """In single precision first, and a Newton step, `y - (tan y - x) cos^2 y`."""
     node = graph.node
     y = _single(graph, "Atan", x)
-    sine, cosine = node("Sin", [y]), node("Cos", [y])
+    sine, cosine = node("Sin", [y]), cos(graph, y)
     off = node("Sub", [sine, node("Mul", [x, cosine])])
     return node("Sub", [y, node("Mul", [off, cosine])])
 
@@ -67,7 +74,7 @@ def acos(graph: Nodes, x: str) -> str:
 
 
 def tan(graph: Nodes, x: str) -> str:
-    return graph.node("Div", [graph.node("Sin", [x]), graph.node("Cos", [x])])
+    return graph.node("Div", [graph.node("Sin", [x]), cos(graph, x)])
 
 
 def sinh(graph: Nodes, x: str) -> str:
@@ -88,5 +95,5 @@ def _single(graph: Nodes, kind: str, x: str) -> str:
 
 
 COMPOSED: dict[str, Callable[[Nodes, str], str]] = {
-    "erf": erf, "atan": atan, "asin": asin, "acos": acos, "tan": tan, "sinh": sinh, "cosh": cosh,
+    "cos": cos, "erf": erf, "atan": atan, "asin": asin, "acos": acos, "tan": tan, "sinh": sinh, "cosh": cosh,
 }  # fmt: skip

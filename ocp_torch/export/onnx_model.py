@@ -16,7 +16,7 @@ from ocp_torch.export.program import STATE, Operand, Operation, Program, View
 # The operator set: that of ONNX 1.13, which runtimes have had since 2022; and the version of the file that goes with it.
 OPSET, FILE = 18, 8
 ENTRYWISE = dict(
-    neg="Neg", sin="Sin", cos="Cos", exp="Exp", log="Log", tanh="Tanh", sqrt="Sqrt", abs="Abs", floor="Floor", add="Add",
+    neg="Neg", sin="Sin", exp="Exp", log="Log", tanh="Tanh", sqrt="Sqrt", abs="Abs", floor="Floor", add="Add",
     sub="Sub", mul="Mul", div="Div", pow="Pow", maximum="Max", minimum="Min",
 )  # fmt: skip
 # Give truth values, which become numbers.

@@ -221,7 +221,10 @@ def test_certificate_json_has_the_documented_schema_with_numbers_or_null(run):
             assert all(is_number(v) for k, v in estimate.items() if k not in words), name
             assert set(estimate.get("rests_on", {}).values()) <= {"given", "proved", "searched", "guessed"}
     gap, share, assumptions = (certificate[group] for group in ("gap", "share", "assumptions"))
-    assert gap.keys() == {"certified", "simulated", "conditional", "lower_from", "upper_from"}
+    assert gap.keys() == {"certified", "simulated", "conditional", "certified_of", "lower_from", "upper_from"}
+    certified_of = gap.pop("certified_of")
+    assert certified_of.keys() <= certificate["perf"].keys()
+    assert all(found is None or is_number(found) for found in certified_of.values())
     assert gap["lower_from"] in (None, "F_M", "shifted")
     assert gap["upper_from"] in (None, "J", "G", "lagrangian")
     assert share.keys() == NUMBERS["share"]

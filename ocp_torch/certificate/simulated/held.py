@@ -27,7 +27,6 @@ from ocp_torch.maths.runge_kutta import (
     Switched,
     discounted_integral,
 )
-from ocp_torch.maths.seeds import Branch, derive_seed
 
 # So many trajectories of each set are followed to the end: what is left to them of the discount is a hundredth of the whole
 # where there were 256 of them.
@@ -85,7 +84,7 @@ def held_integrals(
     replicates: int,
     horizon: float,
     tolerance: float,
-    seed: int,
+    generator: torch.Generator,
     together: bool,
 ) -> tuple[Tensor, Tensor, float]:
     """Contributions to the mean by ``mass`` ``(N,)`` of the discounted cost up to the ``horizon`` at least, or of what it is
@@ -93,7 +92,6 @@ def held_integrals(
     error of that mean: by how much steps that are finer, and ``loop`` where ``quick`` rounds, change it on a random few.
     Steps are halved until that is below ``tolerance`` or little beside the standard error, or does not get smaller."""
     thinning = Thinning.of(loop, len(mass) // replicates, horizon)
-    generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT))
     picked = torch.randperm(len(mass), generator=generator)[:AUDITED]
     substeps, before = loop.substeps, math.inf
     for _ in range(MAX_DOUBLINGS + 1):

@@ -157,6 +157,7 @@ def simulate_performance(
 
     swift, exact = steps.taken_by(quick), None if quick is dynamics else steps.taken_by(dynamics)
     means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
+    generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT))
     if problem.noisy:
         horizons, grading = (times, 1.0) if random else (torch.full_like(mass, steps.horizon), steps.grading)
         grid = Grid(horizons, steps.count, grading)
@@ -166,10 +167,9 @@ def simulate_performance(
         result = result if beside is None else result - beside(x0)
     elif isinstance(dynamics, HeldLoop) and isinstance(quick, HeldLoop):
         loops, sets = (dynamics, quick, beside), (state, mass, replicates)
-        result, end, bias = held_integrals(*loops, *sets, steps.horizon, tolerance * size, seed, together)
+        result, end, bias = held_integrals(*loops, *sets, steps.horizon, tolerance * size, generator, together)
         refinement = torch.zeros_like(means(result))
     else:
-        generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT))
         error = lambda results: Estimate.of(means(results).tolist()).se
         audit = None if exact is None else integrated(exact)
         accuracy = tolerance * size, generator, error, audit, doublings
