@@ -10,6 +10,12 @@ class Reproducible:
     not_arguments: tuple[str, ...] = ()
     _given: tuple[tuple, dict]  # what `__init__` was called with
 
+    def __init_subclass__(cls, **options) -> None:
+        """A class takes what its `__init__` does, its own or inherited: Python 3.10 would ask `__new__` below instead."""
+        super().__init_subclass__(**options)
+        first, *rest = inspect.signature(cls.__init__).parameters.values()
+        cls.__signature__ = inspect.Signature(rest)  # type: ignore[attr-defined]
+
     def __new__(cls, *args, **kwargs) -> "Reproducible":
         made = super().__new__(cls)
         made._given = args, kwargs
