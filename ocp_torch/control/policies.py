@@ -94,7 +94,7 @@ def trained_policies(
     if fields.control_density is not None and (kind == NETWORK or problem.has_simulator):
         mu = occupation_density(kind, problem, fields, constants)
         policies[DENSITY] = density_policy(fields.control_density, mu, problem.control_cost)
-        if every and problem.still and kind != CLOSED:
+        if every and kind != CLOSED and problem.has_simulator and problem.still:
             mu = occupation_density(CLOSED, problem, fields, constants)
             policies[MINIMISED] = density_policy(fields.control_density, mu, problem.control_cost)
     if fields.trajectory_value is not None:

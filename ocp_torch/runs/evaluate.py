@@ -57,7 +57,7 @@ def load_run(config: dict) -> Controller:
 def settings_for(controller: Controller, config: dict) -> CertificateSettings:
     """The settings of the controller's own run, with what ``config`` sets in their place. Raises `InputError` where the run's
     own would take more than a file may ask for."""
-    own, asked = controller.config["certificate"], require_section("certificate", config["certificate"])
+    own, asked = controller.config.get("certificate") or {}, require_section("certificate", config["certificate"])
     changed = {k: v for k, v in asked.items() if v is not None and k != "stage"}
     section = require_section("certificate.stage", {} if asked.get("stage") is None else asked["stage"])
     stage = {k: v for k, v in section.items() if v is not None}
