@@ -142,7 +142,7 @@ class Context:
         return contextlib.nullcontext() if self.sampled_value is None else self.sampled_value.ahead()
 
     @property
-    def known(self) -> dict[str, Simulated]:
+    def remembered(self) -> dict[str, Simulated]:
         """What an earlier certificate has found of controllers that are the same."""
         return {}
 
@@ -154,7 +154,7 @@ class Context:
             return {}, None
         self.progress("simulation")
         how = self.settings, self.seed, not self.external
-        return simulate_candidates(self.problem, candidates, *how, self.known)
+        return simulate_candidates(self.problem, candidates, *how, self.remembered)
 
     def outside(self, name: str | None) -> Estimate | None:
         """The part of the discounted time that the controller ``name`` spends outside the box of a system."""

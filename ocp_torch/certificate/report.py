@@ -21,9 +21,10 @@ MEANS = 1.0
 # What the controllers of a run are called in sentences.
 CONTROLLERS = {
     "value": "controller from V",
-    "density": "controller w/mu",
-    "minimised": "controller w/mu, mu of Lemma 2",
-    "trajectories": "controller from trajectories",
+    "density": "controller w / mu",
+    "minimised": "controller w / mu, mu of Lemma 2",
+    "trajectories": "controller from V of trajectories",
+    "given": "this controller",
 }
 
 
@@ -153,7 +154,9 @@ def holding(certificate: dict) -> list[str]:
     held = certificate.get("held_for")
     if held is None:
         return []
-    how = "J and the Lagrangian bound are of another one, which acts at every instant"
+    how = (
+        "J, the Lagrangian bound and the density that M is held against are of another one, which acts at every instant"
+    )
     return [f"the controller holds each control for {held:.3g} units of time, and is simulated so; {how}"]
 
 

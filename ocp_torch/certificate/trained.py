@@ -23,7 +23,9 @@ from ocp_torch.certificate.upper.penalised import DensityBounds, density_bounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.policies import (
+    CLOSED,
     DENSITY,
+    MINIMISED,
     TRAJECTORIES,
     VALUE,
     Density,
@@ -94,8 +96,8 @@ class FieldsContext(Context):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainedContext(FieldsContext):
-    """Up to three controllers, from `V`, from `w / mu` and from the `V` of a warm start: all are simulated, and the best
-    one is handed out."""
+    """Up to three controllers, from `V`, from `w / mu` and from the `V` of a warm start, and one more where the best
+    certified one is asked for (see `trained_policies`): all are simulated, and the best is handed out."""
 
     divergent = "J, G and the Lagrangian bound"
 
@@ -117,7 +119,7 @@ class TrainedContext(FieldsContext):
         return found
 
     @property
-    def known(self) -> dict[str, Simulated]:
+    def remembered(self) -> dict[str, Simulated]:
         found = self.trained.memory.get(self._remembered_as)
         return {} if found is None else {TRAJECTORIES: found}
 
@@ -212,12 +214,19 @@ class TrainedContext(FieldsContext):
     @property
     def notes(self) -> list[str]:
         notes = list(self._fit[1])
-        with torch.no_grad():
-            empty = (bool((self._mu(samples.x[:LOOKED_AT]) <= 0.0).any()) for samples in self.few)
-            if self.followed == DENSITY and self.densities is not None and any(empty):
-                what = "where w / mu is not regular: J and G may miss what it costs there"
-                notes.insert(0, f"mu is 0 at sampled states, {what}.")
+        # Of the density players' controllers that may be handed out.
+        forms = {DENSITY: self.occupation} if self.followed == DENSITY else {}
+        forms |= {MINIMISED: CLOSED} if MINIMISED in self.policies else {}
+        if self.densities is not None and any(map(self._is_empty_somewhere, forms.values())):
+            what = "where w / mu is not regular: J and G may miss what it costs there"
+            notes.insert(0, f"mu is 0 at sampled states, {what}.")
         return notes
+
+    @torch.no_grad()
+    def _is_empty_somewhere(self, occupation: str | None) -> bool:
+        """Whether the `mu` that fields give by ``occupation`` is 0 at a sampled state."""
+        mu = occupation_density(occupation, self.problem, self.fields, self.constants)
+        return any(bool((mu(samples.x[:LOOKED_AT]) <= 0.0).any()) for samples in self.few)
 
     @property
     def remarks(self) -> list[str]:

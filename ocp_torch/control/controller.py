@@ -40,10 +40,11 @@ States = TypeVar("States", Tensor, np.ndarray)
 class Controller:
     """`u(x)` with all it came from.
 
-    ``kind`` says which policy `u` is: ``value`` (from `V` alone), ``density`` (`w / mu`) or ``trajectories`` (best for a
-    whole step, from the `V` of the warm start). ``certificate`` is the dict of `certificate.json`, ``config`` the resolved
-    configuration of the run, ``model`` the network's configuration. Controls are computed in double precision, whatever
-    the networks were trained in: in single precision those of a pendulum were off by up to 1e-5 of the largest.
+    ``kind`` says which policy `u` is: ``value`` (from `V` alone), ``density`` (`w / mu`), ``minimised`` (`w / mu` with the
+    `mu` of Lemma 2 in place of the trained one) or ``trajectories`` (best for a whole step, from the `V` of the warm start).
+    ``certificate`` is the dict of `certificate.json`, ``config`` the resolved configuration of the run, ``model`` the
+    network's configuration. Controls are computed in double precision, whatever the networks were trained in: in single
+    precision those of a pendulum were off by up to 1e-5 of the largest.
     """
 
     problem: Problem

@@ -6,11 +6,13 @@ import pytest
 import torch
 
 from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.certificate.simulated import held
+from ocp_torch.certificate.simulated import candidates, held
+from ocp_torch.certificate.simulated.candidates import Candidate
 from ocp_torch.certificate.simulated.outside import time_outside
 from ocp_torch.certificate.simulated.performance import simulate_performance, starting_points
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.pace import Pace
+from ocp_torch.maths.runge_kutta import MAX_DOUBLINGS
 from ocp_torch.problems import Circle, Pendulum, Problem
 from ocp_torch.runs.metrics.measures import simulate
 from support.systems import Conveyor
@@ -117,14 +119,43 @@ def test_with_noise_it_is_what_a_plain_simulation_gives():
     x, _ = starting_points(problem, 4096, 2, seed=5)
     sigma, h, cost = problem.noise(x[:1])[0, 0, 0], step / finer, 0.0
     generator = torch.Generator().manual_seed(0)
+    u = policy(x)
     for k in range(round(6.0 / h)):
-        u = policy(x) if k % finer == 0 else u  # noqa: F821
+        u = policy(x) if k % finer == 0 else u
         rate = problem.state_cost(x) + problem.control_cost.cost(u)
         cost = cost + 2.0 * h * math.exp(-2.0 * (k + 0.5) * h) * rate
         x = x + h * u + h**0.5 * sigma * torch.randn(x.shape, generator=generator, dtype=x.dtype)
     error = math.hypot(perf.se, float(cost.std()) / len(x) ** 0.5)
     assert abs(float(cost.mean()) - perf.value) < 4.0 * error + perf.bias + 1e-4
     assert error < 0.02 * perf.value
+
+
+def test_beside_a_held_control_a_worse_controller_stays_rough_and_what_is_remembered_is_not_made_again(monkeypatch):
+    problem = Circle()
+    efforts = []
+
+    def simulated(problem, policy, trajectories, *rest):
+        efforts.append((policy, trajectories, rest[-1]))
+        return simulate_performance(problem, policy, trajectories, *rest)
+
+    monkeypatch.setattr(candidates, "simulate_performance", simulated)
+    held_one, away = optimal_held(problem, 0.05), lambda x: -problem.exact_control(x)
+    settings = CertificateSettings(trajectories=32, replicates=4, tolerance=1e-3)
+    asked = lambda policy: [(count, doublings) for one, count, doublings in efforts if one is policy]
+    whole = (32, MAX_DOUBLINGS)
+    for other, effort in ((away, [(8, 1)]), (problem.exact_control, [(8, 1), whole])):
+        efforts.clear()
+        both = {"value": Candidate(other, None, None), "trajectories": Candidate(held_one, None, None)}
+        found, _ = candidates.simulate_candidates(problem, both, settings, 0, best_only=True)
+        # The exact controller is better than the held one by less than a rough simulation can tell: either is fine.
+        assert asked(other) in (effort, effort[:1])
+        assert asked(held_one) == [whole]
+    assert found["trajectories"].perf.interval(0.999)[0] < held_cost(problem, 0.05)
+    efforts.clear()
+    kept = {"trajectories": found["trajectories"]}
+    again, _ = candidates.simulate_candidates(problem, both, settings, 0, True, kept)
+    assert asked(held_one) == []
+    assert {name: one.perf for name, one in again.items()} == {name: one.perf for name, one in found.items()}
 
 
 def test_paths_for_pictures_hold_it_too():
@@ -140,18 +171,12 @@ def test_paths_for_pictures_hold_it_too():
 
 
 def test_time_outside_the_box_is_that_of_the_held_control():
-    """It moves right for a hold from wherever it is asked, and is asked once only: see the conveyor of test_outside."""
+    """It always moves right: a conveyor (see test_outside) that is moved by its control."""
     system = Conveyor(speed=0.0, start={"place": (0.0, 1.0)})
-    asked = []
-
-    def control(x):
-        asked.append(len(x))
-        return system.to_controls(torch.ones_like(x))
-
+    control = lambda x: system.to_controls(torch.ones_like(x))
     settings = CertificateSettings(trajectories=64, replicates=4)
     found = time_outside(system, Held(system, 0.05, control, 2), settings, 0)
     s = torch.linspace(0.0, 1.0, 10_001, dtype=torch.float64)
     mass = system._density(s.unsqueeze(-1))
     exact = float(torch.trapezoid(mass * torch.exp(-system.discount * (3.0 - s)), s))
     assert found.value == pytest.approx(exact, abs=found.half_width(0.999) + 1e-3)
-    assert asked

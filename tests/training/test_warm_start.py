@@ -2,13 +2,17 @@
 
 import copy
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ocp_torch.certificate.report import table
+from ocp_torch.certificate.simulated import candidates
+from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.certificate.trained import TrainedContext
+from ocp_torch.certificate.upper.policy_evaluation import StageSettings
 from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.pace import MOVED, Pace
@@ -140,6 +144,30 @@ def test_the_controller_of_the_warm_start_is_a_candidate_and_can_be_handed_out(t
     handed_out = load_controller(tmp_path)
     assert (handed_out.held_for is None) == (handed_out.kind != "trajectories")
     assert handed_out.certificate.get("held_for") == handed_out.held_for
+
+
+def test_looks_remember_the_controller_of_the_warm_start_until_its_weights_or_the_seed_change(monkeypatch):
+    trainer = small(*SWING, *WARM, "method=dual")
+    settings = replace(build_certificate_settings(trainer.config), stage=StageSettings(steps=0), occupation_states=0)
+    made = []
+
+    def simulated(problem, policy, *rest):
+        made.append(isinstance(policy, HeldPolicy))
+        return simulate_performance(problem, policy, *rest)
+
+    monkeypatch.setattr(candidates, "simulate_performance", simulated)
+
+    def looked(seed: int = 0):
+        made.clear()
+        found = trainer.evaluator.quick(replace(trainer.run, seed=seed), settings)
+        return sum(made), found.perf["trajectories"]
+
+    (first, perf), (again, same) = looked(), looked()
+    assert (first, again, perf) == (1, 0, same)
+    assert looked(seed=1)[0] == 1
+    with torch.no_grad():
+        next(trainer.averaged_fields.trajectory_value.parameters()).mul_(1.1)
+    assert looked()[0] == 1
 
 
 def test_no_bound_with_a_divergence_speaks_of_a_controller_that_holds_its_control(monkeypatch):

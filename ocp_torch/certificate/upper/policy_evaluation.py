@@ -1,4 +1,4 @@
-"""Policy evaluation: fit `mu` (and `V`, where there is none) to the closed loop of the controller handed out."""
+"""Policy evaluation: fit `mu` (and `V`, where there is none) to the closed loop of a controller."""
 
 import math
 from collections.abc import Callable

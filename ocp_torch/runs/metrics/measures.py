@@ -62,8 +62,8 @@ class Path:
 @torch.no_grad()
 def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, steps: int, samples: int = 1) -> Path:
     r"""From ``x0`` ``(N, d)`` for ``duration``, by RK4 with a control recomputed at each stage; with noise ``samples``
-    paths from each start, by the midpoint rule and what the noise does in a step, which is the same for all controllers.
-    A `HeldPolicy` is asked no less often than it is meant to be, and its controls are held in between.
+    paths from each start, by the midpoint rule and what the noise does in a step, which is the same for all controllers that
+    take the same steps. A `HeldPolicy` is asked no less often than it is meant to be, and held in between, in finer steps.
 
     The cost is `int_0^T rho e^{-rho t} (f + R(u)) dt` by the trapezoidal rule: good to a few digits, where the certificate's
     performance has an error bound.

@@ -4,19 +4,12 @@ import math
 
 from ocp_torch.certificate import bounds
 from ocp_torch.certificate.bound import LOWER, UPPER
-from ocp_torch.certificate.report import MEANS, holding
+from ocp_torch.certificate.report import CONTROLLERS, MEANS, holding
 from ocp_torch.errors import visible
 from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED
 
 # A certified gap up to this, or up to so many times the simulated one, says enough of the controller.
 NARROW, FAR = 0.01, 2.0
-PERFORMANCES = {
-    "value": "controller from V",
-    "density": "controller w / mu",
-    "minimised": "controller w / mu, mu of Lemma 2",
-    "trajectories": "controller from V of trajectories",
-    "given": "this controller",
-}
 BOUNDS = {
     "F_M": "the dual value of `V`, each violation of its inequality charged `M` times; needs no controller",
     "shifted": "`E[V mu0]` less the largest violation of the inequality of `V`; needs neither a controller nor an `M`",
@@ -56,7 +49,7 @@ def percent(part) -> str:
 def label(side: str, name: str) -> str:
     """What the entry ``name`` of a ``side`` of a certificate is called."""
     if side == "perf":
-        return f"Perf: {PERFORMANCES.get(name, name)}"
+        return f"Perf: {CONTROLLERS.get(name, name)}"
     listed = bounds.on(side).get(name)
     named = listed.label if listed else name
     return {LOWER: f"{named} ≤ OPT", UPPER: f"Perf ≤ {named}"}.get(side, named)
