@@ -214,7 +214,7 @@ def perturbed(problem, size=1e-3, seed=0):
 def test_a_value_trained_on_for_the_bound_comes_closer_to_the_optimum_from_below(name, monkeypatch):
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.STEPS", 150)
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.BATCH", 512)
-    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.ROUNDS", 1)
+    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.MS", (100.0,))
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.RATE", 2e-2)
     monkeypatch.setattr("ocp_torch.certificate.lower.mollified.RADII", (1.0 / 64.0,))
     monkeypatch.setattr("ocp_torch.certificate.lower.sampled.WORTH", 0.0)

@@ -11,7 +11,7 @@ from torch import Tensor
 from ocp_torch.certificate.lower.levels import best_level
 from ocp_torch.certificate.lower.mollified import mollified_shift
 from ocp_torch.certificate.lower.shifted import Shift, SlackParts
-from ocp_torch.certificate.lower.tightened import PHASE, tightened
+from ocp_torch.certificate.lower.tightened import MS, tightened
 from ocp_torch.maths.ahead import Ahead
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.problem import Problem
@@ -93,4 +93,4 @@ def to_gain(shift: Shift) -> float:
     bound: where that is nothing, no spike is left to take off."""
     weights = torch.cat([samples.weight for samples in shift.sets])
     mean = sum(shift.initial) / len(shift.initial)
-    return best_level(SlackParts.join(shift.parts), weights, mean, PHASE.constants.M)[2] - shift.bound
+    return best_level(SlackParts.join(shift.parts), weights, mean, MS[0])[2] - shift.bound

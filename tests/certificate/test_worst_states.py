@@ -1,0 +1,102 @@
+"""Batches in which the worst states of earlier ones come again."""
+
+import pytest
+import torch
+
+from ocp_torch.certificate.lower.worst import WorstStates
+from ocp_torch.fields.fields import VALUE, Fields
+from ocp_torch.maths.seeds import fixed_generator
+from ocp_torch.objectives.levelled import LevelledDual
+from ocp_torch.objectives.objective import Phase
+from ocp_torch.problems.constants import Constants
+from ocp_torch.problems.generator import Generator
+from ocp_torch.problems.samples import Samples
+from support import zoo
+
+NEW = 64
+
+
+def phase_of(M: float) -> Phase:
+    return Phase(Constants(M=M, C_V=1.0, C_u=1.0, sources={}))
+
+
+def batches(problem, count: int) -> list[Samples]:
+    return [Samples.of(problem, x, divergences=False) for x in zoo.states(problem, count * NEW).split(NEW)]
+
+
+@pytest.mark.parametrize("name", ["noisy 2-d sigma(x)", "box-limited 2-d"])
+@pytest.mark.parametrize("M", [3.0, 6.4])
+def test_a_batch_stands_for_all_states_of_the_last_ones(name, M, monkeypatch):
+    """The level and the mean above it are those of all of them, `E[V mu0]` is that of the new ones."""
+    monkeypatch.setattr("ocp_torch.certificate.lower.worst.CLIMBERS", 0)
+    monkeypatch.setattr("ocp_torch.certificate.lower.worst.TAIL", 40)
+    problem = zoo.build(name)
+    value = zoo.rough_network(2, seed=3)
+    given = batches(problem, 9)
+    remembered = round(40 * M / NEW)
+    monkeypatch.setattr("ocp_torch.certificate.lower.worst.KEPT", 60)  # above the level are 40
+    draw = WorstStates(problem, value, iter(given).__next__, fixed_generator())
+    objective, phase = LevelledDual(problem), phase_of(M)
+    for k, new in enumerate(given):
+        batch = draw(phase)
+        assert len(batch) < NEW + 60 + 1
+        found = objective.losses(Fields({VALUE: value}), batch, phase)[VALUE]
+        union = Samples.concatenate(given[max(0, k + 1 - remembered) : k + 1])
+        generator = Generator.of(problem, union)
+        slack = generator.hjb_slack(generator.chunked_jet(value))
+        # The least of `c + M E[max(Q - c, 0)]` over all `c` is at one of the slacks (Rockafellar and Uryasev).
+        tail = min(float(c + M * (slack - c).clamp_min(0.0).mean()) for c in slack)
+        paid = float((value(new.x) * new.mu0).mean().detach())
+        assert float(found.detach()) == pytest.approx(tail - paid, rel=1e-9)
+
+
+def test_no_state_stays_longer_than_the_others_it_is_compared_with(monkeypatch):
+    monkeypatch.setattr("ocp_torch.certificate.lower.worst.TAIL", 40)
+    monkeypatch.setattr("ocp_torch.certificate.lower.worst.CLIMBERS", 0)
+    problem = zoo.build("box-limited 2-d")
+    given = batches(problem, 12)
+    draw = WorstStates(problem, zoo.rough_network(2, seed=3), iter(given).__next__, fixed_generator())
+    for k in range(12):
+        x = draw(phase_of(6.4)).x  # of four batches
+        for past, old in enumerate(given[: k + 1]):
+            met = (x.unsqueeze(1) == old.x).all(dim=-1).any()
+            assert bool(met) == (k - past < 4)
+
+
+def test_the_worst_are_those_of_the_value_as_it_is_now(monkeypatch):
+    """A spike that `V` has lost is not trained on, though its states are still remembered."""
+    monkeypatch.setattr("ocp_torch.certificate.lower.worst.CLIMBERS", 0)
+    monkeypatch.setattr("ocp_torch.certificate.lower.worst.KEPT", 30)
+    problem, height = zoo.build("box-limited 2-d"), torch.ones((), dtype=torch.float64)
+    bump = lambda x: height * torch.exp(2.0 * torch.cos(2.0 * torch.pi * x).sum(dim=-1))
+    draw = WorstStates(problem, bump, iter(batches(problem, 2)).__next__, fixed_generator())
+    draw(phase_of(6.4))
+    height.fill_(-1.0)
+    batch = draw(phase_of(6.4))
+    generator = Generator.of(problem, batch)
+    slack, judged = generator.hjb_slack(generator.chunked_jet(bump)), batch.penalty_weight > 0.0
+    assert len(batch) == NEW + 30
+    assert int(judged.sum()) == 30
+    assert slack[judged].min() >= slack[~judged].max()
+
+
+def test_the_worst_states_climb_to_the_top_of_a_narrow_spike():
+    """One of width .004 in a plane, of which a hundred new states a step see the foot at best."""
+    problem = zoo.build("box-limited 2-d")
+    centre = torch.tensor([0.37, 0.61], dtype=torch.float64)
+    distance = lambda x: (2.0 * torch.sin(torch.pi * (x - centre))).square().sum(dim=-1) / (2.0 * torch.pi) ** 2
+    spike = lambda x: torch.exp(-distance(x) / (2.0 * 0.02**2))
+    points = zoo.states(problem, 100 * NEW)
+    near = (points - centre).norm(dim=-1).topk(NEW, largest=False).indices
+    given = [Samples.of(problem, x, divergences=False) for x in (points[near], *points.split(NEW))]
+    draw = WorstStates(problem, spike, iter(given).__next__, fixed_generator())
+    top = []
+    for _ in range(60):
+        batch = draw(phase_of(200.0))
+        generator = Generator.of(problem, batch)
+        top.append(float(generator.hjb_slack(generator.chunked_jet(spike)).max()))
+    fine = Samples.of(problem, centre + 0.06 * (zoo.states(problem, 40_000) - 0.5), divergences=False)
+    generator = Generator.of(problem, fine)
+    truth = float(generator.hjb_slack(generator.chunked_jet(spike)).max())
+    assert top == sorted(top)
+    assert top[-1] > truth - 0.1 * (truth - top[0])
