@@ -250,11 +250,18 @@ def test_a_quick_certificate_trains_for_as_many_times_fewer_steps_as_it_has_fewe
 @pytest.mark.parametrize(
     ("heights", "made"),
     [
-        ((0.02, 0.03, 0.0, 0.01), 2),  # nothing gained in the first, nothing left to gain after the second
+        (
+            (0.02, 0.03, 0.0, 0.01),
+            3,
+        ),  # nothing gained in the first, nothing left to gain after the second, which gained much
         ((0.02, 0.03, 0.01, 0.0), 3),
         ((0.02, 0.03, 6e-4, 0.0), 3),  # of .06: nearly one per cent is left
-        ((0.02, 0.03, 2e-4, 0.0), 2),  # a third of one is not worth a third round
-        ((6e-4, 0.0, 0.0, 0.0), 1),
+        ((6e-4, 6e-4, 2e-4, 2e-4), 3),
+        (
+            (6e-4, 2e-4, 1.8e-4, 0.0),
+            2,
+        ),  # a third of one per cent is not worth a third round where the second gave nothing
+        ((6e-4, 0.0, 0.0, 0.0), 2),
         ((2e-4, 0.0, 0.0, 0.0), 0),
     ],
 )
@@ -279,7 +286,7 @@ def test_rounds_go_on_while_there_is_enough_to_gain(heights, made, monkeypatch):
     def rounds(*_):
         for W in later:
             asked.append(W)
-            yield W
+            yield W, sets[0].take(slice(0, 4))
 
     monkeypatch.setattr("ocp_torch.certificate.lower.sampled.tightened", rounds)
     monkeypatch.setattr("ocp_torch.certificate.lower.sampled.mollified_shift", lambda best: best)
@@ -289,6 +296,8 @@ def test_rounds_go_on_while_there_is_enough_to_gain(heights, made, monkeypatch):
     assert to_gain(found.own) == pytest.approx(lost, rel=0.4, abs=1e-4)
     assert found.best.value.height.item() == min(heights[: made + 1])
     assert asked == later[:made]
+    # Its supremum is sought at the states that training found worst, too.
+    assert len(found.best.beside) == (found.best.value is not V)
 
 
 @pytest.mark.nightly

@@ -22,6 +22,7 @@ from ocp_torch.objectives.levelled import LevelledDual
 from ocp_torch.objectives.objective import Phase
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import advance, short_fit
 from ocp_torch.steppers.nonfinite import NonFiniteError
 
@@ -34,10 +35,10 @@ MS = (100.0, 1000.0, 3000.0)
 BATCH, STEPS, RATE = 2048, 300, 1e-3
 
 
-def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> Iterator[Field | None]:
-    """`W` for ``value`` `V` in float64, after each round of training in float32 on up to ``batch`` states a step, and `None`
-    after each step; nothing where `V` has no weights, nothing more where these do not stay finite. Fewer states than `BATCH`
-    are for a quick certificate, with as many times fewer steps."""
+def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> Iterator[tuple[Field, Samples] | None]:
+    """`W` for ``value`` `V`, and states where its slack is largest, both in float64, after each round of training in float32
+    on up to ``batch`` states a step, and `None` after each step; nothing where `V` has no weights, nothing more where these
+    do not stay finite. Fewer states than `BATCH` are for a quick certificate, with as many times fewer steps."""
     if not isinstance(value, nn.Module) or not any(True for _ in value.parameters()):
         return
     objective, unit = LevelledDual(problem), cost_unit(problem)
@@ -59,4 +60,5 @@ def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> 
         except NonFiniteError:
             return
         fields.load_state_dict(average.module.state_dict())
-        yield copy.deepcopy(fields.value).requires_grad_(False).double()
+        W = copy.deepcopy(fields.value).requires_grad_(False).double()
+        yield W, problem.samples(draw.worst.x.double(), divergences=False)

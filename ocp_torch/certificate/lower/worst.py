@@ -31,9 +31,9 @@ class WorstStates:
 
     def __init__(self, problem: Problem, value: Field, draw: Callable[[], Samples], generator: torch.Generator) -> None:
         self.problem, self.value, self.draw, self.generator = problem, value, draw, generator
-        self.worst: Samples | None = None
-        self.ages = torch.zeros(0)  # of the `worst`, in steps
         self.steps = 0
+        self.worst: Samples  # after the first step
+        self.ages = torch.zeros(0)  # of the `worst`, in steps
 
     def __call__(self, phase: Phase) -> Samples:
         """New states, and the worst of the last ones; `penalty_weight` is 0 for those that are not among the worst."""
@@ -53,7 +53,7 @@ class WorstStates:
 
     def _climbed(self, new: Samples) -> tuple[Samples, Tensor]:
         """The ``new`` states and the worst ones, where these moved to if a neighbour's slack is larger; and their slacks."""
-        if self.worst is None:
+        if self.steps == 0:
             return new, self._slack(new)
         climbers = self.worst.x[:CLIMBERS]
         radius = NEAREST * (FARTHEST / NEAREST) ** torch.rand(len(climbers), 1, generator=self.generator)
