@@ -29,12 +29,12 @@ def batches(problem, count: int) -> list[Samples]:
 def test_a_batch_stands_for_all_states_of_the_last_ones(name, M, monkeypatch):
     """The level and the mean above it are those of all of them, `E[V mu0]` is that of the new ones."""
     monkeypatch.setattr("ocp_torch.certificate.lower.worst.CLIMBERS", 0)
-    monkeypatch.setattr("ocp_torch.certificate.lower.worst.TAIL", 40)
+    monkeypatch.setattr("ocp_torch.certificate.lower.worst.TAIL", 40 / NEW)
     problem = zoo.build(name)
     value = zoo.rough_network(2, seed=3)
     given = batches(problem, 9)
     remembered = round(40 * M / NEW)
-    monkeypatch.setattr("ocp_torch.certificate.lower.worst.KEPT", 60)  # above the level are 40
+    monkeypatch.setattr("ocp_torch.certificate.lower.worst.KEPT", 60 / NEW)  # above the level are 40
     draw = WorstStates(problem, value, iter(given).__next__, fixed_generator())
     objective, phase = LevelledDual(problem), phase_of(M)
     for k, new in enumerate(given):
@@ -51,7 +51,7 @@ def test_a_batch_stands_for_all_states_of_the_last_ones(name, M, monkeypatch):
 
 
 def test_no_state_stays_longer_than_the_others_it_is_compared_with(monkeypatch):
-    monkeypatch.setattr("ocp_torch.certificate.lower.worst.TAIL", 40)
+    monkeypatch.setattr("ocp_torch.certificate.lower.worst.TAIL", 40 / NEW)
     monkeypatch.setattr("ocp_torch.certificate.lower.worst.CLIMBERS", 0)
     problem = zoo.build("box-limited 2-d")
     given = batches(problem, 12)
@@ -66,13 +66,13 @@ def test_no_state_stays_longer_than_the_others_it_is_compared_with(monkeypatch):
 def test_the_worst_are_those_of_the_value_as_it_is_now(monkeypatch):
     """A spike that `V` has lost is not trained on, though its states are still remembered."""
     monkeypatch.setattr("ocp_torch.certificate.lower.worst.CLIMBERS", 0)
-    monkeypatch.setattr("ocp_torch.certificate.lower.worst.KEPT", 30)
+    monkeypatch.setattr("ocp_torch.certificate.lower.worst.KEPT", 30 / NEW)
     problem, height = zoo.build("box-limited 2-d"), torch.ones((), dtype=torch.float64)
     bump = lambda x: height * torch.exp(2.0 * torch.cos(2.0 * torch.pi * x).sum(dim=-1))
     draw = WorstStates(problem, bump, iter(batches(problem, 2)).__next__, fixed_generator())
-    draw(phase_of(6.4))
+    draw(phase_of(100.0))
     height.fill_(-1.0)
-    batch = draw(phase_of(6.4))
+    batch = draw(phase_of(100.0))
     generator = Generator.of(problem, batch)
     slack, judged = generator.hjb_slack(generator.chunked_jet(bump)), batch.penalty_weight > 0.0
     assert len(batch) == NEW + 30
@@ -92,7 +92,7 @@ def test_the_worst_states_climb_to_the_top_of_a_narrow_spike():
     draw = WorstStates(problem, spike, iter(given).__next__, fixed_generator())
     top = []
     for _ in range(60):
-        batch = draw(phase_of(200.0))
+        batch = draw(phase_of(1000.0))
         generator = Generator.of(problem, batch)
         top.append(float(generator.hjb_slack(generator.chunked_jet(spike)).max()))
     fine = Samples.of(problem, centre + 0.06 * (zoo.states(problem, 40_000) - 0.5), divergences=False)

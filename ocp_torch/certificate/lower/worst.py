@@ -1,5 +1,6 @@
 """Batches in which the worst states of earlier ones come again: what a supremum is trained on."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -12,20 +13,21 @@ from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# States whose slacks the mean over the largest shall have, and how many of the worst are looked at again at every step: those
-# whose slack was lower a few steps ago may be among the largest now. Bounds of a pendulum with limited torque after 300, 600
-# and 1,200 steps with 40, 128 and 256 of them: 2.955, 2.960, 2.969, in equal times; without any memory 2.780.
-TAIL, KEPT = 256, 1024
+# Parts of the number of new states: how many slacks the mean over the largest shall have, and how many of the worst are
+# looked at again at every step, as those that were lower a few steps ago may be among the largest now. Bounds of a pendulum
+# with limited torque for 40, 128 and 256 slacks at 2,048 new states: 2.955, 2.960, 2.969, in equal times; without memory
+# 2.780.
+TAIL, KEPT = 1 / 8, 1 / 2
 # How many of the worst look around at each step, and how far, at random between these radii: a spike is as narrow as that.
 CLIMBERS, NEAREST, FARTHEST = 64, 1e-4, 1e-2
 
 
 class WorstStates:
-    """Draws for a `LevelledDual` of one `M`, whose mean over the part `1 / M` of the torus has `TAIL` states.
+    """Draws for a `LevelledDual` of one `M`, whose mean over the part `1 / M` of the torus has many states.
 
-    That takes `TAIL M` states, many more than a step can afford. But its gradient is that of the few with the largest
+    That takes `M` times as many, more than a step can afford. But its gradient is that of the few with the largest
     slacks, and these hardly change from step to step: so each batch has new states, from ``draw``, and with them the worst
-    of those that were new in the last steps, `TAIL M` in all. Each is forgotten after so many steps, so that no spike can
+    of those that were new in the last `TAIL M` steps. Each is forgotten after so many steps, so that no spike can
     hide between states that stay. `E[V mu0]` is a mean over the new ones alone.
     """
 
@@ -40,10 +42,10 @@ class WorstStates:
         new = self.draw()
         batch, slack = self._climbed(new)
         ages = torch.cat([torch.zeros_like(new.weight), self.ages.to(new.weight) + 1.0])
-        remembered = max(1, round(TAIL * phase.constants.M / len(new)))  # steps
+        remembered = max(1, round(TAIL * phase.constants.M))  # steps
         self.steps += 1
         stand_for = min(self.steps, remembered) * len(new)
-        worst = slack.topk(min(KEPT, len(batch))).indices
+        worst = slack.topk(math.ceil(KEPT * len(new))).indices
         again = worst[ages[worst] < remembered - 1]
         self.worst, self.ages = batch.take(again), ages[again]
         is_new = torch.arange(len(batch), device=batch.x.device) < len(new)
