@@ -38,9 +38,10 @@ BUDGETS = (
 )
 
 # Where no M is known the bound is decided by the worst state: that wants more states at once, and, without noise, longer.
-# With noise two coordinates want less: after rounds of 600 and 1,200 steps a pendulum's certified gap is .55 % and an arm's
-# 1.0 % at 1e-3, after 900 and 1,800 .45 and .85 %, for 25 s more of 145.
-LARGE_BATCH, MANY_STEPS, FEW_STEPS = 1024, 1200, 600
+# With noise two and three coordinates want less: after rounds of 600 and 1,200 steps a pendulum's certified gap is .55 % and
+# an arm's 1.0 % at 1e-3, after 900 and 1,800 .45 and .85 %, for 25 s more of 145; dubins has 6.1 (simulated 1.33) after 900
+# and 1,800, 6.8 (1.40) after 1,200 and 2,400.
+LARGE_BATCH, MANY_STEPS, FEW_STEPS = 1024, 1200, {2: 600, 3: 900}
 # In one dimension with noise, where networks are given more modes.
 NOISY_STEPS = 2000
 # The larger batch is for the supremum of the slack, of which the density player of pd knows nothing.
@@ -68,7 +69,7 @@ def fill(config: dict, problem: Problem) -> dict:
     if problem.noisy and problem.dim == 1:
         budget = replace(budget, steps=NOISY_STEPS)
     if unbounded:
-        noisy = FEW_STEPS if problem.dim == 2 else budget.steps
+        noisy = FEW_STEPS.get(problem.dim, budget.steps)
         steps = noisy if problem.noisy else max(budget.steps, MANY_STEPS)
         budget = replace(budget, batch=max(budget.batch, LARGE_BATCH), steps=steps)
     defaults: dict[str, object] = {
