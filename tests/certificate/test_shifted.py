@@ -250,17 +250,11 @@ def test_a_quick_certificate_trains_for_as_many_times_fewer_steps_as_it_has_fewe
 @pytest.mark.parametrize(
     ("heights", "made"),
     [
-        (
-            (0.02, 0.03, 0.0, 0.01),
-            3,
-        ),  # nothing gained in the first, nothing left to gain after the second, which gained much
+        ((0.02, 0.03, 0.0, 0.01), 3),  # nothing gained in the first, much in the second
         ((0.02, 0.03, 0.01, 0.0), 3),
         ((0.02, 0.03, 6e-4, 0.0), 3),  # of .06: nearly one per cent is left
         ((6e-4, 6e-4, 2e-4, 2e-4), 3),
-        (
-            (6e-4, 2e-4, 1.8e-4, 0.0),
-            2,
-        ),  # a third of one per cent is not worth a third round where the second gave nothing
+        ((6e-4, 2e-4, 1.8e-4, 0.0), 2),  # the second gained next to nothing, and a third of one per cent is left
         ((6e-4, 0.0, 0.0, 0.0), 2),
         ((2e-4, 0.0, 0.0, 0.0), 0),
     ],

@@ -81,7 +81,7 @@ def test_the_worst_are_those_of_the_value_as_it_is_now(monkeypatch):
 
 
 def test_the_worst_states_climb_to_the_top_of_a_narrow_spike():
-    """One of width .004 in a plane, of which a hundred new states a step see the foot at best."""
+    """A bump of radius .02 in a plane; a state near its top is met once, and 64 more at every step hardly help."""
     problem = zoo.build("box-limited 2-d")
     centre = torch.tensor([0.37, 0.61], dtype=torch.float64)
     distance = lambda x: (2.0 * torch.sin(torch.pi * (x - centre))).square().sum(dim=-1) / (2.0 * torch.pi) ** 2

@@ -19,16 +19,17 @@ from ocp_torch.problems.samples import Samples
 # 2.780.
 TAIL, KEPT = 1 / 8, 1 / 2
 # How many of the worst look around at each step, and how far, at random between these radii: a spike is as narrow as that.
+# That bound was 2.945 without any and 2.955 with them, for 40 slacks.
 CLIMBERS, NEAREST, FARTHEST = 64, 1e-4, 1e-2
 
 
 class WorstStates:
     """Draws for a `LevelledDual` of one `M`, whose mean over the part `1 / M` of the torus has many states.
 
-    That takes `M` times as many, more than a step can afford. But its gradient is that of the few with the largest
-    slacks, and these hardly change from step to step: so each batch has new states, from ``draw``, and with them the worst
-    of those that were new in the last `TAIL M` steps. Each is forgotten after so many steps, so that no spike can
-    hide between states that stay. `E[V mu0]` is a mean over the new ones alone.
+    That takes `M` times as many, more than a step can afford. But its gradient is that of the few with the largest slacks,
+    and these hardly change from step to step: so each batch has new states, from ``draw``, and with them the worst of those
+    that were new in the last `TAIL M` steps. Each is forgotten after so many steps, so that no spike can hide between states
+    that stay; until then it climbs, which makes the mean a little too large. `E[V mu0]` is a mean over the new ones alone.
     """
 
     def __init__(self, problem: Problem, value: Field, draw: Callable[[], Samples], generator: torch.Generator) -> None:
@@ -48,6 +49,7 @@ class WorstStates:
         worst = slack.topk(math.ceil(KEPT * len(new))).indices
         again = worst[ages[worst] < remembered - 1]
         self.worst, self.ages = batch.take(again), ages[again]
+        # Objectives divide by the size of the batch: means are over the new states, and over all that the worst are of.
         is_new = torch.arange(len(batch), device=batch.x.device) < len(new)
         weight = torch.where(is_new, len(batch) / len(new), 0.0).to(batch.x)
         penalty = torch.zeros_like(weight).index_fill_(0, worst, len(batch) / stand_for)
