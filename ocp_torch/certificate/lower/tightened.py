@@ -31,8 +31,8 @@ from ocp_torch.steppers.nonfinite import NonFiniteError
 # a pendulum with limited torque ends at 2.962; at 2.931 by 1,000, 3,000 and 10,000, and at 2.780 by 100 throughout.
 MS = (100.0, 1000.0, 3000.0)
 # New states of a step, at most, steps of the first round, each further one twice as long, and the first learning rate of
-# each. Bounds at first and after each round: that pendulum 2.761, 2.764, 2.941, 2.969; an arm .4475, .4594, .4597, .4603;
-# dubins with noise, with a shorter memory, 1.152, 1.172, 1.177, 1.150, where the last round left a spike.
+# each. Bounds at first and after each round, with twice as many states that come again: that pendulum 2.761, 2.764, 2.941,
+# 2.969; an arm .4475, .4594, .4597, .4603; with fewer dubins with noise 1.152, 1.172, 1.177, 1.150: a spike was left.
 BATCH, STEPS, RATE = 2048, 300, 1e-3
 
 
