@@ -17,9 +17,9 @@ from ocp_torch.maths.jets import Field
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# The part of the bound that must be to gain for another round of training for it, or that the last one must have gained: the
-# first gave nothing on two unicycles with noise, the second 1.0 and 1.8 %; a third on dubins with noise gave none to .3 %, for
-# 70 s of 320.
+# The part of the bound that must be to gain for another round of training for it, or that the last one must have gained:
+# the first gave nothing on two unicycles with noise, the second 1.0 and 1.8 %; a third on dubins with noise gave none to
+# .3 %, for 70 s of 320.
 WORTH = 0.005
 
 
