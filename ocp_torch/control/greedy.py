@@ -38,20 +38,21 @@ class HeldPolicy:
         """Controls ``(N, m)`` at states ``(N, d)``."""
         problem, cost, a_step = self.problem, self.problem.control_cost, self.problem.discount * self.pace.step
         drifted = self.pace.drift(problem, x)
-        before = jet(self.value, x + drifted).gradient
-        u = cost.argmax(-pull_back(problem.control_matrix(x), before) / problem.discount)
+        before = jet(self.value, x + drifted)
+        u = cost.argmax(-pull_back(problem.control_matrix(x), before.gradient) / problem.discount)
         moved = self.pace.move(problem, x, u)
         along = (moved - drifted) / a_step
-        slopes = ((gradient * along).sum(dim=-1) for gradient in (before, jet(self.value, x + moved).gradient))
+        slopes = ((end.gradient * along).sum(dim=-1) for end in (before, jet(self.value, x + moved)))
         part = kept(cost.q, self._price(u), *slopes).unsqueeze(-1) * u
         if math.isinf(cost.reach):
             return part
         most = farthest(cost, u)
         # All at once: one after the other takes twice as long for few states.
-        tried = [part, most, -most, torch.zeros_like(u)]
-        moves = torch.cat([self.pace.move(problem, torch.cat([x] * 3), torch.cat(tried[:3])), drifted])
-        after = self.value((torch.cat([x] * 4) + moves).remainder(1.0)) / a_step
-        merits = (self._price(torch.cat(tried)) + after).chunk(4)
+        tried = [part, most, -most]
+        x3 = torch.cat([x] * 3)
+        after = self.value((x3 + self.pace.move(problem, x3, torch.cat(tried))).remainder(1.0))
+        tried.append(torch.zeros_like(u))
+        merits = (self._price(torch.cat(tried)) + torch.cat([after, before.value]) / a_step).chunk(4)
         best, least = part, merits[0]
         for other, merit in zip(tried[1:], merits[1:], strict=True):
             better = merit < least

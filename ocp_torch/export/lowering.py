@@ -141,10 +141,11 @@ class Lowering:
 
     def _cat(self, parts: list, dim: int = 0) -> View:
         views = [v for v in map(self.view, parts) if v.places.numel()]
-        whole = self.program.add("cat", tuple(views), (sum(v.places.numel() for v in views),))
-        pieces = whole.places.split([v.places.numel() for v in views])
-        places = torch.cat([p.view(v.places.shape) for p, v in zip(pieces, views, strict=True)], dim=dim)
-        return View(whole.buffer, places)
+        shape = torch.cat([v.places for v in views], dim).shape
+        outer = int(shape[: dim % len(shape)].numel())
+        # Row by row: a result in row-major order has evenly spaced rows, which loops can run along.
+        rows = [View(v.buffer, places) for row in range(outer) for v in views for places in [v.places.reshape(outer, -1)[row]]]
+        return self.program.add("cat", tuple(rows), shape)
 
     def _mm(self, left: Any, right: Any) -> View:
         left, right = self.view(left), self.view(right)
