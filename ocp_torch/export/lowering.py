@@ -144,8 +144,8 @@ class Lowering:
         shape = torch.cat([v.places for v in views], dim).shape
         outer = int(shape[: dim % len(shape)].numel())
         # Row by row: a result in row-major order has evenly spaced rows, which loops can run along.
-        parts = [(v.buffer, v.places.reshape(outer, -1)) for v in views]
-        rows = [View(buffer, places[row]) for row in range(outer) for buffer, places in parts]
+        flat = [(v.buffer, v.places.reshape(outer, -1)) for v in views]
+        rows = [View(buffer, places[row]) for row in range(outer) for buffer, places in flat]
         return self.program.add("cat", tuple(rows), shape)
 
     def _mm(self, left: Any, right: Any) -> View:

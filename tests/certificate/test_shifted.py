@@ -212,7 +212,8 @@ def perturbed(problem, size=1e-3, seed=0):
 
 @pytest.mark.parametrize("name", ["manufactured 2-d q=1.5", "noisy 1-d"])
 def test_a_value_trained_on_for_the_bound_comes_closer_to_the_optimum_from_below(name, monkeypatch):
-    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.STEPS", 150)
+    for steps in ("STEPS", "NOISY_STEPS"):
+        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{steps}", 150)
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.BATCH", 512)
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.MS", (100.0,))
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.RATE", 2e-2)
@@ -312,7 +313,8 @@ def test_rounds_go_on_while_there_is_enough_to_gain(problem, heights, made, monk
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["kuramoto n=3", "noisy 1-d"])
 def test_a_second_core_gives_the_same_certificate(name, monkeypatch):
-    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.STEPS", 10)
+    for steps in ("STEPS", "NOISY_STEPS"):
+        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{steps}", 10)
     for least in ("WORTH", "WORTH_AT_FIRST"):
         monkeypatch.setattr(f"ocp_torch.certificate.lower.sampled.{least}", 0.0)
     problem, threads = zoo.build(name), []

@@ -17,8 +17,8 @@ from ocp_torch.maths.jets import Field
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# Another round of training for the bound is made where that part of the bound is to gain, or was gained by the last one, with
-# noise: the first gave nothing on two unicycles, the second 1.0 and 1.8 %; a third on dubins none to .3 %, for 70 s of 320.
+# With noise another round of training for the bound is made where that part of it is to gain, or was gained by the last one:
+# the first gave nothing on two unicycles, the second 1.0 and 1.8 %; a third on dubins none to .3 %, for 70 s of 320.
 WORTH = 0.005
 # Without noise less is enough, as gaps are narrow, and twice as much after each round, as the next takes twice as long. Of
 # two arms .39 and .85 % were to gain, by which no round was made of one, and one of the other; three gave .51 and 1.0 %.
