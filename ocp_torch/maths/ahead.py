@@ -4,6 +4,8 @@ import threading
 from collections.abc import Generator
 from typing import Generic, TypeVar
 
+import torch
+
 from ocp_torch.maths.cores import cores
 
 T = TypeVar("T")
@@ -26,7 +28,8 @@ class Ahead(Generic[T]):
     def begin(self) -> None:
         """Go on in a thread of its own, where there is a second core."""
         if self._thread is None and not self._answer and cores() > 1:
-            self._thread = threading.Thread(target=self._run, name="ocp_torch ahead", daemon=True)
+            threads = (torch.get_num_threads(),)
+            self._thread = threading.Thread(target=self._run, args=threads, name="ocp_torch ahead", daemon=True)
             self._thread.start()
 
     def answer(self) -> T:
@@ -46,7 +49,9 @@ class Ahead(Generic[T]):
             self._stopped.set()
             self._thread.join()
 
-    def _run(self) -> None:
+    def _run(self, threads: int | None = None) -> None:
+        if threads is not None:  # a new thread would take as many of PyTorch's as there are cores
+            torch.set_num_threads(threads)
         try:
             while not self._stopped.is_set():
                 next(self._work)

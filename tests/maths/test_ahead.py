@@ -4,6 +4,7 @@ import threading
 import time
 
 import pytest
+import torch
 
 from ocp_torch.maths import ahead
 from ocp_torch.maths.ahead import Ahead
@@ -30,6 +31,19 @@ def test_the_answer_is_that_of_the_work_wherever_it_is_done(monkeypatch, count):
     threads = {thread for _, thread in done}
     assert (threading.current_thread() in threads) == (count == 1)
     assert len(threads) == 1
+
+
+def test_a_sum_begun_before_is_bitwise_that_of_whoever_asked(monkeypatch):
+    left, right = torch.randn(2, 2048, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+    def product():
+        yield
+        return left.T @ right
+
+    monkeypatch.setattr(ahead, "cores", lambda: 2)
+    work = Ahead(product())
+    work.begin()
+    assert torch.equal(work.answer(), left.T @ right)
 
 
 def test_without_a_beginning_whoever_asks_does_the_work():

@@ -25,6 +25,16 @@ def test_results_are_in_order_and_threads_are_those_that_are_allowed(monkeypatch
     assert here == (count == 1 or not together)
 
 
+def test_a_sum_in_a_thread_is_bitwise_that_of_whoever_asked(monkeypatch):
+    # A product of large matrices is summed by so many threads as PyTorch may take, in an order of their number.
+    left, right = torch.randn(2, 2048, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    sums = []
+    for count in (1, 2):
+        monkeypatch.setattr(cores, "cores", lambda count=count: count)
+        sums.append(side_by_side(lambda k: left.T @ right, [0, 1]))
+    assert all(torch.equal(one, other) for one in sums[0] for other in sums[1])
+
+
 @pytest.mark.parametrize("together", [True, False])
 def test_an_error_in_a_piece_reaches_whoever_asked(monkeypatch, together):
     monkeypatch.setattr(cores, "cores", lambda: 2)
