@@ -35,7 +35,9 @@ class FourierEmbedding(nn.Module):
 
     def waves(self, dim: int) -> Tensor:
         """All wave vectors, ``(J, d)``, in the order of `forward`."""
-        single = (torch.eye(dim).to(self.wave_numbers).unsqueeze(1) * self.wave_numbers[:, None]).flatten(0, 1)
+        like = self.wave_numbers
+        units = torch.eye(dim, dtype=like.dtype, device=like.device)
+        single = (units.unsqueeze(1) * like[:, None]).flatten(0, 1)
         return single if self.mixed is None else torch.cat([single, self.mixed])
 
     def forward(self, x: Tensor) -> Tensor:

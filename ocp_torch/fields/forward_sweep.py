@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from ocp_torch.fields.embedding import FourierEmbedding
+from ocp_torch.maths.replays import decided
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,10 @@ class Along:
         if sigma.shape[2] < sigma.shape[1]:
             return cls(columns=sigma)
         scales = sigma.diagonal(dim1=1, dim2=2)
-        plain = sigma.shape[1] == sigma.shape[2] and torch.equal(sigma, torch.diag_embed(scales))
-        return cls(scales=scales) if plain and bool(scales.all()) else cls(sigma=sigma)
+        if sigma.shape[1] != sigma.shape[2]:
+            return cls(sigma=sigma)
+        plain = (sigma == torch.diag_embed(scales)).all() & scales.all()
+        return cls(scales=scales) if decided(plain) else cls(sigma=sigma)
 
     def derivatives(self, waves: Tensor, count: int) -> Tensor:
         """The derivatives ``(p, N, J)`` of linear functions with gradients ``waves`` ``(J, d)`` at ``count`` states `N`."""

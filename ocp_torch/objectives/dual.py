@@ -8,10 +8,6 @@ from ocp_torch.objectives.objective import Objective, Phase
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# Where no `M` is known, its weight grows geometrically from this part of `M` to all of it, over this part of each round. A
-# heavier start leaves `V` stuck far below `V*`; a longer growth leaves it less of the round to become feasible.
-LEAST_WEIGHT, GROWTH = 1.0 / 20.0, 0.7
-
 
 class Dual(Objective):
     r"""Maximise `F_M(V) = E[V mu0 - M max(Q, 0)]`: at most `OPT` for every `V` once `M >= sup mu*` (Proposition 3).
@@ -40,10 +36,7 @@ class Dual(Objective):
 
 def value_loss(phase: Phase, fields: Fields, samples: Samples, value: Tensor, slack: Tensor, residual: float) -> Tensor:
     """What a value player on its own minimises: `E[M max(Q, 0) + (residual / s) Q^2 - V mu0]`."""
-    M = phase.constants.M
-    if phase.constants.unbounded:
-        M = M * LEAST_WEIGHT ** max(0.0, 1.0 - phase.progress / GROWTH)
-    violation = M * slack.clamp_min(0.0)
+    violation = phase.growth * phase.constants.M * slack.clamp_min(0.0)
     if residual > 0.0:
         violation = violation + residual / getattr(fields.value, "scale", 1.0) * slack.square()
     return samples.penalty(violation) - samples.mean(value * samples.mu0)

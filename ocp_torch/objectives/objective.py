@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,18 +18,35 @@ from ocp_torch.problems.samples import Samples
 # How a method turns its fields into mu: Lemma 2, Lemma 3, or a network for log mu.
 CLOSED, SADDLE, NETWORK = "closed", "saddle", "network"
 
+# Where no `M` is known, its weight grows geometrically from this part of `M` to all of it, over this part of each round. A
+# heavier start leaves `V` stuck far below `V*`; a longer growth leaves it less of the round to become feasible.
+LEAST_WEIGHT, GROWTH = 1.0 / 20.0, 0.7
+
 
 @dataclass(frozen=True)
 class Phase:
     """Made by whoever trains, at each step, and passed on to losses: an objective has neither a clock nor a state.
 
     ``constants`` are `M`, `C_V` and `C_u` in force; ``progress`` is the part of the present round that is done, in [0, 1];
-    the samples are one of ``shares`` equal parts of a batch.
+    the samples are one of ``shares`` equal parts of a batch; ``growing`` is the `growth`, where that is a tensor.
     """
 
     constants: Constants
     progress: float = 1.0
     shares: int = 1
+    growing: Any = None
+
+    @property
+    def growth(self) -> Any:
+        """The part of `M` that is in force: all of it, but where no `M` is known (see `Dual`)."""
+        if self.growing is not None or not self.constants.unbounded:
+            return 1.0 if self.growing is None else self.growing
+        return LEAST_WEIGHT ** max(0.0, 1.0 - self.progress / GROWTH)
+
+    @property
+    def form(self) -> tuple:
+        """What the course of a loss may depend on, `progress` apart."""
+        return (*(getattr(self.constants, name) for name in ("M", "C_V", "C_u", "unbounded")), self.shares)
 
 
 class Objective(ABC):

@@ -15,6 +15,7 @@ from torch import Tensor
 from ocp_torch.errors import InputError, require_number, require_numbers, shown
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.control_cost import PowerCost, norm_power, radial_part
+from ocp_torch.problems.placed import Placed
 
 # What a problem may be told: the largest `|u|`, or a list of the largest `|u_i|`; `None` where there is no limit.
 Limit = float | Sequence[float] | None
@@ -120,7 +121,7 @@ class LimitedCost(ConstrainedCost):
         return self.gauge(w) * self.largest
 
 
-class BoxLimitedCost(ConstrainedCost):
+class BoxLimitedCost(ConstrainedCost, Placed):
     r"""`R_c(u) = |u|^2 / 2` for `|u_i| <= c_i`, else infinity: a sum over the actuators, as is its conjugate, of Huber's
     functions `R_{c_i}*(p_i)`; but the actuators share `mu`, which is at least `max_i |w_i| / c_i`.
 
@@ -140,18 +141,19 @@ class BoxLimitedCost(ConstrainedCost):
         names = (f"problem.control_limit[{i}]" for i in range(len(limit)))
         numbers = require_numbers("problem.control_limit", limit, count)
         self.limit = self.sides = [_size(name, c) for name, c in zip(names, numbers, strict=True)]
+        self._sides = torch.tensor(self.limit, dtype=torch.float64)
         self.reach = math.hypot(*self.limit)
 
     def gauge(self, w: Tensor) -> Tensor:
-        return (w.abs() / w.new_tensor(self.limit)).amax(dim=-1)
+        return (w.abs() / self._like(w, "sides", self._sides)).amax(dim=-1)
 
     def within(self, w: Tensor, mu: Tensor | float) -> Tensor:
-        room = w.new_tensor(self.limit) * (mu.unsqueeze(-1) if isinstance(mu, Tensor) else mu)
+        room = self._like(w, "sides", self._sides) * (mu.unsqueeze(-1) if isinstance(mu, Tensor) else mu)
         return w.clamp(-room, room)
 
     def argmax_along(self, p: Tensor, moved: Tensor) -> Tensor:
         """An entry at its limit stays there."""
-        return torch.where((p.abs() > p.new_tensor(self.limit)).unsqueeze(-1), 0.0, moved)
+        return torch.where((p.abs() > self._like(p, "sides", self._sides)).unsqueeze(-1), 0.0, moved)
 
 
 def _size(name: str, limit: object) -> float:

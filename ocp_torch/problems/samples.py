@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError
+from ocp_torch.maths.replays import decided
 
 if TYPE_CHECKING:
     from ocp_torch.problems.problem import Problem
@@ -67,6 +68,11 @@ class Samples:
             f, noise = problem.state_cost(x), problem.noise(x)
         return cls(x, f, a, B, one, one, noise=noise)
 
+    @property
+    def columns(self) -> list[Tensor | None]:
+        """All of it, in the order in which `Samples` takes them."""
+        return [getattr(self, f.name) for f in fields(self)]
+
     def __len__(self) -> int:
         return self.x.shape[0]
 
@@ -97,10 +103,15 @@ class Samples:
 
     def take_weighted(self, most: int | None = None) -> "tuple[Samples, Tensor]":
         """Those that carry weight, the first ``most`` of them, and their rows; `mean` estimates the same integrals."""
-        rows = self.weight.nonzero().squeeze(-1)
-        part = len(rows) / len(self)
-        chosen = self.take(rows[:most])
-        return replace(chosen, weight=part * chosen.weight, penalty_weight=None), rows[:most]
+        none = self.weight == 0.0
+        count = len(self) - decided(none.sum())
+        rows = none.sort(stable=True)[1][: count if most is None else min(count, most)]
+        chosen = self.take(rows)
+        return replace(chosen, weight=count / len(self) * chosen.weight, penalty_weight=None), rows
+
+    def copied(self) -> "Samples":
+        """The samples in memory of their own."""
+        return self._map(torch.clone)
 
     def to(self, like: Tensor) -> "Samples":
         """The samples in the precision and on the device of ``like``."""

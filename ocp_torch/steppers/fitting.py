@@ -3,7 +3,6 @@ and SOAP from `pytorch_optimizer`; averages of the iterates those of `torch.opti
 
 import math
 from collections.abc import Callable, Sequence
-from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -36,10 +35,10 @@ def _adam(parameters: list[Tensor], lr: float, betas=(0.9, 0.99)) -> Optimizer:
 
 
 def _soap(parameters: list[Tensor], lr: float, betas=(0.95, 0.95), precondition_frequency: int = 10) -> Optimizer:
-    from pytorch_optimizer import SOAP  # slow to import, and only needed here
+    from ocp_torch.steppers.soap import ReplayedSOAP  # slow to import, and only needed here
 
     every = require_integer("optimizer.precondition_frequency", precondition_frequency, 1)
-    return SOAP(parameters, lr=lr, betas=_betas(betas), weight_decay=0.0, precondition_frequency=every)
+    return ReplayedSOAP(parameters, lr=lr, betas=_betas(betas), weight_decay=0.0, precondition_frequency=every)
 
 
 def _betas(betas) -> tuple[float, float]:
@@ -98,11 +97,18 @@ class Average(AveragedModel):
     """The average of the iterates that were counted is in ``module``."""
 
     module: Fields
+    rule: Callable[..., None]
 
+    @torch.no_grad()
     def count(self, iterate: Sequence[Tensor]) -> None:
-        """Take ``iterate``, all parameters in the order of those of the fields, into the average."""
-        alike: Any = SimpleNamespace(parameters=lambda: iterate, buffers=self.module.buffers)
-        self.update_parameters(alike)
+        """Take ``iterate``, all parameters in the order of those of the fields, into the average: as `update_parameters`
+        would, without its look at each of them."""
+        own: list[Any] = list(self.module.parameters())
+        if self.n_averaged == 0:
+            torch._foreach_copy_(own, list(iterate))
+        else:
+            self.rule(own, list(iterate), self.n_averaged)
+        self.n_averaged += 1
 
 
 def averaged(fields: Fields, kind: str = "ema", decay: float = DECAY) -> Average:
@@ -114,7 +120,9 @@ def averaged(fields: Fields, kind: str = "ema", decay: float = DECAY) -> Average
     decay = require_number("averaging.decay", decay, at_least=0.0, at_most=MOST_DECAY)
     exponential = get_ema_multi_avg_fn(decay if kind == "ema" else 0.0)  # with 0 that is the last iterate
     rule = get_swa_multi_avg_fn() if kind == "uniform" else exponential
-    return Average(fields, multi_avg_fn=rule, use_buffers=False).requires_grad_(False)
+    average = Average(fields, use_buffers=False).requires_grad_(False)
+    average.rule = rule
+    return average
 
 
 def advance(stepper: Stepper, average: Average, draw: Callable[[Phase], Samples], phase: Phase) -> StepReport:
@@ -122,7 +130,10 @@ def advance(stepper: Stepper, average: Average, draw: Callable[[Phase], Samples]
 
     Raises `NonFiniteError` as `Stepper.step` does; nothing is counted then.
     """
-    report = stepper.step([draw(phase) for _ in range(stepper.draws)], phase)
+    # The next draw of a replay is written over the one before.
+    kept = stepper.replay.captures and stepper.draws > 1
+    batches = [draw(phase).copied() if kept else draw(phase) for _ in range(stepper.draws)]
+    report = stepper.step(batches, phase)
     average.count(report.counted)
     return report
 

@@ -4,7 +4,7 @@ import copy
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -15,6 +15,7 @@ from torch.optim.lr_scheduler import LRScheduler
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.maths.ranks import Alone
+from ocp_torch.maths.replays import Called, replays_on
 from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM, NonFiniteError, first_nonfinite
@@ -66,7 +67,21 @@ class Stepper(ABC):
         self.delays = {player: objective.delays.get(player, 0.0) for player in objective.players}
         self.schedules = {player: schedule(o, self.delays[player]) for player, o in self.optimizers.items()}
         self._start = copy.deepcopy(self.state_dict())
+        self._moving: dict[tuple, list[str]] = {}  # who has a loss, by the form of the phase
         self.ranks = Alone()  # those with which batches are shared
+        self.replay = replays_on(next(fields.parameters()).device)
+
+    @property
+    def replay(self) -> Called:
+        """How what is the same from step to step is called."""
+        return self._replay
+
+    @replay.setter
+    def replay(self, replay: Called) -> None:
+        self._replay = replay
+        for optimizer in self.optimizers.values():
+            if hasattr(optimizer, "replay"):
+                optimizer.replay = replay.fresh()  # its own, to be forgotten apart
 
     @abstractmethod
     def step(self, batches: Sequence[Samples], phase: Phase) -> StepReport:
@@ -106,22 +121,22 @@ class Stepper(ABC):
 
     def _parameters(self) -> list[Tensor]:
         """A copy of all parameters as they stand."""
-        return [p.detach().clone() for p in self.fields.parameters()]
+        return torch._foreach_mul([p.detach() for p in self.fields.parameters()], 1.0)  # type: ignore[return-value]
 
     def _differentiate(self, samples: Samples, phase: Phase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Set each parameter's gradient to that of its own player's loss, the mean of those of all `ranks`; losses and
         gradient norms per player."""
-        losses = self.objective.losses(self.fields, samples, phase)
-        *_, last = losses
-        found = [loss.detach() for loss in losses.values()]
-        for player, loss in losses.items():
-            own = self.parameters[player]
-            more = player != last
-            gradients = torch.autograd.grad(loss / self.unit, own, retain_graph=more, allow_unused=True)
-            # A bias that only shifts V gets no gradient where only grad V matters.
-            found += [torch.zeros_like(p) if g is None else g for p, g in zip(own, gradients, strict=True)]
+        form = (*phase.form, self.objective.needs_divergences(phase))
+
+        def differentiated(growth: Any, *columns: Tensor) -> list[Tensor]:
+            found = self.objective.losses(self.fields, Samples(*columns), replace(phase, growing=growth))
+            self._moving[form] = list(found)
+            return [*(loss.detach() for loss in found.values()), *self._gradients(found)]
+
+        inputs = [self.replay.number(phase.growth, samples.weight), *samples.columns]
+        found: list[Any] = self.replay(("losses", form), differentiated, inputs)
         means = iter(self.ranks.mean(found))
-        losses, norms = {player: next(means) for player in losses}, {}
+        losses, norms = {player: next(means) for player in self._moving[form]}, {}
         for player in losses:
             for parameter in self.parameters[player]:
                 parameter.grad = next(means)
@@ -137,6 +152,18 @@ class Stepper(ABC):
             for player, norm in norms.items():
                 torch.nn.utils.clip_grads_with_norm_(self.parameters[player], self.clip, norm)
         return losses, norms
+
+    def _gradients(self, losses: dict[str, Tensor]) -> list[Tensor]:
+        """Of each player's own loss, with respect to each of its parameters."""
+        *_, last = losses
+        found: list[Tensor] = []
+        for player, loss in losses.items():
+            own = self.parameters[player]
+            more = player != last
+            gradients = torch.autograd.grad(loss / self.unit, own, retain_graph=more, allow_unused=True)
+            # A bias that only shifts V gets no gradient where only grad V matters.
+            found += [torch.zeros_like(p) if g is None else g for p, g in zip(own, gradients, strict=True)]
+        return found
 
     def _update(self, players: Iterable[str], ahead: bool = False) -> None:
         """One update of ``players`` with the gradients in place, then the projection. A player's schedule counts its own

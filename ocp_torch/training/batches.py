@@ -1,7 +1,8 @@
 """Training batches: states of a sampler and, where that pays, states that the controller in training visits."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -10,6 +11,7 @@ from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.errors import InputError, require_number
 from ocp_torch.fields import VALUE, Fields
 from ocp_torch.maths.ranks import Alone
+from ocp_torch.maths.replays import replays_on
 from ocp_torch.maths.sampling import ImportanceSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives import Objective, Phase
@@ -61,6 +63,8 @@ class Batches:
             raise InputError(f"sampler.visited is {self.visited:g}, but {lacks}; leave it out.")
         self.generator = torch.Generator().manual_seed(derive_seed(self.seed, Branch.VISITS))
         self.states: Tensor | None = None  # (k, d), where the visited states are now
+        self._noises = 0  # columns of sigma
+        self.replay = replays_on(next(self.fields.parameters()).device)
 
     def draw(self, phase: Phase) -> Samples:
         """This process's share of the next batch, with what the objective needs at ``phase``, in the precision and on the
@@ -74,54 +78,71 @@ class Batches:
         divergences = self.objective.needs_divergences(phase)
         self.ranks.require_shares("trainer.batch", self.size)
         self.ranks.require_shares("the number of visited states in trainer.batch", count)
-        if isinstance(self.sampler, ImportanceSampler):
-            drawn = self._weighted(self.sampler, self.size - count, phase, like, divergences)
-        else:
-            x = self.sampler.draw(self.size - count)[self.ranks.share]
-            drawn = self.problem.samples(x.to(like.device), divergences=divergences)
         if not self.problem.has_simulator:
-            return drawn.to(like)
-        return self._with_visited(drawn, count, like, divergences) if count else drawn
+            rows = self.sampler.draw(self.size)[self.ranks.share]
+            return self.problem.samples(rows, divergences=divergences).to(like)
+        x, weight = self._drawn(self.size - count, phase, like, divergences)
+        inputs = [x, weight, *(self._moves(count, like) if count else ())]
+        found: list[Any] = self.replay(("samples", divergences), partial(self._evaluated, divergences), inputs)
+        *columns, states = found
+        self.states = states if count else self.states
+        return Samples(*columns)
 
-    def _weighted(
-        self, sampler: ImportanceSampler, count: int, phase: Phase, like: Tensor, divergences: bool
-    ) -> Samples:
-        """``count`` states of ``sampler`` with their weights, after a look at a pool of states where one is due."""
-        at = lambda x: self.problem.samples(x.to(like.device), divergences=divergences)
+    def _drawn(self, count: int, phase: Phase, like: Tensor, divergences: bool) -> tuple[Tensor, Tensor | None]:
+        """``count`` states of the sampler, with weights where it has any. Before, where one is due, a look at a pool."""
+        sampler = self.sampler
+        if not isinstance(sampler, ImportanceSampler):
+            return sampler.draw(count, like.device)[self.ranks.share], None
         if sampler.due:
             x, weight = sampler.pool()
+            pool = self.problem.samples(x.to(like.device), divergences=divergences)
             whole = replace(phase, shares=1)
-            sampler.learn(x, weight, scores(self.objective, self.fields, at(x), whole, sampler.generator))
+            sampler.learn(x, weight, scores(self.objective, self.fields, pool, whole, sampler.generator))
         x, weight = (part[self.ranks.share] for part in sampler.draw_weighted(count))
-        return replace(at(x), weight=weight.to(like))
+        return x.to(like.device), weight.to(like)
 
-    def _with_visited(self, drawn: Samples, count: int, like: Tensor, divergences: bool) -> Samples:
+    def _moves(self, count: int, like: Tensor) -> list[Tensor | None]:
+        """Where ``count`` visited states are, and the random numbers that decide where they go."""
         if self.states is None or len(self.states) != count:
             self.states = self._uniform(count, like)
-        visited = self.problem.samples(self.states.to(like), divergences=divergences)
-        spent = self._move(visited)  # of all, on every process: where they go next is then the same everywhere
+        states, driven = self.states.to(like), None
+        if self.problem.noisy:
+            self._noises = self._noises or cast(Tensor, self.problem.noise(states[:1])).shape[-1]
+            driven = torch.randn(count, self._noises, generator=self.generator).to(like)
+        return [states, driven, torch.rand(count, generator=self.generator).to(like), self._uniform(count, like)]
+
+    def _evaluated(self, divergences: bool, x: Tensor, weight: Tensor | None, *moves: Tensor) -> list[Tensor | None]:
+        """The columns of a batch at the states ``x``, and where visited states are then."""
+        drawn = self.problem.samples(x, divergences=divergences)
+        if weight is not None:
+            drawn = replace(drawn, weight=weight)
+        if not moves:
+            return [*drawn.columns, None]
+        states, *numbers = moves
+        visited = self.problem.samples(states, divergences=divergences)
+        moved, spent = self._moved(
+            visited, *numbers
+        )  # of all, on every process: where they go next is the same everywhere
         # The drawn states stand for all integrals, as they would without the visited ones; the penalties see both.
-        part = self.size / (self.size - count)
+        part = self.size / (self.size - len(states))
         drawn = replace(drawn, weight=part * drawn.weight, penalty_weight=drawn.weight)
         visited = replace(visited, weight=torch.zeros_like(visited.weight), penalty_weight=spent)
-        return Samples.concatenate([drawn, visited.take(self.ranks.share)])
+        return [*Samples.concatenate([drawn, visited.take(self.ranks.share)]).columns, moved]
 
     @torch.no_grad()
-    def _move(self, at: Samples) -> Tensor:
-        """Along the closed loop for a short time, or back to a uniform state; the part of `STEP_TIME` it took, ``(k,)``."""
+    def _moved(self, at: Samples, driven: Tensor | None, chance: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the visited states ``at`` are a short time along the closed loop later, or back at ``fresh`` uniform states,
+        ``(k, d)``; and the part of `STEP_TIME` it took, ``(k,)``."""
         policy, rho = ValuePolicy(self.problem, self.fields.value), self.problem.discount
         u = policy(at.x)
         velocity = at.a + torch.einsum("ndm,nm->nd", at.B, u)
         time = (LONGEST_STEP / velocity.norm(dim=-1).clamp_min(1e-12)).clamp_max(STEP_TIME / rho)
         moved = at.x + time.unsqueeze(-1) * velocity
         if at.noise is not None:
-            drawn = torch.randn(len(moved), at.noise.shape[-1], generator=self.generator).to(moved)
-            moved = moved + time.sqrt().unsqueeze(-1) * torch.einsum("ndk,nk->nd", at.noise, drawn)
+            moved = moved + time.sqrt().unsqueeze(-1) * torch.einsum("ndk,nk->nd", at.noise, driven)
         moved = moved.remainder(1.0)
-        chance = torch.rand(len(moved), generator=self.generator).to(moved)
         again = (chance < 1.0 - torch.exp(-rho * time)) | ~torch.isfinite(moved).all(dim=-1)
-        self.states = torch.where(again.unsqueeze(-1), self._uniform(len(moved), moved), moved)
-        return time * rho / STEP_TIME
+        return torch.where(again.unsqueeze(-1), fresh, moved), time * rho / STEP_TIME
 
     def _uniform(self, count: int, like: Tensor) -> Tensor:
         return torch.rand(count, self.problem.dim, generator=self.generator).to(like)

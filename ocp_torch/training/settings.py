@@ -30,6 +30,7 @@ class TrainerSettings:
     max_seconds: float | None  # stop training after so many seconds, those before a resume included; null for never
     figures: bool  # draw figures at the end and in TensorBoard
     progress: bool  # a progress bar, where the output is a terminal
+    graphs: bool = True  # on a GPU, steps are replayed from CUDA graphs; runs from before there were any do not say
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "log_every"):
@@ -37,7 +38,7 @@ class TrainerSettings:
         require_integer("trainer.rounds", self.rounds, 1, maximum=16)
         require_number("trainer.good_gap", self.good_gap, above=0.0)
         require_integer("trainer.threads", self.threads, 1, maximum=MOST_THREADS)
-        for name in ("figures", "progress"):
+        for name in ("graphs", "figures", "progress"):
             require_flag(f"trainer.{name}", getattr(self, name))
         for name in ("evaluate_every", "checkpoint_every"):
             require_integer(f"trainer.{name}", getattr(self, name), 0)

@@ -106,3 +106,23 @@ def test_a_sobol_stream_goes_on_past_what_is_buffered_and_never_repeats_itself(m
     assert len(rows(x)) == len(x)
     engine = scrambled_sobol(10_000, 2, derive_seed(0, Branch.TRAINING, 1), torch.float64)
     assert torch.equal(x[10_000:20_000], engine)
+
+
+@each_precision
+def test_points_made_on_a_device_are_those_of_the_engine(dtype, device):
+    """From anywhere in a scrambling, to its end."""
+    drawn, made = (SobolSampler(5, 3, dtype) for _ in range(2))
+    x = drawn.draw(samplers.SOBOL_BLOCK)
+    for position, count in ((0, 1), (0, 7), (1000, 24), (samplers.SOBOL_BLOCK - 9, 9)):
+        found = made._made(0, position, count, device)
+        assert found.device.type == device.type
+        assert torch.equal(found.cpu(), x[position : position + count])
+
+
+def test_a_device_draws_the_same_states_however_many(device, monkeypatch):
+    monkeypatch.setattr(samplers, "SOBOL_BLOCK", 64)
+    monkeypatch.setattr(samplers, "MANY", 60)
+    here, there = (SobolSampler(2, 1, torch.float32) for _ in range(2))
+    for count in (10, 50, 130, 3):
+        assert torch.equal(there.draw(count, device).cpu(), here.draw(count))
+    assert here.state_dict() == there.state_dict()

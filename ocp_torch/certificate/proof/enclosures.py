@@ -123,7 +123,7 @@ def manufactured_enclosure(problem: Manufactured, box: Box) -> Enclosure | None:
     V0, slope = polynomial_model(problem.V0, box), gradient_model(problem.V0, box)
     mu, mu0 = polynomial_model(problem.mu, box), polynomial_model(problem.mu0, box)
     flux = gradient_model(problem.phi, box) * rho + TaylorModel.stack(
-        [polynomial_model(h, box) for h in problem.stream]
+        [polynomial_model(h, box) for h in problem.stream.components]
     )
     sigma = constant_noise(problem, box) if problem.sigma is None else matrix_model(problem.sigma, box)
     if sigma is not None:

@@ -108,7 +108,8 @@ def require_made(problem: Problem) -> None:
     require_number("problem.discount", problem.discount, above=0.0)
     require_number("problem.exponent", problem.exponent, above=1.0, at_most=2.0)
     expected = control_cost(problem.exponent, problem.control_limit)
-    if type(problem.control_cost) is type(expected) and vars(problem.control_cost) != vars(expected):
+    cost = problem.control_cost
+    if type(cost) is type(expected) and (cost.q, cost.limit) != (expected.q, expected.limit):
         raise ProblemError(
             f"{named(problem)} changes exponent or control_limit after super().__init__, which has made the control cost of "
             "them; give both to super().__init__."

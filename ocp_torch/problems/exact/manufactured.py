@@ -17,7 +17,12 @@ from ocp_torch.errors import InputError, require_flag, require_integer, require_
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.control_limit import Limit
-from ocp_torch.problems.exact.trigonometric import TrigonometricPolynomial, WavyMatrix, random_polynomial
+from ocp_torch.problems.exact.trigonometric import (
+    TrigonometricField,
+    TrigonometricPolynomial,
+    WavyMatrix,
+    random_polynomial,
+)
 from ocp_torch.problems.problem import Problem
 
 # States searched for the extrema of u* and f, and the ascents from the best of them with their steps: the truth claimed is as
@@ -92,7 +97,7 @@ class Manufactured(Problem):
         peak = torch.rand(d, generator=generator, dtype=torch.float64)
         self.mu0 = replace(draw(peak).scaled(self.initial_contrast), constant=1.0)
         self.phi = self.mu0.minus(self.mu).inverse_laplacian()
-        self.stream = [self._stream_component(i, generator) for i in range(d)]
+        self.stream = TrigonometricField([self._stream_component(i, generator) for i in range(d)])
         self.B = WavyMatrix(d, self.control_dim, self.state_dependent_control, generator)
         self.sigma = None
         if self.diffusion is not None and self.state_dependent_noise:
@@ -135,7 +140,7 @@ class Manufactured(Problem):
 
     def _closed_loop(self, x: Tensor) -> Tensor:
         """`g* = (F + div(D mu*)) / mu*`, ``(N, d)``."""
-        flux = self.discount * self.phi.gradient(x) + torch.stack([h(x) for h in self.stream], dim=-1)
+        flux = self.discount * self.phi.gradient(x) + self.stream(x)
         sigma, density = self.noise(x), self.mu(x).unsqueeze(-1)
         if sigma is not None:
             div_D, _ = self.noise_divergences(x)

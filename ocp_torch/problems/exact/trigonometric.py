@@ -6,16 +6,20 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ocp_torch.problems.placed import Placed
+
 TURN = 2.0 * math.pi
 # How far an entry of a matrix goes up and down, relative to its mean: below 1, so that none changes its sign.
 DEPTH = 0.3
 # How far the random part of the mean goes from the identity, in standard deviations, before it is divided by sqrt(d): small
 # enough that the columns stay apart.
 MIX = 0.25
+# Cosines of a vector field taken at once: 32 MiB in float64.
+MOST_COSINES = 2**22
 
 
 @dataclass(frozen=True)
-class TrigonometricPolynomial:
+class TrigonometricPolynomial(Placed):
     """`p(x) = c + sum_j b_j cos(2 pi k_j . x + theta_j)` with integer wave vectors `k_j != 0`.
 
     ``waves`` ``(J, d)``, ``amplitudes`` and ``phases`` ``(J,)``, all float64; evaluated in the precision of `x`.
@@ -56,20 +60,44 @@ class TrigonometricPolynomial:
         return total
 
     def _angle(self, x: Tensor) -> Tensor:
-        return TURN * (x @ self.waves.to(x).T) + self.phases.to(x)
+        return TURN * (x @ self._like(x, "waves", self.waves).T) + self._like(x, "phases", self.phases)
 
     def __call__(self, x: Tensor) -> Tensor:
         """`p(x)`, ``(N,)``."""
-        return self.constant + self._angle(x).cos() @ self.amplitudes.to(x)
+        return self.constant + self._angle(x).cos() @ self._like(x, "amplitudes", self.amplitudes)
 
     def gradient(self, x: Tensor) -> Tensor:
         """`grad p(x)`, ``(N, d)``."""
-        return (-TURN * self.amplitudes.to(x) * self._angle(x).sin()) @ self.waves.to(x)
+        slopes = -TURN * self._like(x, "amplitudes", self.amplitudes) * self._angle(x).sin()
+        return slopes @ self._like(x, "waves", self.waves)
 
     def hessian(self, x: Tensor) -> Tensor:
         """Second derivatives of `p`, ``(N, d, d)``."""
-        curvatures = -(TURN**2) * self.amplitudes.to(x) * self._angle(x).cos()
-        return torch.einsum("nj,ji,jk->nik", curvatures, self.waves.to(x), self.waves.to(x))
+        curvatures = -(TURN**2) * self._like(x, "amplitudes", self.amplitudes) * self._angle(x).cos()
+        waves = self._like(x, "waves", self.waves)
+        return torch.einsum("nj,ji,jk->nik", curvatures, waves, waves)
+
+
+class TrigonometricField(Placed):
+    """A vector field of polynomials ``components``, of equally many terms each."""
+
+    def __init__(self, components: list[TrigonometricPolynomial]) -> None:
+        self.components = components
+        self._waves = torch.cat([p.waves for p in components])
+        self._phases = torch.cat([p.phases for p in components])
+        self._amplitudes = torch.stack([p.amplitudes for p in components])
+        self._constants = torch.tensor([p.constant for p in components], dtype=torch.float64)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """All components, ``(N, len(components))``."""
+        most = max(1, MOST_COSINES // max(1, len(self._phases)))
+        return torch.cat([self._at(part) for part in x.split(most)])
+
+    def _at(self, x: Tensor) -> Tensor:
+        turns, phases = x @ self._like(x, "waves", self._waves).T, self._like(x, "phases", self._phases)
+        cosines = (TURN * turns + phases).cos().unflatten(1, self._amplitudes.shape)
+        amplitudes = self._like(x, "amplitudes", self._amplitudes)
+        return self._like(x, "constants", self._constants) + torch.einsum("nij,ij->ni", cosines, amplitudes)
 
 
 def random_polynomial(
@@ -101,7 +129,7 @@ def _random_waves(dim: int, interaction: int, count: int, generator: torch.Gener
     return waves
 
 
-class WavyMatrix:
+class WavyMatrix(Placed):
     r"""`B_ik(x) = M_ik (1 + DEPTH cos 2 pi (x_c + phase))` with a coordinate `c` and a phase for each entry, or `B = M`.
 
     ``mean`` is `M` ``(d, m)``; ``phase`` ``(d, m)`` in turns; ``coordinate`` ``(d, m)``; without ``varies`` it is constant.
@@ -117,29 +145,29 @@ class WavyMatrix:
 
     def __call__(self, x: Tensor) -> Tensor:
         """`B(x)`, ``(N, d, m)``."""
-        mean = self.mean.to(x)
+        mean = self._like(x, "mean", self.mean)
         return mean * (1.0 + DEPTH * self._angle(x).cos()) if self.varies else mean.expand(len(x), -1, -1)
 
     def slopes(self, x: Tensor) -> Tensor:
         """The derivative of each entry along its coordinate, ``(N, d, m)``."""
         if not self.varies:
             return x.new_zeros(len(x), *self.mean.shape)
-        return -2.0 * DEPTH * torch.pi * self.mean.to(x) * self._angle(x).sin()
+        return -2.0 * DEPTH * torch.pi * self._like(x, "mean", self.mean) * self._angle(x).sin()
 
     def curvatures(self, x: Tensor) -> Tensor:
         """The second derivative of each entry along its coordinate, ``(N, d, m)``."""
         if not self.varies:
             return x.new_zeros(len(x), *self.mean.shape)
-        return -DEPTH * (2.0 * torch.pi) ** 2 * self.mean.to(x) * self._angle(x).cos()
+        return -DEPTH * (2.0 * torch.pi) ** 2 * self._like(x, "mean", self.mean) * self._angle(x).cos()
 
     def directions(self, x: Tensor) -> Tensor:
         """1 at `[i, k, c]` for the coordinate `c` of entry `(i, k)`, else 0: ``(d, m, d)``."""
-        return torch.nn.functional.one_hot(self.coordinate.to(x.device), len(self.mean)).to(x)
+        return (self._at(x).unsqueeze(-1) == torch.arange(len(self.mean), device=x.device)).to(x)
 
     def divergence(self, x: Tensor) -> Tensor:
         """Of each column, ``(N, m)``: entry `(i, k)` counts where it varies with coordinate `i`."""
         rows = torch.arange(len(self.mean), device=x.device).unsqueeze(-1)
-        return (self.slopes(x) * (self.coordinate.to(x.device) == rows)).sum(dim=1)
+        return (self.slopes(x) * (self._at(x) == rows)).sum(dim=1)
 
     def square_divergences(self, x: Tensor) -> tuple[Tensor, Tensor]:
         r"""`div D` ``(N, d)`` and `div div D` ``(N,)`` of `D = B B^T / 2`, by the product rule."""
@@ -152,4 +180,8 @@ class WavyMatrix:
         return rows, bent + 0.5 * columns.square().sum(-1) + 0.5 * torch.einsum("nijk,njik->n", turned, turned)
 
     def _angle(self, x: Tensor) -> Tensor:
-        return TURN * (x[:, self.coordinate.to(x.device)] + self.phase.to(x))
+        at = x.index_select(1, self._at(x).flatten()).unflatten(1, self.coordinate.shape)
+        return TURN * (at + self._like(x, "phase", self.phase))
+
+    def _at(self, x: Tensor) -> Tensor:
+        return self._like(x, "coordinate", self.coordinate)

@@ -34,6 +34,7 @@ class Chart(Placed):
         boxed = [(i, c) for i, c in enumerate(coordinates) if isinstance(c, Interval)]
         self.boxed = [i for i, _ in boxed]
         self.volume = float(self.length.prod())
+        self._rows = torch.tensor(self.boxed, dtype=torch.long)
         self._half = torch.tensor([0.5 * (c.high - c.low) for _, c in boxed], dtype=torch.float64)
         self._seam = torch.tensor([c.seam for _, c in boxed], dtype=torch.float64)
 
@@ -83,7 +84,7 @@ class Chart(Placed):
             return torch.ones_like(s[:, 0]), slope
         z = self._beyond(s)
         steps = smooth_step(z)
-        side = (s - self._like(s, "centre", self.centre))[:, self.boxed].sign() / self._like(s, "seam", self._seam)
+        side = self._from_centre(s).sign() / self._like(s, "seam", self._seam)
         for k, i in enumerate(self.boxed):
             rest = torch.cat([steps[:, :k], steps[:, k + 1 :]], dim=-1).prod(dim=-1)
             slope[:, i] = -30.0 * (z[:, k] * (1.0 - z[:, k])).square() * side[:, k] * rest
@@ -91,12 +92,16 @@ class Chart(Placed):
 
     def _beyond(self, s: Tensor) -> Tensor:
         """How far each interval's coordinate is between its end and the seam, 0 to 1, ``(N, K)``."""
-        off = (s - self._like(s, "centre", self.centre))[:, self.boxed].abs()
+        off = self._from_centre(s).abs()
         return ((off - self._like(s, "half", self._half)) / self._like(s, "seam", self._seam)).clamp(0.0, 1.0)
+
+    def _from_centre(self, s: Tensor) -> Tensor:
+        """How far each interval's coordinate is from the middle, ``(N, K)``."""
+        return (s - self._like(s, "centre", self.centre)).index_select(1, self._like(s, "rows", self._rows))
 
     def outside(self, s: Tensor) -> Tensor:
         """Whether states ``(N, d)`` are beyond the end of an interval, ``(N,)``."""
-        off = (s - self._like(s, "centre", self.centre))[:, self.boxed].abs()
+        off = self._from_centre(s).abs()
         return (off > self._like(s, "half", self._half) * (1.0 + ROUNDING)).any(dim=-1)
 
     def nearest(self, s: Tensor) -> Tensor:

@@ -84,10 +84,12 @@ class _Ranges(Placed):
         self.middle = torch.zeros(len(chart.coordinates), dtype=torch.float64)
         self.middle[self.columns] = 0.5 * (low + high)
         self.half = 0.5 * (high - low)
+        self._columns = torch.tensor(self.columns, dtype=torch.long)
 
     def __call__(self, s: Tensor) -> Tensor:
         half = self._like(s, "half", self.half)
-        off = self.chart.wrapped(s - self._like(s, "middle", self.middle))[:, self.columns].abs()
+        off = self.chart.wrapped(s - self._like(s, "middle", self.middle))
+        off = off.index_select(1, self._like(s, "columns", self._columns)).abs()
         edge = 2.0 * EDGE * half
         factors = smooth_step((off - (half - edge)) / edge) / (2.0 * half - edge)
         return self.whole * factors.prod(dim=-1)

@@ -58,9 +58,9 @@ class DoubleIntegrator(System):
         rho = require_number("problem.discount", discount, above=0.0)
         A, Q = torch.zeros(2, 2).double(), torch.tensor([self.position_weight, self.velocity_weight]).double().diag()
         A[0, 1] = 1.0
-        pushed = torch.tensor([[0.0], [1.0 / self.mass]], dtype=torch.float64)
-        D = 0.5 * self.force_noise**2 * pushed @ pushed.T
-        self.plane = LinearQuadratic(A, pushed / self.force_weight**0.5, Q, D, rho)
+        self._pushed = torch.tensor([[0.0], [1.0 / self.mass]], dtype=torch.float64)
+        D = 0.5 * self.force_noise**2 * self._pushed @ self._pushed.T
+        self.plane = LinearQuadratic(A, self._pushed / self.force_weight**0.5, Q, D, rho)
         position, velocity = self.box
         seams = (1.0 + 2.0 * MARGIN) * torch.tensor([[position, velocity], [position, -velocity]], dtype=torch.float64)
         enough = float(self.plane.value(seams).max()) + self.plane.constant
@@ -102,7 +102,7 @@ class DoubleIntegrator(System):
 
     def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:
         a = torch.stack([s[:, 1], torch.zeros_like(s[:, 1])], dim=-1)
-        return a, s.new_tensor([[0.0], [1.0 / self.mass]]).expand(len(s), 2, 1)
+        return a, self._like(s, "pushed", self._pushed).expand(len(s), 2, 1)
 
     def disturbance(self, s: Tensor) -> Tensor | None:
         return self.force_noise * self.dynamics(s)[1] if self.force_noise else None

@@ -58,6 +58,7 @@ class DoublePendulum(System):
     ) -> None:
         pair = lambda name, value: require_numbers(f"problem.{name}", value, 2)
         self.masses, self.lengths = pair("masses", masses), pair("lengths", lengths)
+        self._lengths = torch.tensor(self.lengths, dtype=torch.float64).unsqueeze(-1)
         self.centres, self.inertias = pair("centres", centres), pair("inertias", inertias)
         self.damping, self.max_speeds = pair("damping", damping), pair("max_speeds", max_speeds)
         for name in ("masses", "lengths", "centres", "inertias", "max_speeds"):
@@ -136,7 +137,7 @@ class DoublePendulum(System):
     def joints(self, s: Tensor) -> Tensor:
         """Shoulder, elbow and tip in m, up positive, ``(N, 3, 2)``."""
         angles = torch.stack([s[:, 0], s[:, 0] + s[:, 1]], dim=-1)
-        links = torch.stack([-angles.sin(), angles.cos()], dim=-1) * s.new_tensor(self.lengths).unsqueeze(-1)
+        links = torch.stack([-angles.sin(), angles.cos()], dim=-1) * self._like(s, "lengths", self._lengths)
         return torch.cat([torch.zeros_like(links[:, :1]), links.cumsum(dim=1)], dim=1)
 
 

@@ -84,7 +84,10 @@ class Linkage(Reaching):
         if not self.obstacles:
             return cost
         balls = self._like(s, "balls", self._balls)
-        along = torch.arange(1, self.points_per_link + 1).to(s).unsqueeze(-1) / self.points_per_link
+        along = (
+            torch.arange(1, self.points_per_link + 1, dtype=s.dtype, device=s.device).unsqueeze(-1)
+            / self.points_per_link
+        )
         points = joints[:, :-1].unsqueeze(2) + along * joints.diff(dim=1).unsqueeze(2)  # (N, links, points, c)
         square = (points.unsqueeze(-2) - balls[:, :-1]).square().sum(dim=-1)
         missed = (1.0 - bump(square, balls[:, -1] + self.clearance)).flatten(1, 2).prod(dim=1)  # (N, obstacles)

@@ -82,8 +82,8 @@ class Pendulum(System):
         self.square_cost = require_flag("problem.square_cost", square_cost)
         self.torque_noise = require_number("problem.torque_noise", torque_noise, at_least=0.0)
         self._pull = 1.5 * self.gravity / self.length
-        self._push = 3.0 / (self.mass * self.length**2)
-        self.disturb(torch.tensor([[0.0], [self._push * self.torque_noise]], dtype=torch.float64))
+        self._pushed = torch.tensor([[0.0], [3.0 / (self.mass * self.length**2)]], dtype=torch.float64)
+        self.disturb(self.torque_noise * self._pushed)
         self._scale = 0.5 / (self.torque_cost * self.max_torque**2)
         self._square_at_seam = float(self._square(torch.tensor(self.seam, dtype=torch.float64)))
         largest = math.pi**2 if self.square_cost else 4.0
@@ -112,8 +112,8 @@ class Pendulum(System):
 
     def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:
         angle, velocity = s.unbind(-1)
-        push = s.new_tensor([[0.0], [self._push]]).expand(len(s), 2, 1)
-        return torch.stack([velocity, self._pull * angle.sin()], dim=-1), push
+        a = torch.stack([velocity, self._pull * angle.sin()], dim=-1)
+        return a, self._like(s, "pushed", self._pushed).expand(len(s), 2, 1)
 
     def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
         """The state of Pendulum-v1 that shows `(cos theta, sin theta, theta')`; speeds beyond the seam are taken at it."""

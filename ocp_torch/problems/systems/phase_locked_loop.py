@@ -73,4 +73,4 @@ class PhaseLockedLoop(System):
 
     def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:
         a = torch.stack([s[:, 1], torch.zeros_like(s[:, 1])], dim=-1)
-        return a, -torch.eye(2).to(s).expand(len(s), 2, 2)
+        return a, -torch.eye(2, dtype=s.dtype, device=s.device).expand(len(s), 2, 2)

@@ -87,9 +87,10 @@ class RobotArm(Linkage):
     def _frames(self, s: Tensor) -> tuple[Tensor, list[Tensor]]:
         """What `joints` gives, and the frame that each joint turns in, `n` times ``(N, 3, 3)``."""
         angle = s[..., None, None]
+        eye = torch.eye(3, dtype=s.dtype, device=s.device)
         fixed, K = self._like(s, "fixed", self._fixed), self._like(s, "turners", self._turners)
-        turns = torch.eye(3).to(s) + angle.sin() * K + (1.0 - angle.cos()) * (K @ K)
-        rotation, at = torch.eye(3).to(s).expand(len(s), 3, 3), s.new_zeros(len(s), 3)
+        turns = eye + angle.sin() * K + (1.0 - angle.cos()) * (K @ K)
+        rotation, at = eye.expand(len(s), 3, 3), s.new_zeros(len(s), 3)
         points, held = [at], []
         for i in range(self.dim + 1):
             at = at + rotation @ fixed[i, :, 3]

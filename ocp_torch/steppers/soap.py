@@ -1,0 +1,88 @@
+"""SOAP of `pytorch_optimizer`, with steps that can be replayed (see `ocp_torch.maths.replays`)."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from pytorch_optimizer import SOAP
+from torch import Tensor
+
+from ocp_torch.maths.cores import side_by_side
+from ocp_torch.maths.replays import Called
+
+
+class ReplayedSOAP(SOAP):
+    """Where functions are captured, what changes from step to step without the device knowing stays outside of what is: the
+    learning rate, its correction for a short memory, and every so many steps new eigenbases. The arithmetic is `SOAP`'s."""
+
+    replay = Called()
+    _moving = False
+
+    @torch.no_grad()
+    def step(self, closure: Callable | None = None) -> Any:
+        if not self.replay.captures:
+            return super().step(closure)
+        (group,) = self.param_groups
+        self.init_group(group)
+        group["step"] += 1
+        steps = group["step"] - 1
+        if not steps:
+            return None
+        first, second = group["betas"]
+        rate = group["lr"] * math.sqrt(self.debias(second, steps)) / self.debias(first, steps)
+        moved = [p for p in group["params"] if p.grad is not None]
+        like = moved[0]
+        self.replay("optimizer", self._move, [self.replay.number(rate, like), *(p.grad for p in moved)], pure=False)
+        if steps % group["precondition_frequency"] == 0:
+            side_by_side(lambda p: self._refresh(self.state[p], group), moved)
+        return None
+
+    def _move(self, rate: Tensor, *gradients: Tensor) -> list[Tensor | None]:
+        """A step of the library's at the rate 1, which is then multiplied by ``rate``."""
+        (group,) = self.param_groups
+        moved = [p for p in group["params"] if p.grad is not None]
+        own = [p.grad for p in moved]
+        kept = {name: group[name] for name in ("lr", "correct_bias", "step")}
+        before = [p.clone() for p in moved]
+        group.update(lr=1.0, correct_bias=False, step=1)
+        self._moving = True
+        try:
+            for p, gradient in zip(moved, gradients, strict=True):
+                p.grad = gradient
+            SOAP.step(self)
+        finally:
+            self._moving = False
+            group.update(kept)
+            for p, gradient in zip(moved, own, strict=True):
+                p.grad = gradient
+        torch._foreach_sub_(moved, before)
+        torch._foreach_mul_(moved, rate)
+        torch._foreach_add_(moved, before)
+        return []
+
+    def get_orthogonal_matrix_qr(self, state: dict, *options: Any) -> list:
+        """As `SOAP` has it; during a move, the eigenbases there are."""
+        return state["Q"] if self._moving else super().get_orthogonal_matrix_qr(state, *options)
+
+    def _refresh(self, state: dict, group: dict) -> None:
+        """New eigenbases where the old ones were in memory, found on the CPU: a GPU takes longer for matrices that small."""
+        with torch.no_grad():  # each thread decides for itself
+            self._refreshed(state, group)
+
+    def _refreshed(self, state: dict, group: dict) -> None:
+        host = {name: _on_cpu(state[name]) for name in ("GG", "Q", "exp_avg_sq")}
+        bases = self.get_orthogonal_matrix_qr(host, group["max_precondition_dim"], group["merge_dims"])
+        state["exp_avg_sq"].copy_(host["exp_avg_sq"])
+        for old, new in zip(state["Q"], bases, strict=True):
+            if len(old):
+                old.copy_(new)
+
+    def load_state_dict(self, state_dict: dict) -> None:
+        super().load_state_dict(state_dict)
+        self.replay.forget()  # what was captured reads the tensors of before
+
+
+def _on_cpu(value: Any) -> Any:
+    """The tensors in ``value``, of lists too, on the CPU."""
+    return value.cpu() if isinstance(value, Tensor) else [_on_cpu(v) for v in value]

@@ -1,0 +1,110 @@
+"""Replays of functions, with captures that are calls in disguise where there is no GPU."""
+
+import pytest
+import torch
+
+from ocp_torch.maths import replays
+from ocp_torch.maths.replays import CudaRecorder, Recorder, Replays, decided
+
+
+def recorder(device):
+    return CudaRecorder() if device.type == "cuda" else Recorder()
+
+
+class Counted(Recorder):
+    """Counts calls and captures."""
+
+    def __init__(self):
+        self.calls = self.captures = 0
+
+    def call(self, function):
+        self.calls += 1
+        return super().call(function)
+
+    def capture(self, function):
+        self.captures += 1
+        return super().capture(function)
+
+
+def test_from_the_third_call_on_it_is_replayed_into_the_same_tensors(device):
+    replay = Replays(recorder(device))
+    found = [
+        replay("square", lambda x, _: [x * x, None], [torch.full((3,), float(k), device=device), None])
+        for k in range(6)
+    ]
+    assert [float(f[0][0]) for f in found[:2]] == [0.0, 1.0]
+    assert all(f[0] is found[2][0] for f in found[3:])
+    assert float(found[2][0][0]) == 25.0
+    assert found[5][1] is None
+
+
+def test_captures_are_of_one_function_and_one_form_of_inputs():
+    counted = Counted()
+    replay = Replays(counted)
+    for _ in range(5):
+        assert float(replay("a", lambda x: [x.sum()], [torch.ones(2)])[0]) == 2.0
+        assert float(replay("a", lambda x: [x.sum()], [torch.ones(3)])[0]) == 3.0
+        assert float(replay("b", lambda x: [x.prod()], [torch.ones(3)])[0]) == 1.0
+    assert counted.captures == 3
+    replay.forget()
+    replay("a", lambda x: [x.sum()], [torch.ones(2)])
+    assert counted.captures == 3
+
+
+def test_what_is_expanded_is_placed_once(device):
+    replay = Replays(recorder(device))
+    column = lambda k: torch.full((1, 2), float(k), device=device).expand(5, 2)
+    for k in range(5):
+        assert float(replay("sum", lambda x: [x.sum()], [column(k)])[0]) == 10.0 * k
+
+
+def test_a_course_that_changes_is_taken_as_it_is(device):
+    """Also where the first answers were others, and where they change again and again."""
+    replay = Replays(recorder(device))
+    function = lambda x: [x + 1.0 if decided((x > 0).all()) else x - 1.0]
+    for sign in (1, 1, 1, 1, -1, 1, -1, -1, -1, -1, 1, 1, -1, 1, -1, 1, -1):
+        assert float(replay("sign", function, [torch.full((2,), float(sign), device=device)])[0][0]) == 2.0 * sign
+
+
+def test_outside_of_replays_a_question_is_answered_at_once():
+    assert decided(torch.tensor(7)) == 7
+    assert decided(torch.tensor(True)) == 1
+
+
+def test_what_cannot_be_captured_is_called(caplog):
+    class Unable(Recorder):
+        def capture(self, function):
+            raise RuntimeError("operation not permitted when stream is capturing")
+
+    replay = Replays(Unable())
+    with caplog.at_level("DEBUG", logger=replays.__name__):
+        for k in range(6):
+            assert float(replay("square", lambda x: [x * x], [torch.tensor(float(k))])[0]) == k * k
+    assert caplog.text.count("is not captured") == 1
+
+
+@pytest.mark.parametrize(
+    "function", [lambda x: [x + torch.rand(())], lambda x: [x + next(NUMBERS)]], ids=["torch", "python"]
+)
+def test_what_draws_random_numbers_is_called(function):
+    """A replay would draw the same again; here it is seen as it differs from a call."""
+    counted = Counted()
+    replay = Replays(counted)
+    found = {float(replay("noisy", function, [torch.zeros(())])[0]) for _ in range(12)}
+    assert len(found) == 12
+    assert counted.captures == 1
+
+
+NUMBERS = iter(range(1000))
+
+
+def test_an_impure_function_runs_once_a_call(device):
+    replay, total = Replays(recorder(device)), torch.zeros((), device=device)
+
+    def add(x):
+        total.add_(x)
+        return []
+
+    for k in range(6):
+        replay("add", add, [torch.full((), float(k), device=device)], pure=False)
+    assert float(total) == (15.0 if device.type == "cuda" else 17.0)  # the disguised capture of k = 2 runs it
