@@ -3,7 +3,8 @@ kernels, each of which takes longer to be started than to run, and a graph start
 
 A captured function runs as it did when it was captured. What it reads beside its tensors must stay where it is in memory, or
 be a constant; it draws no random numbers and never waits for the device. Where the course of a computation depends on
-numbers, it asks `decided`, and each replay checks that it would be answered the same.
+numbers, it asks `decided`, and each replay checks that it would be answered the same. Tensors that it makes of Python's
+numbers, or brings from the host, are those of the call before.
 """
 
 import contextvars
@@ -14,6 +15,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 log = logging.getLogger(__name__)
 
@@ -24,6 +26,8 @@ Function = Callable[..., Columns]
 CALLS_FIRST = 2
 # Captures after which a function whose course keeps changing is called as it is.
 MOST_CAPTURES = 3
+# They make a tensor of numbers of Python's.
+MAKERS = {torch.tensor, torch.as_tensor, Tensor.new_tensor}
 # A replay and a call differ by rounding at most. In float32, relative to the largest entry.
 ROUNDING = 1e-3
 
@@ -89,14 +93,15 @@ class _Replayed:
 
     def __call__(self, function: Function, inputs: Columns, pure: bool) -> list[Tensor | None]:
         self.calls += 1
-        if self.replay is None and (self.calls <= CALLS_FIRST or self.captures >= MOST_CAPTURES):
-            return self._called(function, inputs)
-        if self.replay is None and not self._captured(function, inputs, pure):
-            return self._called(function, inputs)
+        if self.replay is None:
+            if self.captures >= MOST_CAPTURES:
+                return list(function(*inputs))
+            if self.calls <= CALLS_FIRST or not self._captured(function, inputs, pure):
+                return self._called(function, inputs)
         _place(self.inputs, inputs)
         assert self.replay is not None
         *found, answers = self.replay()
-        if answers is not None and answers.tolist() != self.answers:
+        if answers is not None and answers.tolist() != self.asked.answers:
             # Nothing was changed yet: a function that is not pure asks for no decision.
             self.replay = None
             return self._called(function, inputs)
@@ -105,7 +110,7 @@ class _Replayed:
     def _called(self, function: Function, inputs: Columns) -> list[Tensor | None]:
         with _asking(_Asked()) as asked:
             found = self.recorder.call(lambda: list(function(*inputs)))
-        self.answers = asked.answers
+        self.asked = asked
         return found
 
     def _captured(self, function: Function, inputs: Columns, pure: bool) -> bool:
@@ -114,7 +119,7 @@ class _Replayed:
         self.inputs = list(inputs)
 
         def whole() -> list[Tensor | None]:
-            with _asking(_Told(self.answers)) as told:
+            with _asking(_Told(self.asked)) as told:
                 found = list(function(*self.inputs))
             return [*found, torch.stack(told.tensors) if told.tensors else None]
 
@@ -175,26 +180,53 @@ class CudaRecorder(Recorder):
         return replay
 
 
-class _Asked:
-    """Answers questions by looking, and remembers what it said."""
+class _Asked(TorchFunctionMode):
+    """Answers questions by looking, and remembers what it said, and the constants that were made."""
 
     def __init__(self) -> None:
-        self.answers: list = []
+        super().__init__()
+        self.answers: list[int] = []
+        self.constants: list[Tensor] = []
 
-    def answer(self, asked: Tensor) -> Any:
+    def answer(self, asked: Tensor) -> int:
         self.answers.append(int(asked))
         return self.answers[-1]
 
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        found = func(*args, **(kwargs or {}))
+        if _makes(func, args) or func is Tensor.to and args[0].device != found.device:
+            self.constants.append(found.clone())
+        return found
 
-class _Told:
-    """Answers questions as they were answered before, and keeps them, to be checked."""
 
-    def __init__(self, answers: list) -> None:
-        self.answers, self.tensors = answers, []  # type: ignore[var-annotated]
+class _Told(TorchFunctionMode):
+    """Answers questions as they were ``before``, keeping them to be checked, and gives out the constants of then."""
 
-    def answer(self, asked: Tensor) -> Any:
+    def __init__(self, before: _Asked) -> None:
+        super().__init__()
+        self.answers, self.constants, self.tensors = before.answers, iter(before.constants), []  # type: ignore[var-annotated]
+
+    def answer(self, asked: Tensor) -> int:
         self.tensors.append(asked.long())
         return self.answers[len(self.tensors) - 1]
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if _makes(func, args) or func is Tensor.to and args[0].is_cpu and _goes(args[1:], kwargs):
+            return next(self.constants).clone()  # whoever was given it may change it
+        return func(*args, **(kwargs or {}))
+
+
+def _makes(func: Any, args: Any) -> bool:
+    """Whether a tensor is made of Python's numbers."""
+    data = args[1:2] if func is Tensor.new_tensor else args[:1]
+    return func in MAKERS and len(data) == 1 and not isinstance(data[0], Tensor)
+
+
+def _goes(args: Any, kwargs: Any) -> bool:
+    """Whether `Tensor.to` with these arguments leads from the CPU to another device."""
+    given = [*args, *(kwargs or {}).values()]
+    devices = [a.device if isinstance(a, Tensor) else a for a in given if isinstance(a, Tensor | torch.device | str)]
+    return any(torch.device(d).type != "cpu" for d in devices)
 
 
 _oracle: contextvars.ContextVar[_Asked | _Told | None] = contextvars.ContextVar("oracle", default=None)
@@ -204,7 +236,8 @@ _oracle: contextvars.ContextVar[_Asked | _Told | None] = contextvars.ContextVar(
 def _asking(oracle: Any) -> Iterator[Any]:
     token = _oracle.set(oracle)
     try:
-        yield oracle
+        with oracle:
+            yield oracle
     finally:
         _oracle.reset(token)
 

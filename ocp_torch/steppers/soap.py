@@ -32,10 +32,11 @@ class ReplayedSOAP(SOAP):
         first, second = group["betas"]
         rate = group["lr"] * math.sqrt(self.debias(second, steps)) / self.debias(first, steps)
         moved = [p for p in group["params"] if p.grad is not None]
-        like = moved[0]
-        self.replay("optimizer", self._move, [self.replay.number(rate, like), *(p.grad for p in moved)], pure=False)
+        inputs = [self.replay.number(rate, moved[0]), *(p.grad for p in moved)]
+        self.replay("optimizer", self._move, inputs, pure=False)
         if steps % group["precondition_frequency"] == 0:
-            side_by_side(lambda p: self._refresh(self.state[p], group), moved)
+            refresh = torch.no_grad()(lambda p: self._refresh(self.state[p], group))  # each thread decides for itself
+            side_by_side(refresh, moved)
         return None
 
     def _move(self, rate: Tensor, *gradients: Tensor) -> list[Tensor | None]:
@@ -67,10 +68,6 @@ class ReplayedSOAP(SOAP):
 
     def _refresh(self, state: dict, group: dict) -> None:
         """New eigenbases where the old ones were in memory, found on the CPU: a GPU takes longer for matrices that small."""
-        with torch.no_grad():  # each thread decides for itself
-            self._refreshed(state, group)
-
-    def _refreshed(self, state: dict, group: dict) -> None:
         host = {name: _on_cpu(state[name]) for name in ("GG", "Q", "exp_avg_sq")}
         bases = self.get_orthogonal_matrix_qr(host, group["max_precondition_dim"], group["merge_dims"])
         state["exp_avg_sq"].copy_(host["exp_avg_sq"])

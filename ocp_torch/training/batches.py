@@ -120,9 +120,8 @@ class Batches:
             return [*drawn.columns, None]
         states, *numbers = moves
         visited = self.problem.samples(states, divergences=divergences)
-        moved, spent = self._moved(
-            visited, *numbers
-        )  # of all, on every process: where they go next is the same everywhere
+        # Of all, on every process: where they go next is then the same everywhere.
+        moved, spent = self._moved(visited, *numbers)
         # The drawn states stand for all integrals, as they would without the visited ones; the penalties see both.
         part = self.size / (self.size - len(states))
         drawn = replace(drawn, weight=part * drawn.weight, penalty_weight=drawn.weight)

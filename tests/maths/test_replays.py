@@ -5,6 +5,7 @@ import torch
 
 from ocp_torch.maths import replays
 from ocp_torch.maths.replays import CudaRecorder, Recorder, Replays, decided
+from support.waiting import Waits
 
 
 def recorder(device):
@@ -64,6 +65,24 @@ def test_a_course_that_changes_is_taken_as_it_is(device):
     function = lambda x: [x + 1.0 if decided((x > 0).all()) else x - 1.0]
     for sign in (1, 1, 1, 1, -1, 1, -1, -1, -1, -1, 1, 1, -1, 1, -1, 1, -1):
         assert float(replay("sign", function, [torch.full((2,), float(sign), device=device)])[0][0]) == 2.0 * sign
+
+
+def test_constants_are_made_once(device):
+    """Of Python's numbers, or brought from the host; and whoever is given one may change it."""
+    host = torch.tensor([5.0, 7.0])
+
+    def function(x):
+        twice = x.new_tensor([1.0, 2.0])
+        twice *= 2.0
+        return [x * twice + torch.tensor(3.0, device=x.device) + host.to(x) + torch.as_tensor(x)]
+
+    replay = Replays(recorder(device))
+    at = lambda k: torch.full((2,), float(k), device=device)
+    for k in range(4):
+        assert torch.equal(replay("linear", function, [at(k)])[0].cpu(), torch.tensor([8.0 + 3.0 * k, 10.0 + 5.0 * k]))
+    with Waits() as waits:
+        replay("linear", function, [at(4)])
+    assert waits.seen == set()
 
 
 def test_outside_of_replays_a_question_is_answered_at_once():
