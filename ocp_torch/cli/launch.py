@@ -22,7 +22,7 @@ from ocp_torch.cli.outcome import INTERRUPTED, Record, fail, failures, typed
 from ocp_torch.cli.single import carry_out, checked, require_places_to_write
 from ocp_torch.errors import InputError, require_flag, require_section, shown
 from ocp_torch.files.reading import require_unlinked
-from ocp_torch.maths.ranks import joined
+from ocp_torch.maths.ranks import Left, LostError, joined
 from ocp_torch.problems.commands import ForeignProblem
 from ocp_torch.training.stopping import Preempted
 
@@ -60,7 +60,12 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
     sys.argv[1:] = with_own_defaults(config_name, sys.argv[1:])
     options = [a for a in sys.argv[1:] if a.startswith("-")]
     overrides = [a for a in sys.argv[1:] if not a.startswith("-")]
-    ranks = joined()
+    try:
+        ranks = joined()
+    except Left:  # it told why
+        sys.exit(0)
+    except LostError as error:
+        fail(str(error))
     if not ranks.first:
         assist(ranks, lambda: checked(overrides, config_name, check), work)
     try:

@@ -79,15 +79,18 @@ class Alone:
 
 
 class Ranks(Alone):
-    """One of several. A collective raises `LostError` where others are lost, and `Left` where the first one left."""
+    """One of several. To join, and a collective, raise `LostError` where others are lost, and `Left` where the first left."""
 
     def __init__(self, store: Any, rank: int, size: int) -> None:
         self.first, self.size, self.share = rank == 0, size, slice(rank, None, size)
         self._store, self._said, self._heard = store, list[bool](), list[bool]()
-        dist.init_process_group(
-            "gloo", store=dist.PrefixStore("ocp_torch", store), rank=rank, world_size=size, timeout=WORD
-        )
-        self._steps: Any = dist.new_group(backend="gloo", timeout=STEP)
+        self._steps: Any = None
+        self._together(self._join)  # the first may have left again before this one is connected
+
+    def _join(self) -> None:
+        store, rank = dist.PrefixStore("ocp_torch", self._store), self.share.start
+        dist.init_process_group("gloo", store=store, rank=rank, world_size=self.size, timeout=WORD)
+        self._steps = dist.new_group(backend="gloo", timeout=STEP)
 
     def use(self, device: torch.device) -> None:
         """Raises `InputError` where a GPU would be that of two processes."""
@@ -170,7 +173,8 @@ class Ranks(Alone):
 
 @cache
 def joined() -> Alone:
-    """This process among those that torchrun started with it; each has a GPU of its own, where there are enough."""
+    """This process among those that torchrun started with it; each has a GPU of its own, where there are enough. Raises as
+    `Ranks` does."""
     if "TORCHELASTIC_RUN_ID" not in os.environ or int(os.environ.get("WORLD_SIZE", "1")) < 2:
         return Alone()
     if torch.cuda.is_available():

@@ -167,6 +167,26 @@ def test_what_fails_in_another_process_is_told_by_the_first_which_hands_out_what
     assert (folder / "controller.safetensors").exists()
 
 
+def hurried():
+    import torch.distributed as dist
+
+    connect = dist.new_group
+
+    def left_alone(*args, **kwargs):
+        connect(*args, **kwargs)
+        time.sleep(1.0)
+        raise RuntimeError("Connection closed by peer")
+
+    if os.environ["RANK"] == "1":
+        dist.new_group = left_alone
+
+
+def test_who_finds_the_first_gone_when_it_has_joined_leaves_as_well(tmp_path):
+    first, other = ended(shared(2, *EXACT, "-m", "seed=0,1", cwd=tmp_path, before=hurried))
+    assert "share a single run" in first.sentence
+    assert (other.status, other.stdout, other.stderr) == (0, "", "")
+
+
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
