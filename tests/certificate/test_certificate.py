@@ -97,6 +97,7 @@ def test_a_guessed_M_makes_a_conditional_bound_that_enters_nothing_else():
     assert any("a guess: no gap that counts uses it" in warning for warning in said["warnings"])
 
 
+@pytest.mark.nightly
 def test_a_guess_that_the_controller_s_density_refutes_makes_no_bound_at_all():
     problem = Anonymous(dim=1, contrast=0.9, seed=3)
     certificate = certificate_of(problem, replace(resolve_constants(problem), M=1.1))
@@ -105,6 +106,7 @@ def test_a_guess_that_the_controller_s_density_refutes_makes_no_bound_at_all():
     assert certificate.gap["lower_from"] == "shifted"
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("basis", ["given", "guessed"])
 def test_an_M_that_was_held_against_nothing_makes_nothing_count(basis):
     problem = Anonymous(dim=1)

@@ -54,6 +54,7 @@ def test_on_the_circle_it_costs_what_sampled_feedback_costs(step, variate):
     assert exact > problem.exact_optimum
 
 
+@pytest.mark.nightly
 def test_what_is_thinned_out_is_right_in_the_mean(monkeypatch):
     """On the pendulum, against the same starts followed to the end, and in the mean over seeds."""
     problem = Pendulum(control_limit=1.0)

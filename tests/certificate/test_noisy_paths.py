@@ -17,7 +17,9 @@ from ocp_torch.training.evaluator import QUICK
 from support import zoo
 
 
-@pytest.mark.parametrize(("noise", "efforts"), [(0.02, [4, 4, 16, 4]), (0.0, [16, 16, 4])])
+@pytest.mark.parametrize(
+    ("noise", "efforts"), [(0.02, [4, 4, 16, 4]), pytest.param(0.0, [16, 16, 4], marks=pytest.mark.nightly)]
+)
 def test_with_noise_a_controller_that_is_clearly_worse_is_followed_shortly_even_in_a_quick_look(
     noise, efforts, monkeypatch
 ):

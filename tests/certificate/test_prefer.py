@@ -37,6 +37,7 @@ def test_of_the_lowest_bound(tmp_path):
     assert perf.value == pytest.approx(G.value, rel=0.2)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("prefer", ["simulated", "certified"])
 def test_gaps_are_those_of_each_controller(tmp_path, prefer):
     certificate = session(small(*SMALL, f"certificate.prefer={prefer}"), tmp_path)

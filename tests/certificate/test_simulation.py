@@ -226,6 +226,7 @@ def test_a_density_followed_back_on_several_cores_is_the_same(problem, monkeypat
     torch.testing.assert_close(found(2, True), found(2, False), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("slope", [0.0, pytest.param(0.2, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("starts", [16, pytest.param(64, marks=pytest.mark.nightly)])
 def test_intervals_cover_the_cost_of_a_jump_however_alike_the_replicates(slope, starts):
@@ -379,6 +380,7 @@ class Spinning(Problem):
         return x.new_zeros(len(x), 2, 1)
 
 
+@pytest.mark.nightly
 def test_a_few_fast_trajectories_take_finer_steps_and_the_others_none(monkeypatch):
     """`rho int e^{-rho t} cos(2 pi (y + v t)) dt = (rho^2 cos - rho w sin)(2 pi y) / (rho^2 + w^2)`, `w = 2 pi v`."""
     problem = Spinning()

@@ -282,6 +282,7 @@ def test_the_pendulum_is_gymnasiums_over_a_short_time(theirs):
     assert max(errors[0.005]) < 0.015 * max(errors[0.05]) + 1e-6
 
 
+@pytest.mark.nightly
 def test_a_saved_pendulum_controller_plays_gymnasiums_untouched(gymnasium, tmp_path):
     """The classical swing-up through the same maps: what does not swing up returns about -1200."""
     from ocp_torch.runs.metrics.classical import classical_policy

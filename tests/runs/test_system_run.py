@@ -24,6 +24,7 @@ def run(tmp_path_factory):
         "certificate.trajectories=32",
         "certificate.tolerance=0.01",
         "certificate.replicates=2",
+        "warm_start.mode=off",
         "problem._target_=support.systems.Swing",
         "problem.control_limit=2.0",
     )

@@ -273,6 +273,7 @@ def test_tensorboard_shows_every_group_of_scalars_and_the_exact_optimum(run):
         assert [event.step for event in events.Scalars("loss/value")] == [5, 10, 15, 20]
 
 
+@pytest.mark.nightly
 def test_tensorboard_shows_the_fields_at_each_look_and_at_the_end(tmp_path, monkeypatch):
     monkeypatch.setattr("ocp_torch.runs.run.glimpse", glimpse)
     session(small("method=dual", "trainer.evaluate_every=8", "trainer.figures=true"), tmp_path)

@@ -12,7 +12,6 @@ from ocp_torch.certificate.report import table
 from ocp_torch.certificate.simulated import candidates
 from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.certificate.trained import TrainedContext
-from ocp_torch.certificate.upper.policy_evaluation import StageSettings
 from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.pace import MOVED, Pace
@@ -24,6 +23,7 @@ from ocp_torch.maths.jets import jet
 from ocp_torch.problems import PROBLEMS
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.runs.run import run_to_end
+from ocp_torch.training import evaluator
 from ocp_torch.training.monitor import Silent
 from ocp_torch.training.warm_start.grid import GridValues
 from ocp_torch.training.warm_start.iteration import ValueIteration
@@ -37,6 +37,14 @@ from support.zoo import FEW_SMOOTH, NATURAL, QUIET, fresh, on, states
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
 WARM = ("warm_start.mode=on", "warm_start.rounds=12", "warm_start.pieces=16", "warm_start.steps=4")
 SWING = ("problem=pendulum", "problem.control_limit=1.0")
+# Controllers that are hardly trained take long to simulate, unless little counts of what comes late.
+FEW = (
+    "problem.discount=8",
+    "certificate.points=64",
+    "certificate.replicates=2",
+    "certificate.trajectories=4",
+    "certificate.ascents=2",
+)
 
 
 @pytest.mark.parametrize("trace", [0.0, 0.6, 1.0])
@@ -146,9 +154,9 @@ def test_the_controller_of_the_warm_start_is_a_candidate_and_can_be_handed_out(t
     assert handed_out.certificate.get("held_for") == handed_out.held_for
 
 
+@pytest.mark.nightly
 def test_looks_remember_the_controller_of_the_warm_start_until_its_weights_or_the_seed_change(monkeypatch):
-    trainer = small(*SWING, *WARM, "method=dual")
-    settings = replace(build_certificate_settings(trainer.config), stage=StageSettings(steps=0), occupation_states=0)
+    trainer = small(*SWING, *WARM, *FEW, "method=dual")
     made = []
 
     def simulated(problem, policy, *rest):
@@ -159,7 +167,7 @@ def test_looks_remember_the_controller_of_the_warm_start_until_its_weights_or_th
 
     def looked(seed: int = 0):
         made.clear()
-        found = trainer.evaluator.quick(replace(trainer.run, seed=seed), settings)
+        found = trainer.evaluator.quick(replace(trainer.run, seed=seed), evaluator.QUICK)
         return sum(made), found.perf["trajectories"]
 
     (first, perf), (again, same) = looked(), looked()
@@ -170,8 +178,9 @@ def test_looks_remember_the_controller_of_the_warm_start_until_its_weights_or_th
     assert looked()[0] == 1
 
 
+@pytest.mark.nightly
 def test_no_bound_with_a_divergence_speaks_of_a_controller_that_holds_its_control(monkeypatch):
-    trainer = small(*SWING, *WARM, "method=dual", "certificate.stage.steps=20", "certificate.stage.rounds=1")
+    trainer = small(*SWING, *WARM, *FEW, "method=dual", "certificate.stage.steps=20", "certificate.stage.rounds=1")
     fit = lambda: trainer.certify(build_certificate_settings(trainer.config))
     monkeypatch.setattr(TrainedContext, "kind", "value")
     of_value = fit()
