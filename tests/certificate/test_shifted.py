@@ -218,7 +218,7 @@ def test_a_value_trained_on_for_the_bound_comes_closer_to_the_optimum_from_below
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.MS", (100.0,))
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.RATE", 2e-2)
     monkeypatch.setattr("ocp_torch.certificate.lower.mollified.RADII", (1.0 / 64.0,))
-    for least in ("WORTH", "WORTH_AT_FIRST"):
+    for least in ("WORTH", "WORTH_WITHOUT_NOISE"):
         monkeypatch.setattr(f"ocp_torch.certificate.lower.sampled.{least}", 0.0)
     problem = zoo.build(name)
     value = perturbed(problem)
@@ -315,7 +315,7 @@ def test_rounds_go_on_while_there_is_enough_to_gain(problem, heights, made, monk
 def test_a_second_core_gives_the_same_certificate(name, monkeypatch):
     for steps in ("STEPS", "NOISY_STEPS"):
         monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{steps}", 10)
-    for least in ("WORTH", "WORTH_AT_FIRST"):
+    for least in ("WORTH", "WORTH_WITHOUT_NOISE"):
         monkeypatch.setattr(f"ocp_torch.certificate.lower.sampled.{least}", 0.0)
     problem, threads = zoo.build(name), []
     torch.manual_seed(0)
