@@ -62,7 +62,7 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
     overrides = [a for a in sys.argv[1:] if not a.startswith("-")]
     try:
         ranks = joined()
-    except Left:  # it told why
+    except Left:  # the first process, which tells why
         sys.exit(0)
     except LostError as error:
         fail(str(error))

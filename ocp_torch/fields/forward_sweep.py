@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from ocp_torch.fields.embedding import FourierEmbedding
-from ocp_torch.maths.replays import decided
+from ocp_torch.maths.decisions import decided
 
 
 @dataclass(frozen=True)

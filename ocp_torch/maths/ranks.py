@@ -88,8 +88,8 @@ class Ranks(Alone):
         self._together(self._join)  # the first may have left again before this one is connected
 
     def _join(self) -> None:
-        store, rank = dist.PrefixStore("ocp_torch", self._store), self.share.start
-        dist.init_process_group("gloo", store=store, rank=rank, world_size=self.size, timeout=WORD)
+        store = dist.PrefixStore("ocp_torch", self._store)
+        dist.init_process_group("gloo", store=store, rank=self.share.start, world_size=self.size, timeout=WORD)
         self._steps = dist.new_group(backend="gloo", timeout=STEP)
 
     def use(self, device: torch.device) -> None:

@@ -39,14 +39,16 @@ class Phase:
     @property
     def growth(self) -> Any:
         """The part of `M` that is in force: all of it, but where no `M` is known (see `Dual`)."""
-        if self.growing is not None or not self.constants.unbounded:
-            return 1.0 if self.growing is None else self.growing
-        return LEAST_WEIGHT ** max(0.0, 1.0 - self.progress / GROWTH)
+        if self.growing is not None:
+            return self.growing
+        return LEAST_WEIGHT ** max(0.0, 1.0 - self.progress / GROWTH) if self.constants.unbounded else 1.0
 
     @property
     def form(self) -> tuple:
-        """What the course of a loss may depend on, `progress` apart."""
-        return (*(getattr(self.constants, name) for name in ("M", "C_V", "C_u", "unbounded")), self.shares)
+        """What stays the same for as long as losses are computed alike: all but `progress`, of which they may read `growth`,
+        and `Objective.needs_divergences`."""
+        constants = self.constants
+        return constants.M, constants.C_V, constants.C_u, constants.unbounded, self.shares
 
 
 class Objective(ABC):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError
-from ocp_torch.maths.replays import decided
+from ocp_torch.maths.decisions import decided
 
 if TYPE_CHECKING:
     from ocp_torch.problems.problem import Problem

@@ -13,11 +13,11 @@ from ocp_torch.maths.replays import Called
 
 
 class ReplayedSOAP(SOAP):
-    """Where functions are captured, what changes from step to step without the device knowing stays outside of what is: the
-    learning rate, its correction for a short memory, and every so many steps new eigenbases. The arithmetic is `SOAP`'s."""
+    """`SOAP`, whose moves may go through ``replay``. The learning rate, with its correction for a short memory, is an input
+    of a move then, and new eigenbases are found after it, every so many steps. The arithmetic is that of `SOAP`."""
 
     replay = Called()
-    _moving = False
+    _keeps_bases = False  # during a move
 
     @torch.no_grad()
     def step(self, closure: Callable | None = None) -> Any:
@@ -47,13 +47,13 @@ class ReplayedSOAP(SOAP):
         kept = {name: group[name] for name in ("lr", "correct_bias", "step")}
         before = [p.clone() for p in moved]
         group.update(lr=1.0, correct_bias=False, step=1)
-        self._moving = True
+        self._keeps_bases = True
         try:
             for p, gradient in zip(moved, gradients, strict=True):
                 p.grad = gradient
             SOAP.step(self)
         finally:
-            self._moving = False
+            self._keeps_bases = False
             group.update(kept)
             for p, gradient in zip(moved, own, strict=True):
                 p.grad = gradient
@@ -64,10 +64,11 @@ class ReplayedSOAP(SOAP):
 
     def get_orthogonal_matrix_qr(self, state: dict, *options: Any) -> list:
         """As `SOAP` has it; during a move, the eigenbases there are."""
-        return state["Q"] if self._moving else super().get_orthogonal_matrix_qr(state, *options)
+        return state["Q"] if self._keeps_bases else super().get_orthogonal_matrix_qr(state, *options)
 
     def _refresh(self, state: dict, group: dict) -> None:
-        """New eigenbases where the old ones were in memory, found on the CPU: a GPU takes longer for matrices that small."""
+        """New eigenbases where the old ones were in memory, found on the CPU: there a matrix of 96 or 128 rows takes .24 or
+        .45 ms, copies included, on an H200 .57 or .80."""
         host = {name: _on_cpu(state[name]) for name in ("GG", "Q", "exp_avg_sq")}
         bases = self.get_orthogonal_matrix_qr(host, group["max_precondition_dim"], group["merge_dims"])
         state["exp_avg_sq"].copy_(host["exp_avg_sq"])

@@ -15,7 +15,7 @@ from torch.optim.lr_scheduler import LRScheduler
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.maths.ranks import Alone
-from ocp_torch.maths.replays import Called, replays_on
+from ocp_torch.maths.replays import Called
 from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM, NonFiniteError, first_nonfinite
@@ -69,11 +69,11 @@ class Stepper(ABC):
         self._start = copy.deepcopy(self.state_dict())
         self._moving: dict[tuple, list[str]] = {}  # who has a loss, by the form of the phase
         self.ranks = Alone()  # those with which batches are shared
-        self.replay = replays_on(next(fields.parameters()).device)
+        self.replay = Called()
 
     @property
     def replay(self) -> Called:
-        """How what is the same from step to step is called."""
+        """How losses and moves are called (see `ocp_torch.maths.replays`)."""
         return self._replay
 
     @replay.setter

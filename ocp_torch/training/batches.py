@@ -11,7 +11,7 @@ from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.errors import InputError, require_number
 from ocp_torch.fields import VALUE, Fields
 from ocp_torch.maths.ranks import Alone
-from ocp_torch.maths.replays import replays_on
+from ocp_torch.maths.replays import Called
 from ocp_torch.maths.sampling import ImportanceSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives import Objective, Phase
@@ -63,8 +63,8 @@ class Batches:
             raise InputError(f"sampler.visited is {self.visited:g}, but {lacks}; leave it out.")
         self.generator = torch.Generator().manual_seed(derive_seed(self.seed, Branch.VISITS))
         self.states: Tensor | None = None  # (k, d), where the visited states are now
-        self._noises = 0  # columns of sigma
-        self.replay = replays_on(next(self.fields.parameters()).device)
+        self._noises = 0  # columns of sigma, once known
+        self.replay = Called()  # how the problem is evaluated
 
     def draw(self, phase: Phase) -> Samples:
         """This process's share of the next batch, with what the objective needs at ``phase``, in the precision and on the

@@ -40,7 +40,8 @@ BUDGETS = (
 # Where no M is known the bound is decided by the worst state: that wants more states at once, and, without noise, longer.
 # With noise two and three coordinates want less: after rounds of 600 and 1,200 steps a pendulum's certified gap is .55 % and
 # an arm's 1.0 % at 1e-3, after 900 and 1,800 .45 and .85 %, for 25 s more of 145; dubins has 6.1 (simulated 1.33) after 900
-# and 1,800, 6.8 (1.40) after 1,200 and 2,400; a unicycle 3.0 (1.26) after those, 3.5 (1.19) after 800 and 1,600.
+# and 1,800, 6.8 (1.40) after 1,200 and 2,400; a unicycle 3.0 (1.26) after 900 and
+# 1,800, 3.5 (1.19) after 800 and 1,600.
 LARGE_BATCH, MANY_STEPS, FEW_STEPS = 1024, 1200, {2: 600, 3: 800}
 # In one dimension with noise, where networks are given more modes.
 NOISY_STEPS = 2000

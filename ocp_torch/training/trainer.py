@@ -13,7 +13,7 @@ from ocp_torch.certificate.settings import Progress, silent
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.maths.ranks import Alone, LostError
-from ocp_torch.maths.replays import Called
+from ocp_torch.maths.replays import replays_on
 from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import blamed
@@ -49,8 +49,8 @@ class Trainer:
         self.fields, self.stepper, self.batches = state.fields, state.stepper, state.batches
         self.health, self.names, self.config = state.health, state.names, state.config
         self.trained = Trained(state.average.module, self.objective.occupation, self.network)
-        if not self.settings.graphs:
-            self.stepper.replay = self.batches.replay = Called()
+        if self.settings.graphs:
+            self.stepper.replay = self.batches.replay = replays_on(self.settings.torch_device)
         self.evaluator = Evaluator(self.problem, self.trained, state)
 
     @property

@@ -1,30 +1,19 @@
-"""Replays of functions, with captures that are calls in disguise where there is no GPU."""
+"""Replays of functions; where there is no GPU, of functions that are run again."""
+
+import math
 
 import pytest
 import torch
 
 from ocp_torch.maths import replays
-from ocp_torch.maths.replays import CudaRecorder, Recorder, Replays, decided
+from ocp_torch.maths.decisions import decided
+from ocp_torch.maths.replays import CudaRecorder, Replays
+from support.rerun import Rerun
 from support.waiting import Waits
 
 
 def recorder(device):
-    return CudaRecorder() if device.type == "cuda" else Recorder()
-
-
-class Counted(Recorder):
-    """Counts calls and captures."""
-
-    def __init__(self):
-        self.calls = self.captures = 0
-
-    def call(self, function):
-        self.calls += 1
-        return super().call(function)
-
-    def capture(self, function):
-        self.captures += 1
-        return super().capture(function)
+    return CudaRecorder() if device.type == "cuda" else Rerun()
 
 
 def test_from_the_third_call_on_it_is_replayed_into_the_same_tensors(device):
@@ -40,7 +29,7 @@ def test_from_the_third_call_on_it_is_replayed_into_the_same_tensors(device):
 
 
 def test_captures_are_of_one_function_and_one_form_of_inputs():
-    counted = Counted()
+    counted = Rerun()
     replay = Replays(counted)
     for _ in range(5):
         assert float(replay("a", lambda x: [x.sum()], [torch.ones(2)])[0]) == 2.0
@@ -91,7 +80,7 @@ def test_outside_of_replays_a_question_is_answered_at_once():
 
 
 def test_what_cannot_be_captured_is_called(caplog):
-    class Unable(Recorder):
+    class Unable(Rerun):
         def capture(self, function):
             raise RuntimeError("operation not permitted when stream is capturing")
 
@@ -99,7 +88,7 @@ def test_what_cannot_be_captured_is_called(caplog):
     with caplog.at_level("DEBUG", logger=replays.__name__):
         for k in range(6):
             assert float(replay("square", lambda x: [x * x], [torch.tensor(float(k))])[0]) == k * k
-    assert caplog.text.count("is not captured") == 1
+    assert caplog.text.count("is not replayed") == 1
 
 
 @pytest.mark.parametrize(
@@ -107,7 +96,7 @@ def test_what_cannot_be_captured_is_called(caplog):
 )
 def test_what_draws_random_numbers_is_called(function):
     """A replay would draw the same again; here it is seen as it differs from a call."""
-    counted = Counted()
+    counted = Rerun()
     replay = Replays(counted)
     found = {float(replay("noisy", function, [torch.zeros(())])[0]) for _ in range(12)}
     assert len(found) == 12
@@ -126,4 +115,36 @@ def test_an_impure_function_runs_once_a_call(device):
 
     for k in range(6):
         replay("add", add, [torch.full((), float(k), device=device)], pure=False)
-    assert float(total) == (15.0 if device.type == "cuda" else 17.0)  # the disguised capture of k = 2 runs it
+    assert float(total) == 15.0
+
+
+def test_what_changes_later_for_another_reason_is_noticed_and_said(monkeypatch, caplog):
+    """A problem whose parameters somebody sets, or a loss that reads a clock."""
+    monkeypatch.setattr(replays, "CHECKED", 5)
+    replay, factor = Replays(Rerun()), [2.0]
+    scaled = lambda x: [x * torch.tensor(factor[0])]
+    once = lambda: float(replay("scaled", scaled, [torch.ones(())])[0])
+    assert [once() for _ in range(6)] == [2.0] * 6
+    factor[0] = 3.0  # a replay gives the constant of before
+    found = [once() for _ in range(8)]
+    assert found == sorted(found)
+    assert found[0] == 2.0
+    assert found[-2:] == [3.0, 3.0]
+    assert caplog.text.count("gives something else for the same states") == 1
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "same"),
+    [
+        ([1.0, 2.0], [1.0, 2.0 + 1e-6], True),
+        ([1.0, 2.0], [1.0, 2.001], False),
+        ([0.0, 1e6], [1.0, 1e6], True),  # rounding of the largest
+        ([math.nan, 1.0], [2.0, 1.0], False),
+        ([2.0, 1.0], [math.nan, 1.0], False),
+        ([math.inf, 1.0], [-math.inf, 1.0], False),
+        ([math.nan, math.inf], [math.nan, math.inf], True),
+        ([], [], True),
+    ],
+)
+def test_a_replay_is_a_call_but_for_rounding(left, right, same):
+    assert replays._alike([None, torch.tensor(left)], [None, torch.tensor(right)]) is same

@@ -74,6 +74,7 @@ WRONG = [
     "trainer.dtype=float16",
     "trainer.device=tpu",
     "trainer.figures=perhaps",
+    "trainer.graphs=2",
     "trainer.progress=3",
     *(f"problem.discount={value}" for value in ("-1", "0", "nan", "inf", "abc", "null")),
     *(f"problem=manufactured problem.exponent={value}" for value in ("3", "1", "abc", "true")),

@@ -168,6 +168,7 @@ def test_what_fails_in_another_process_is_told_by_the_first_which_hands_out_what
 
 
 def hurried():
+    """In the child: the second process finds the first gone once they are connected."""
     import torch.distributed as dist
 
     connect = dist.new_group

@@ -8,30 +8,13 @@ import pytest
 import torch
 from torch import nn
 
-from ocp_torch.maths.replays import CudaRecorder, Recorder, Replays
+from ocp_torch.maths.replays import CudaRecorder, Replays
 from ocp_torch.problems import PROBLEMS
 from ocp_torch.steppers import advance, optimizer_maker
 from ocp_torch.steppers.soap import ReplayedSOAP
+from support.rerun import Rerun
 from support.small import METHODS, small
 from support.waiting import Waits
-
-
-class Rerun(Recorder):
-    """Captures nothing, and runs nothing when it is asked to, as a graph does."""
-
-    def capture(self, function):
-        kept = []
-
-        def replay():
-            found = function()
-            if not kept:
-                kept.extend(None if t is None else t.clone() for t in found)
-            for old, new in zip(kept, found, strict=True):
-                if old is not None:
-                    old.copy_(new)
-            return list(kept)
-
-        return replay
 
 
 def replays(trainer):
