@@ -101,8 +101,8 @@ class Average(AveragedModel):
 
     @torch.no_grad()
     def count(self, iterate: Sequence[Tensor]) -> None:
-        """Take ``iterate``, all parameters in the order of those of the fields, into the average: as `update_parameters`
-        would, without its look at each of them."""
+        """Take ``iterate``, all parameters in the order of those of the fields, into the average: what `update_parameters` of
+        a module would do, which takes four times as long on a GPU."""
         own: list[Any] = list(self.module.parameters())
         if self.n_averaged == 0:
             torch._foreach_copy_(own, list(iterate))

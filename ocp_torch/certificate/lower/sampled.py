@@ -19,7 +19,8 @@ from ocp_torch.problems.samples import Samples
 
 # With noise another round of training for the bound is made where that part of it is to gain, or was gained by the last one:
 # the first gave nothing on two unicycles, the second 1.0 and 1.8 %; a third on dubins none to .5 %, for 70 s of 320. Twice as
-# much after each round, as the next takes twice as long: the second gave nothing on a unicycle with .93 % to gain.
+# much after each round, as the next takes twice as long: the second gave nothing on a unicycle with .93 % to gain,
+# and the third would have been made.
 WORTH = 0.005
 # Without noise less is enough, as gaps are narrow. Of two arms .39 and .85 % were to gain, by which no round was made of one,
 # and one of the other; three gave .51 and 1.0 %.
