@@ -21,7 +21,7 @@ HEADER = Template("""\
 /* $name: exported by ocp_torch.
  *
  * $about
- * Stack: $space numbers; nothing is allocated. Compile both files alike:
+ * Stack: $space numbers; nothing is allocated. Fastest with gcc -O3 -march=native -ffast-math. Compile both files alike:
  *   (no flag)        states and results are doubles
  *   -D${NAME}_FLOAT   they are floats; what is between is computed in double, so that results are off by their rounding alone
  *   -D${NAME}_SINGLE  all is computed in float, for processors without doubles; results are off by some 1e-5 of the most */

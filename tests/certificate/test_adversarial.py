@@ -107,7 +107,7 @@ def test_what_training_ends_with_is_certified_truly(name, method, seed, monkeypa
 
 def trained(problem, method, seed, monkeypatch, steps=150):
     monkeypatch.setattr(config, "build_problem", lambda section: problem)
-    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.STEPS", 60)
+    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.ROUNDS", ((100.0, 60), (1000.0, 120)))
     drifting = method == "primal" and not problem.driftless
     trainer = build_trainer(
         configured(

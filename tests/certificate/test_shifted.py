@@ -212,13 +212,12 @@ def perturbed(problem, size=1e-3, seed=0):
 
 @pytest.mark.parametrize("name", ["manufactured 2-d q=1.5", "noisy 1-d"])
 def test_a_value_trained_on_for_the_bound_comes_closer_to_the_optimum_from_below(name, monkeypatch):
-    for steps in ("STEPS", "NOISY_STEPS"):
-        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{steps}", 150)
+    for rounds in ("ROUNDS", "NOISY_ROUNDS"):
+        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{rounds}", ((100.0, 150),))
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.BATCH", 512)
-    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.MS", (100.0,))
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.RATE", 2e-2)
     monkeypatch.setattr("ocp_torch.certificate.lower.mollified.RADII", (1.0 / 64.0,))
-    for least in ("WORTH", "WORTH_WITHOUT_NOISE"):
+    for least in ("WORTH", "WORTH_AT_FIRST"):
         monkeypatch.setattr(f"ocp_torch.certificate.lower.sampled.{least}", 0.0)
     problem = zoo.build(name)
     value = perturbed(problem)
@@ -240,12 +239,12 @@ def test_what_cannot_be_trained_on_stays_as_it_is():
 
 
 def test_a_quick_certificate_trains_for_as_many_times_fewer_steps_as_it_has_fewer_states(monkeypatch):
-    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.STEPS", 8)
+    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.ROUNDS", ((100.0, 8), (1000.0, 16)))
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.BATCH", 64)
-    for batch, first in ((1000, 8), (64, 8), (16, 2), (1, 1)):
+    for batch, first, second in ((1000, 8, 16), (64, 8, 16), (16, 2, 4), (1, 1, 1)):
         met = list(tightened(Circle(), perturbed(Circle()), 0, batch))
         rounds = [k for k, W in enumerate(met) if W is not None]
-        assert rounds == [first, 3 * first + 1, 7 * first + 2, 15 * first + 3]
+        assert rounds == [first, first + second + 1]
 
 
 class AsIfNoisy(Circle):
@@ -261,7 +260,7 @@ class AsIfNoisy(Circle):
         (AsIfNoisy(), (0.02, 0.03, 0.0, 0.01), 3),  # nothing gained in the first, much in the second
         (AsIfNoisy(), (0.02, 0.03, 0.01, 0.0), 3),
         (AsIfNoisy(), (0.02, 0.03, 6e-4, 0.0), 3),  # nearly one per cent is left
-        (AsIfNoisy(), (6e-4, 6e-4, 2e-4, 2e-4), 2),  # two thirds of one per cent are enough after the first alone
+        (AsIfNoisy(), (6e-4, 6e-4, 2e-4, 2e-4), 3),
         (
             AsIfNoisy(),
             (6e-4, 2e-4, 1.8e-4, 0.0),
@@ -313,9 +312,9 @@ def test_rounds_go_on_while_there_is_enough_to_gain(problem, heights, made, monk
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["kuramoto n=3", "noisy 1-d"])
 def test_a_second_core_gives_the_same_certificate(name, monkeypatch):
-    for steps in ("STEPS", "NOISY_STEPS"):
-        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{steps}", 10)
-    for least in ("WORTH", "WORTH_WITHOUT_NOISE"):
+    for rounds in ("ROUNDS", "NOISY_ROUNDS"):
+        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{rounds}", ((100.0, 10), (1000.0, 20)))
+    for least in ("WORTH", "WORTH_AT_FIRST"):
         monkeypatch.setattr(f"ocp_torch.certificate.lower.sampled.{least}", 0.0)
     problem, threads = zoo.build(name), []
     torch.manual_seed(0)
