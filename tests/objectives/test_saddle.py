@@ -20,11 +20,7 @@ from ocp_torch.problems.samples import Samples
 from support import zoo
 from support.exact import lattice
 
-SMOOTH = {
-    "drift": Manufactured(dim=2, initial_contrast=0.3),
-    "q = 1.5": Manufactured(dim=1, exponent=1.5),
-    "m < d, B(x)": Manufactured(dim=3, control_dim=2, state_dependent_control=True),
-}
+each_smooth = zoo.on(["manufactured 2-d mu0", "manufactured 1-d q=1.5", "manufactured 3-d m=2 B(x) q=1.5"])
 
 
 class Function(nn.Module):
@@ -52,7 +48,7 @@ def exact_fields(problem, **bumps) -> Fields:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("problem", SMOOTH.values(), ids=SMOOTH.keys())
+@each_smooth
 @pytest.mark.parametrize("coupling", [0.0, 1.0])
 def test_no_player_gains_by_leaving_the_truth(problem, coupling):
     objective = saddle(problem, augmentation=0.5, coupling=coupling, warm_start=0.0)
@@ -68,7 +64,7 @@ def test_no_player_gains_by_leaving_the_truth(problem, coupling):
             assert float(objective.losses(moved, samples, phase)["density"]) > at_truth["density"] - 1e-5
 
 
-@pytest.mark.parametrize("problem", SMOOTH.values(), ids=SMOOTH.keys())
+@each_smooth
 def test_the_losses_at_the_truth_are_the_optimum(problem):
     objective = saddle(problem, augmentation=0.5, coupling=1.0, residual=7.0)
     phase = Phase(resolve_constants(problem))
@@ -141,7 +137,7 @@ class WithoutDivergences(Manufactured):
         return None
 
 
-@pytest.mark.parametrize("problem", SMOOTH.values(), ids=SMOOTH.keys())
+@each_smooth
 @pytest.mark.parametrize("size", [0.0, 0.01, 0.3, 5.0])
 @pytest.mark.parametrize("augmentation", [0.5, 3.0])
 def test_against_the_optimal_flux_no_value_is_worth_more_than_the_optimum(problem, size, augmentation):

@@ -1,6 +1,7 @@
 """A limit `|u| <= c`: closed forms against brute force, gradients against differences, bounds against exact truth."""
 
 import math
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -408,15 +409,16 @@ def test_the_kernel_methods_refuse_a_limit():
 
 
 @pytest.mark.parametrize(
-    ("problem", "side"),
+    ("make", "side"),
     [
-        (Manufactured(dim=1, control_limit=0.5, exponent=1.5), 128),
-        (Circle(control_limit=0.1), 128),
-        (Manufactured(control_limit=[0.6, 0.3], seed=2), 48),
+        (partial(Manufactured, dim=1, control_limit=0.5, exponent=1.5), 128),
+        (partial(Circle, control_limit=0.1), 128),
+        (partial(Manufactured, control_limit=[0.6, 0.3], seed=2), 48),
     ],
 )
-def test_the_grid_knows_the_limit(problem, side):
+def test_the_grid_knows_the_limit(make, side):
     """Against exact truth, or against an upper and a lower bound that are easy to have."""
+    problem = make()
     reference = solve_reference(problem, side=side)
     for u in (reference.control, reference.interpolate(zoo.states(problem, 200))[1]):
         assert float(least(problem.control_cost, u.reshape(-1, problem.control_dim)).max()) <= 1.0 + 1e-9
