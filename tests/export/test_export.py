@@ -122,8 +122,9 @@ def test_c(variant, tmp_path):
         function = truth(controller, place)
         double, metadata = through_c(tmp_path, name, function(states), states)
         agree(double, function(states), DOUBLE)
-        fastest = (tmp_path / f"{name}.h").read_text().split("gcc ")[1].split(".")[0]
-        agree(through_c(tmp_path, name, function(states), states, speed=fastest)[0], function(states), DOUBLE)
+        if variant not in QUICK:
+            fastest = (tmp_path / f"{name}.h").read_text().split("gcc ")[1].split(".")[0]
+            agree(through_c(tmp_path, name, function(states), states, speed=fastest)[0], function(states), DOUBLE)
         assert metadata["certificate"] == controller.certificate
         assert metadata["coordinates"] == place
         single = states.float()
