@@ -98,7 +98,8 @@ class Controller:
                 f"the problem {problem_name(self.problem)} has no physical units; give states of the torus to controller(x)."
             )
         states = self._states("s", s)
-        u = self.problem.from_controls(self(self.problem.to_torus(self.problem.chart.nearest(states))))
+        exact = states.to(next(self._exact.parameters()))
+        u = self.problem.from_controls(self(self.problem.to_torus(self.problem.chart.nearest(exact)))).to(states.dtype)
         return u.cpu().numpy() if isinstance(s, np.ndarray) else u
 
     def _states(self, name: str, given: States) -> Tensor:
