@@ -32,9 +32,9 @@ from ocp_torch.steppers.nonfinite import NonFiniteError
 # first and after each round: that pendulum 2.761, 2.760, 2.904, 2.967, 2.990 in 170 s, and 2.961 at a rate of 2e-3 with a
 # third fewer steps; an arm .4475, .4594, .4597, .4603.
 ROUNDS = ((100.0, 300), (1000.0, 600), (3000.0, 1200), (3000.0, 2400))
-# With noise, which rounds the kinks, and where a step takes twice as long. It gave two dubins 1.1772 and 1.1758 for 1.0949 and
-# 1.1553, a unicycle 1.3084 for 1.2934; 200 steps at 100 and then 1,200 at 3,000 gave the dubins 1.1713 and 1.1718; 200, 400,
-# and 800 steps at 100, 1,000 and 3,000 the second one 1.1753. Another one of 2,800 steps would take a third of a run's time.
+# With noise, which rounds the kinks, and where a step takes twice as long. It gave two dubins 1.1772 and 1.1758 for 1.0949
+# and 1.1553, a unicycle 1.3084 for 1.2934; 200 steps at 100 and then 1,200 at 3,000 gave the dubins 1.1713 and 1.1718; 200,
+# 400, and 800 steps at 100, 1,000 and 3,000 the second one 1.1753. Another 2,800 steps would take a third of a run's time.
 NOISY_ROUNDS = ((3000.0, 1400),)
 # New states of a step, at most, and the first learning rate of each round.
 BATCH, RATE = 2048, 1e-3
