@@ -91,6 +91,7 @@ class Ranks(Alone):
         store = dist.PrefixStore("ocp_torch", self._store)
         dist.init_process_group("gloo", store=store, rank=self.share.start, world_size=self.size, timeout=WORD)
         self._steps = dist.new_group(backend="gloo", timeout=STEP)
+        dist.barrier(self._steps)  # who leaves before the others are connected makes Gloo print so
 
     def use(self, device: torch.device) -> None:
         """Raises `InputError` where a GPU would be that of two processes."""
