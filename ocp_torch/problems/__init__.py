@@ -13,6 +13,7 @@ from ocp_torch.problems.systems.double_integrator import DoubleIntegrator
 from ocp_torch.problems.systems.double_pendulum import Acrobot, Pendubot
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
+from ocp_torch.problems.systems.mountain_car import MountainCar
 from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.phase_locked_loop import PhaseLockedLoop
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
@@ -41,6 +42,7 @@ PROBLEMS: dict[str, type[Problem]] = {
     "pendubot": Pendubot,
     "quadrotor": Quadrotor,
     "satellite": Satellite,
+    "mountain_car": MountainCar,
 }
 
 # What `Simulator` was called in files written before.

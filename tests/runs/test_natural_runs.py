@@ -11,7 +11,16 @@ from ocp_torch.runs.loading import policy_of
 from ocp_torch.runs.metrics.trial import METRICS, metrics
 from support.small import session, small
 
-NEW = ["acrobot", "pendubot", "quadrotor", "satellite", "cart_pole", "double_integrator", "phase_locked_loop"]
+NEW = [
+    "acrobot",
+    "pendubot",
+    "quadrotor",
+    "satellite",
+    "cart_pole",
+    "double_integrator",
+    "mountain_car",
+    "phase_locked_loop",
+]
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
 
 

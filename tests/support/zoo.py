@@ -16,6 +16,7 @@ from ocp_torch.problems import (
     Dubins,
     Kuramoto,
     Manufactured,
+    MountainCar,
     Pendubot,
     Pendulum,
     PhaseLockedLoop,
@@ -148,6 +149,7 @@ _NATURAL = {
     "quadrotor": Quadrotor,
     "quadrotor without obstacles": partial(Quadrotor, obstacles=[], control_limit=0.5, thrust_cost=2.0),
     "satellite": Satellite,
+    "mountain car": MountainCar,
     "phase neurons n=3 type 1": partial(PhaseNeurons, neurons=3, response="type1"),
 }
 

@@ -57,6 +57,12 @@ class Chart(Placed):
             )
         return turns.remainder(1.0)
 
+    def clipped(self, s: Tensor) -> Tensor:
+        """`to_torus`, but what is beyond a seam is taken at it."""
+        turns = self.turns(s)
+        turns[:, self.boxed] = turns[:, self.boxed].clamp(-0.5, 0.5)
+        return turns.remainder(1.0)
+
     def turns(self, s: Tensor) -> Tensor:
         """How far states ``(N, d)`` are from the centres, in turns of each coordinate."""
         return (s - self._like(s, "centre", self.centre)) / self.lengths(s)

@@ -3,6 +3,7 @@ r"""A problem in physical units: what a user writes in radians, metres and newto
 from collections.abc import Sequence
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -45,6 +46,8 @@ class System(Disturbed):
     not_arguments = ("control_limit",)
     # Whether neither `a` nor a column of `B` has a divergence, in physical units.
     divergence_free = False
+    # The environment of Gymnasium's that this is a model of, if any: `observed` and `action` say how.
+    gymnasium: str | None = None
 
     def __init__(
         self,
@@ -75,6 +78,27 @@ class System(Disturbed):
         if failure_cost is not None:
             require_number("problem.failure_cost", failure_cost, at_least=0.0)
         self.failure_cost = failure_cost
+
+    def observed(self, observation: np.ndarray) -> np.ndarray:
+        """The physical state ``(d,)`` that an observation of the environment ``gymnasium`` shows."""
+        raise InputError(f"{type(self).__name__} must define observed(observation), as it names an environment.")
+
+    def action(self, control: np.ndarray) -> np.ndarray:
+        """The action of the environment ``gymnasium`` that applies the physical ``control`` ``(m,)``."""
+        raise InputError(f"{type(self).__name__} must define action(control), as it names an environment.")
+
+    def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
+        """What is beyond a seam is taken at it."""
+        if env != self.gymnasium:
+            return super().from_observation(env, observation)
+        s = self.observed(np.asarray(observation, dtype=np.float64))
+        return self.chart.clipped(torch.as_tensor(s, dtype=torch.float64).unsqueeze(0))[0].numpy()
+
+    def to_action(self, env: str, control: np.ndarray) -> np.ndarray:
+        if env != self.gymnasium:
+            return super().to_action(env, control)
+        v = torch.as_tensor(np.asarray(control), dtype=torch.float64)
+        return np.asarray(self.action(self.from_controls(v).numpy()))
 
     def cost(self, s: Tensor) -> Tensor:
         """Running cost `>= 0`, ``(N,)``, per unit of time."""

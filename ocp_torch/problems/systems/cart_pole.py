@@ -2,6 +2,7 @@ r"""Swing up a pole that hangs from a cart by pushing the cart, whose track is s
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -27,6 +28,8 @@ class CartPole(System):
     the linear system and the quadratic cost there say so). ``force_noise`` in N sqrt(s) enters as the force does; with it, or
     ``noise``, nothing is known of `mu*`. Raises `InputError` for wrong arguments.
     """
+
+    gymnasium = "CartPole-v1"
 
     def __init__(
         self,
@@ -102,6 +105,14 @@ class CartPole(System):
 
     def disturbance(self, s: Tensor) -> Tensor | None:
         return self.force_noise * self.dynamics(s)[1] if self.force_noise else None
+
+    def observed(self, observation: np.ndarray) -> np.ndarray:
+        position, velocity, pole, spin = observation
+        return np.array([position, pole, velocity, spin])
+
+    def action(self, control: np.ndarray) -> np.ndarray:
+        """To the side the force is on: it is 10 N there, either way."""
+        return np.array(control[0] > 0.0, dtype=np.int64)
 
     def energy(self, s: Tensor) -> Tensor:
         """Kinetic and potential energy ``(N,)`` in J, the latter 0 with the pole upright."""

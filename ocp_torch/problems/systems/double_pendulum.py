@@ -3,6 +3,7 @@ r"""Swing up a double pendulum by a torque at one of its joints: acrobot (elbow)
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -145,6 +146,16 @@ class Acrobot(DoublePendulum):
     """The torque is at the elbow (Murray and Hauser, 1991)."""
 
     joint = 1
+    gymnasium = "Acrobot-v1"
+
+    def observed(self, observation: np.ndarray) -> np.ndarray:
+        """Angles there are from hanging."""
+        c1, s1, c2, s2, w1, w2 = observation
+        return np.array([np.arctan2(-s1, -c1), np.arctan2(s2, c2), w1, w2])
+
+    def action(self, control: np.ndarray) -> np.ndarray:
+        """The nearest of the torques -1, 0 and 1 N m there are."""
+        return np.array(np.rint(control[0]).clip(-1.0, 1.0) + 1.0, dtype=np.int64)
 
 
 class Pendubot(DoublePendulum):

@@ -16,8 +16,6 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.rest import bound_at_rest
 
 SPEED_COST = 0.1
-# The environment this is a model of: it observes cos theta, sin theta and theta', and takes a torque in N m.
-GYMNASIUM = "Pendulum-v1"
 
 
 class Pendulum(System):
@@ -37,6 +35,7 @@ class Pendulum(System):
     `InputError` for wrong arguments.
     """
 
+    gymnasium = "Pendulum-v1"
     initial_density = Problem.initial_density
     divergence_free = True
 
@@ -115,16 +114,9 @@ class Pendulum(System):
         a = torch.stack([velocity, self._pull * angle.sin()], dim=-1)
         return a, self._like(s, "pushed", self._pushed).expand(len(s), 2, 1)
 
-    def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
-        """The state of Pendulum-v1 that shows `(cos theta, sin theta, theta')`; speeds beyond the seam are taken at it."""
-        if env != GYMNASIUM:
-            return super().from_observation(env, observation)
-        cosine, sine, velocity = np.asarray(observation, dtype=np.float64)
-        physical = [[np.arctan2(sine, cosine), np.clip(velocity, -self.seam, self.seam)]]
-        return self.to_torus(torch.tensor(physical, dtype=torch.float64))[0].numpy()
+    def observed(self, observation: np.ndarray) -> np.ndarray:
+        cosine, sine, velocity = observation
+        return np.array([np.arctan2(sine, cosine), velocity])
 
-    def to_action(self, env: str, control: np.ndarray) -> np.ndarray:
-        """The torque in N m, within the ``max_torque`` that Pendulum-v1 allows."""
-        if env != GYMNASIUM:
-            return super().to_action(env, control)
-        return np.clip(self.max_torque * np.asarray(control), -self.max_torque, self.max_torque)
+    def action(self, control: np.ndarray) -> np.ndarray:
+        return np.clip(control, -self.max_torque, self.max_torque)

@@ -14,6 +14,7 @@ from ocp_torch.problems.systems.double_pendulum import DoublePendulum
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.linkage import Linkage
+from ocp_torch.problems.systems.mountain_car import HILLS, MountainCar
 from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.phase_locked_loop import PhaseLockedLoop
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
@@ -85,6 +86,16 @@ def energy_pump(problem: Pendulum, x: Tensor) -> Tensor:
     return (torch.where(near, balance, pump) / problem.max_torque).clamp(-1.0, 1.0).unsqueeze(-1)
 
 
+def gather_speed(problem: MountainCar, x: Tensor) -> Tensor:
+    """Full force to the right, but to the left while the car goes there with less energy than takes it half way up; none at
+    the goal."""
+    s = problem.from_torus(x)
+    bottom, top = -problem.gravity / HILLS, problem.energy(s.new_tensor([[problem.low, 0.0]]))
+    back = (s[:, 1] < 0.0) & (problem.energy(s) < 0.5 * (bottom + top))
+    force = torch.where(problem.arrived(x), 0.0, torch.where(back, -1.0, 1.0)).to(x)
+    return problem.to_controls(force.unsqueeze(-1))
+
+
 # The control ``(N, m)`` at states ``(N, d)``, for each kind of problem that has one.
 CONTROLS: dict[type[Problem], Callable[..., Tensor]] = {
     Linkage: resolved_rate,
@@ -93,6 +104,7 @@ CONTROLS: dict[type[Problem], Callable[..., Tensor]] = {
     Kuramoto: descend,
     PhaseNeurons: descend,
     Pendulum: energy_pump,
+    MountainCar: gather_speed,
     CartPole: feedback.shape_energy,
     DoubleIntegrator: feedback.linear_quadratic,
     DoublePendulum: feedback.swing_up,

@@ -18,6 +18,7 @@ from ocp_torch.problems.systems.double_pendulum import DoublePendulum
 from ocp_torch.problems.systems.dubins import Dubins
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.linkage import Linkage
+from ocp_torch.problems.systems.mountain_car import MountainCar
 from ocp_torch.problems.systems.pendulum import Pendulum
 from ocp_torch.problems.systems.phase_locked_loop import PhaseLockedLoop
 from ocp_torch.problems.systems.phase_neurons import PhaseNeurons
@@ -190,6 +191,13 @@ def _(problem: CartPole, path: Path) -> dict[str, float]:
     """Success: the pole within 0.2 rad and 0.5 rad/s of upright at the end, and never off the track or out of the box."""
     s = problem.from_torus(path.states[-1])
     return _swung_up(problem, path, s[:, 1:2], s[:, 3:])
+
+
+@measure.register
+def _(problem: MountainCar, path: Path) -> dict[str, float]:
+    """The parts of the starts from which the goal is reached, and from which the box is ever left elsewhere."""
+    arrived, left = path.each(problem.arrived).any(dim=0), path.each(problem.outside).any(dim=0)
+    return {"arrived": _part(arrived), "left": _part(left)}
 
 
 @measure.register
