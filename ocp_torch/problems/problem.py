@@ -111,10 +111,12 @@ class Problem(Reproducible, Placed, Played):
     def add_noise(self, columns: Tensor) -> None:
         """Put ``columns`` ``(d, k)``, torus units per square root of time, beside those of `sigma`; for `__init__` alone.
 
-        Each is a Brownian motion of its own; those that are 0 are left out."""
+        Each is a Brownian motion of its own; those that are 0 are left out. Of more than `d` in all, `d` with the same
+        `sigma sigma^T` take the place: states have the same law, and there are fewer directions to differentiate along."""
         columns = columns.double()[:, columns.any(dim=0)]
         if columns.shape[1]:
-            self._sigma = columns if self._sigma is None else torch.cat([self._sigma, columns], dim=1)
+            sigma = columns if self._sigma is None else torch.cat([self._sigma, columns], dim=1)
+            self._sigma = sigma if sigma.shape[1] <= self.dim else torch.linalg.qr(sigma.T, mode="r").R.T
 
     @property
     def noisy(self) -> bool:

@@ -200,3 +200,11 @@ def test_generator_and_residual_are_adjoint_on_systems(name):
         charged = L.multiplier_term(L.jet(V), mu, w(samples.x)).mean()
         given = (V(samples.x) * (inflow - outflow - samples.mu0)).mean()
     torch.testing.assert_close(charged, given, rtol=1e-5, atol=1e-5)
+
+
+def test_more_motions_than_coordinates_become_as_many_of_the_same_law():
+    problem = Kuramoto(phase_noise=[0.1, 0.2, 0.3], noise=[0.01, 0.02])
+    sigma = problem.noise(torch.zeros(1, 2).double())[0]
+    assert sigma.shape == (2, 2)
+    parted = torch.tensor([[0.1, 0.0, -0.3], [0.0, 0.2, -0.3]], dtype=torch.float64) / TURN
+    torch.testing.assert_close(sigma @ sigma.T, parted @ parted.T + torch.tensor([[0.02, 0.0], [0.0, 0.04]]).double())

@@ -43,7 +43,7 @@ class MountainCar(System):
         time_cost: float = 0.05,
         effort: float = 0.1,
         start: Start = None,
-        discount: float = 0.002,
+        discount: float = 0.005,
         exponent: float = 2.0,
         control_limit: float | Sequence[float] | None = 1.0,
         force_noise: float = 0.0,
