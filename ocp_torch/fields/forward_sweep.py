@@ -18,13 +18,18 @@ from torch.autograd.function import once_differentiable
 from ocp_torch.fields.embedding import FourierEmbedding
 from ocp_torch.maths.decisions import decided
 
+# Rounding grows by at most this factor where a gradient is had from derivatives along columns of the noise.
+LARGEST_CONDITION = 100.0
+
 
 @dataclass(frozen=True)
 class Along:
     """The directions derivatives are taken along: the columns of the noise, or else the coordinates."""
 
-    columns: Tensor | None = None  # (N, d, p): directions that are not coordinates
+    columns: Tensor | None = None  # (N, d, p): directions that are not coordinates, and too few for the gradient
     scales: Tensor | None = None  # (N, d): by which coordinates are multiplied, so that they are columns of the noise
+    frame: Tensor | None = None  # (d, d): columns of the noise that are the same at all states
+    inverse: Tensor | None = None  # (d, d): of ``frame``
     sigma: Tensor | None = None  # (N, d, k): the noise, where directions are not its columns
 
     @classmethod
@@ -36,17 +41,32 @@ class Along:
         if sigma.shape[1] != sigma.shape[2]:
             return cls(sigma=sigma)
         plain = (sigma == torch.diag_embed(scales)).all() & scales.all()
-        return cls(scales=scales) if decided(plain) else cls(sigma=sigma)
+        if decided(plain):
+            return cls(scales=scales)
+        if sigma.requires_grad:
+            return cls(sigma=sigma)
+        frame = sigma[0].tril()
+        eye = torch.eye(len(frame), dtype=frame.dtype, device=frame.device)
+        inverse = torch.linalg.solve_triangular(frame, eye, upper=False)
+        even = (sigma == frame).all() & (frame.norm() * inverse.norm() < LARGEST_CONDITION)
+        return cls(frame=frame, inverse=inverse) if decided(even) else cls(sigma=sigma)
+
+    @property
+    def enough(self) -> bool:
+        """Whether directions are columns of the noise, and gradients follow from derivatives along them."""
+        return self.scales is not None or self.frame is not None
 
     def derivatives(self, waves: Tensor, count: int) -> Tensor:
         """The derivatives ``(p, N, J)`` of linear functions with gradients ``waves`` ``(J, d)`` at ``count`` states `N`."""
         if self.columns is not None:
             return torch.einsum("jd,ndp->pnj", waves, self.columns)
-        along = waves.T.unsqueeze(1).expand(-1, count, -1)
+        along = (waves if self.frame is None else waves @ self.frame).T.unsqueeze(1).expand(-1, count, -1)
         return along if self.scales is None else along * self.scales.T.unsqueeze(-1)
 
     def gradient(self, slopes: Tensor) -> Tensor:
-        """The gradient ``(N, d)`` of what has derivatives ``slopes`` ``(d, N)`` along the coordinates."""
+        """The gradient ``(N, d)`` of what has derivatives ``slopes`` ``(d, N)``."""
+        if self.inverse is not None:
+            return slopes.T @ self.inverse
         return slopes.T if self.scales is None else slopes.T / self.scales
 
     def form(self, left: Tensor, right: Tensor) -> Tensor:
@@ -82,7 +102,7 @@ class Sweep:
     def activated(self, activation: nn.Module, along: Along) -> "Sweep":
         """Through a smooth function of each entry."""
         derivatives = DERIVATIVES[type(activation)]
-        if along.scales is not None:
+        if along.enough:
             return Sweep(*Activated.apply(self.value, self.slopes, self.curvature, derivatives))
         value, first, second, _ = derivatives(self.value)
         bent = second * along.form(self.slopes, self.slopes)

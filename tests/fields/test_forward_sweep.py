@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from ocp_torch.fields import PeriodicMLP, SobolevField
+from ocp_torch.fields.forward_sweep import Along
 from ocp_torch.fields.mlp import ACTIVATIONS
 from ocp_torch.maths import cores
 from ocp_torch.maths.batch_jet import PIECE, batch_jet
@@ -67,6 +68,38 @@ def test_noise_along_the_coordinates_takes_the_short_way_to_the_same(dim, activa
     gradients = [torch.autograd.grad(loss(j), inputs, retain_graph=True) for j in (swept, nested)]
     for found, expected in zip(*gradients, strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("gated", [False, True])
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("dim", [2, 3])
+def test_noise_that_is_the_same_everywhere_takes_the_short_way_to_the_same(dim, activation, gated):
+    network, (x, sigma) = made(dim, 5, activation=activation, gated=gated), drawn(dim, dim)
+    factor = sigma[:1].tril() + 2.0 * torch.eye(dim, dtype=torch.float64)
+    x.requires_grad_(True)
+    inputs = [x, *network.parameters()]
+    loss = lambda j: (j.value.sin() + j.gradient.square().sum(dim=-1) + j.curvature.square()).sum()
+    # One that is all but singular, and one that a state alone does not have, go the long way.
+    odd = factor.repeat(len(x), 1, 1)
+    odd[3, 1, 0] += 0.5
+    flat = factor * torch.tensor([1.0] + (dim - 1) * [1e-3], dtype=torch.float64)
+    for noise, short in ((factor.expand(len(x), -1, -1), True), (odd, False), (flat.expand(len(x), -1, -1), False)):
+        assert (Along.of(noise).frame is not None) == short
+        swept, nested = jet(network, x, noise), reverse_jet(network, x, noise)
+        assert_same(swept, nested)
+        gradients = [torch.autograd.grad(loss(j), inputs, retain_graph=True) for j in (swept, nested)]
+        for found, expected in zip(*gradients, strict=True):
+            torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_noise_that_follows_the_state_has_its_own_derivative():
+    network, (x, sigma) = made(2, 5), drawn(2, 2, count=1)
+    x.requires_grad_(True)
+    found, expected = (
+        torch.autograd.grad(of(network, x, (sigma.tril() + 2.0 * torch.eye(2)) * (1.5 + x.sin())).curvature.sum(), x)[0]
+        for of in (jet, reverse_jet)
+    )
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize(("dim", "columns"), SHAPES)
