@@ -2,8 +2,8 @@ r"""Value, gradient and `D : hess` of a perceptron in one sweep forward: exact, 
 
 Each layer is handed its input `h` ``(N, F)``, the derivatives `h_i` of it along `p` directions ``(p, N, F)`` and the
 curvature `D : h_ij` ``(N, F)``. A linear layer maps them alike. An activation `s` maps them to `s(h)`, `s' h_i` and
-`s' (D : h_ij) + s'' sum_ij D_ij h_i h_j`. The directions are the coordinates, or the columns of the noise where those are
-fewer; then one reverse pass gives the gradient.
+`s' (D : h_ij) + s'' sum_ij D_ij h_i h_j`. The directions are the coordinates, or the columns of the noise: where those are
+fewer, and one reverse pass gives the gradient, or where they are as many and the same at all states.
 """
 
 import math

@@ -79,7 +79,7 @@ def test_noise_that_is_the_same_everywhere_takes_the_short_way_to_the_same(dim, 
     x.requires_grad_(True)
     inputs = [x, *network.parameters()]
     loss = lambda j: (j.value.sin() + j.gradient.square().sum(dim=-1) + j.curvature.square()).sum()
-    # One that is all but singular, and one that a state alone does not have, go the long way.
+    # One that differs at a single state, and one that is all but singular, go the long way.
     odd = factor.repeat(len(x), 1, 1)
     odd[3, 1, 0] += 0.5
     flat = factor * torch.tensor([1.0] + (dim - 1) * [1e-3], dtype=torch.float64)

@@ -28,7 +28,7 @@ ACROBOT = Acrobot(
     control_limit=1.0,
 )
 CAR, CART = MountainCar(), CartPole()
-# The physical state and control that environments are put into and given; how their state is written, and what they observe.
+# Each model, a physical state and control to try, and how the environment writes that state.
 CASES = {
     "CartPole-v1": (CART, [0.4, 0.3, -0.6, 1.1], [10.0], lambda s: np.array([s[0], s[2], s[1], s[3]])),
     "Acrobot-v1": (ACROBOT, [2.4, -0.7, 0.8, -1.3], [-1.0], lambda s: np.array([s[0] - math.pi, *s[1:]])),
