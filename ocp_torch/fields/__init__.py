@@ -1,8 +1,8 @@
 """What represents `V`, `w` and `log mu`: anything periodic and differentiable. `MODELS` maps names to network classes.
 
 A class is made from ``dim``, ``outputs`` (`None` for a scalar field), ``shift`` and ``scale``, the units of what it
-represents, and from arguments of its own that `model` configures; ``defaults(dim, worst_state, noisy)`` gives those that are
-null.
+represents, ``centred``, whether it may resolve a state of rest, and from arguments of its own that `model` configures;
+``defaults(dim, worst_state, noisy)`` gives those that are null.
 """
 
 from typing import Any

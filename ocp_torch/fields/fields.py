@@ -9,10 +9,12 @@ import torch
 from torch import Tensor, nn
 
 from ocp_torch.errors import InputError
+from ocp_torch.fields.centred import Centred
 from ocp_torch.fields.embedding import FourierEmbedding
 from ocp_torch.fields.logarithmic import Logarithmic
 from ocp_torch.fields.rounded import Rounded
 from ocp_torch.fields.waves import STATES, prominent_waves
+from ocp_torch.problems.equilibrium import equilibrium
 from ocp_torch.problems.problem import Problem
 
 VALUE, CONTROL_DENSITY, LOG_OCCUPATION = "value", "control_density", "log_occupation"
@@ -33,7 +35,7 @@ class Fields(nn.Module):
     def build(cls, problem: Problem, names: Iterable[str], network: NetworkFactory, seed: int) -> "Fields":
         """Fresh networks for ``names`` in the units of ``problem``, initialised from ``seed`` alone.
 
-        An embedding with room for them gets the problem's `prominent_waves`.
+        An embedding with room for them gets the problem's `prominent_waves`, one for a state of rest its `equilibrium`.
         """
         cost, control = typical_sizes(problem)
         forms: dict[str, dict[str, Any]] = {
@@ -48,6 +50,9 @@ class Fields(nn.Module):
         for embedding in (m for m in fields.modules() if isinstance(m, FourierEmbedding)):
             if embedding.mixed is not None and not embedding.mixed.is_meta:
                 embedding.mix(_waves(problem, len(embedding.mixed)))
+        for centred in (m for m in fields.modules() if isinstance(m, Centred)):
+            if not centred.at.is_meta and (rest := equilibrium(problem)) is not None:
+                centred.centre(*rest, fields.trajectory_value.unit)
         return fields
 
     @property

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ocp_torch.errors import require_choice, require_flag, require_integer
+from ocp_torch.fields.centred import Centred
 from ocp_torch.fields.embedding import FourierEmbedding
 from ocp_torch.fields.forward_sweep import Along, Sweep
 from ocp_torch.maths.jets import Jet, reverse_jet
@@ -49,7 +50,7 @@ class PeriodicMLP(nn.Module):
 
     ``shift`` and ``scale`` are constants in the units of what is represented, so that one learning rate suits costs of
     any size. With ``gated`` each hidden layer multiplies two halves (`Gated`). The last layer starts small: the field
-    starts near the constant ``shift``.
+    starts near the constant ``shift``. With ``centred`` the embedding has features about a state of rest (`Centred`).
     """
 
     shift: Tensor
@@ -67,13 +68,15 @@ class PeriodicMLP(nn.Module):
         waves: int = 0,
         shift: float = 0.0,
         scale: float = 1.0,
+        centred: bool = False,
     ) -> None:
         super().__init__()
         width = require_integer("model.width", width, 1, maximum=2**14)
         depth = require_integer("model.depth", depth, 1, maximum=64)
         activate = ACTIVATIONS[require_choice("model.activation", activation, ACTIVATIONS)]
         self.embedding = FourierEmbedding(dim, modes, waves)
-        sizes = [self.embedding.width] + [width] * depth
+        self.centred = Centred(dim) if centred else None
+        sizes = [self.embedding.width + (self.centred.width if self.centred else 0)] + [width] * depth
         require_flag("model.gated", gated)
         layers: list[nn.Module] = []
         for inward, outward in zip(sizes, sizes[1:], strict=False):
@@ -102,14 +105,17 @@ class PeriodicMLP(nn.Module):
         return {**sizes, "waves": waves, "activation": "gelu" if gentle else "tanh"}
 
     def forward(self, x: Tensor) -> Tensor:
-        out = self.shift + self.scale * self.head(self.body(self.embedding(x)))
+        features = self.embedding(x)
+        if self.centred is not None:
+            features = torch.cat([features, self.centred(x)], dim=-1)
+        out = self.shift + self.scale * self.head(self.body(features))
         return out.squeeze(-1) if self.scalar else out
 
     def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
         """The jet of a scalar network at states ``(N, d)``: by one reverse pass, and with noise ``sigma`` ``(N, d, k)``
-        there by a sweep forward, of `min(d, k) + 2` times the work of `forward`."""
-        if sigma is None:
-            return reverse_jet(self, x)
+        there by a sweep forward, of `min(d, k) + 2` times the work of `forward`; a ``centred`` one by reverse passes."""
+        if sigma is None or self.centred is not None:
+            return reverse_jet(self, x, sigma)
         along = Along.of(sigma)
         if along.columns is None:
             swept = self._swept(x, along)

@@ -131,7 +131,8 @@ class SobolevField(nn.Module):
     """`x -> shift + scale * theta . features(x)`, ``(N, d) -> (N,)`` or, with ``outputs``, ``(N, outputs)``; starts at 0.
 
     A plain gradient step on `theta` is a gradient step in the space. ``scaled`` takes the problem's units for shift and
-    scale; without it they are 0 and 1, as in the paper, whose step sizes mean something only then.
+    scale; without it they are 0 and 1, as in the paper, whose step sizes mean something only then. A space has
+    its features, ``centred`` or not.
     """
 
     shift: Tensor
@@ -147,6 +148,7 @@ class SobolevField(nn.Module):
         scaled: bool = False,
         shift: float = 0.0,
         scale: float = 1.0,
+        centred: bool = False,
     ) -> None:
         super().__init__()
         require_flag("model.scaled", scaled)

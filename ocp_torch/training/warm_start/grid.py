@@ -22,12 +22,12 @@ from ocp_torch.training.warm_start.targets import Targets
 # Nodes along each of two coordinates, controls from one limit to the other, and steps of the pace in one: longer steps are
 # interpolated less often. On a limited pendulum (discount 0.5) V is then 2.988 on average at the starts of a trial, and the
 # controller of the network fitted to it costs 2.974 there; that learnt from trajectories 3.06, after twice the time.
-DIM, SIDE, CONTROLS, STEPS = 2, 192, 17, 2.0
+DIM, SIDE, CONTROLS, STEPS = 2, 192, 17, 1.2
 # A policy is followed for so many sweeps before it is improved. It is over when an improvement moves V by less than this part
 # of its largest value, were it made for ever; or after so many policies.
 SWEEPS, SETTLED, MOST_POLICIES = 25, 0.002, 200
-# The first learning rate of a fit to them, in units of that of a fit to what moves from round to round. Nothing moves here,
-# and it falls to 0: the pendulum in Gymnasium lost 1.6 % of the return then, and 4 % at the usual rate throughout.
+# The first learning rate of a fit to them, in units of the usual one: nothing moves here from round to round. It falls to 0:
+# the pendulum in Gymnasium lost 1.6 % of the return then, and 4 % at the usual rate throughout.
 FASTEST = 2.5
 
 
@@ -35,8 +35,8 @@ class GridValues:
     """The value of every node of a grid; found when it is first asked for, always the same."""
 
     # A trial follows so many rounds, whose fits take about as long as it does (with a discount of 0.1 per second half as
-    # long). However they turn out all rounds are made: the last ones, at the lowest rates, gain most.
-    trial_every, patience = 40, math.inf
+    # long).
+    trial_every, fastest = 40, FASTEST
 
     def __init__(self, problem: Problem, pace: Pace, like: Tensor) -> None:
         self.problem, self.pace, self.like = problem, pace.with_step(STEPS * pace.step), like
@@ -47,11 +47,6 @@ class GridValues:
         """Whether a grid is cheap: two coordinates and one control with a limit, of a problem that is no simulator."""
         one = problem.dim == DIM and problem.control_dim == 1
         return one and math.isfinite(problem.control_cost.reach) and not isinstance(problem, Simulator)
-
-    @staticmethod
-    def rate(part: float) -> float:
-        """The learning rate, in units of the usual one, when a ``part`` of the rounds is over."""
-        return FASTEST * 0.5 * (1.0 + math.cos(math.pi * part))
 
     @property
     def plan(self) -> str:

@@ -26,8 +26,8 @@ POOLED = 8
 class Trajectories:
     """Returns along pieces of trajectory of ``problem``, which start among ``starts`` ``(M, d)`` and elsewhere."""
 
-    # A trial follows so many rounds; it goes on from the best at half the rate after so many that are no better.
-    trial_every, patience = 10, 3.0
+    # A trial follows so many rounds; and the first learning rate of a fit, in units of the usual one.
+    trial_every, fastest = 10, 1.5
 
     def __init__(
         self, problem: Problem, pace: Pace, starts: Tensor, settings: WarmStartSettings, generator: torch.Generator
@@ -36,11 +36,6 @@ class Trajectories:
         self.ends: Tensor | None = None  # (k, d), where pieces ended
         self.largest = math.inf if problem.state_cost_bound is None else float(problem.state_cost_bound)
         self.drawn = settings.pieces * settings.steps  # states a round
-
-    @staticmethod
-    def rate(part: float) -> float:
-        """The learning rate, in units of the usual one, whatever ``part`` of the rounds is over."""
-        return 1.0
 
     @property
     def plan(self) -> str:
