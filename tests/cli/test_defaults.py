@@ -47,7 +47,7 @@ CHOOSE = ("_target_", "name", "kind", "player_lr", "stage")
 FILLED = {
     "dataset": ("dim", "control_dim", "constant_matrix"),  # of the file
     "method": ("problem", "constants"),
-    "model": ("dim", "outputs", "shift", "scale"),
+    "model": ("dim", "outputs", "shift", "scale", "centred"),
     "optimizer": ("parameters",),
     "schedule": ("name", "steps"),
     "stepper": ("fields", "objective", "optimizers", "schedule", "unit"),
