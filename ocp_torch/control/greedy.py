@@ -36,6 +36,10 @@ class HeldPolicy:
 
     def __call__(self, x: Tensor) -> Tensor:
         """Controls ``(N, m)`` at states ``(N, d)``."""
+        return self.step(x)[0]
+
+    def step(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Controls at states ``(N, d)``, and how far these move under them ``(N, d)``, where that was compared."""
         problem, cost, a_step = self.problem, self.problem.control_cost, self.problem.discount * self.pace.step
         drifted = self.pace.drift(problem, x)
         before = jet(self.value, x + drifted)
@@ -45,19 +49,22 @@ class HeldPolicy:
         slopes = ((end.gradient * along).sum(dim=-1) for end in (before, jet(self.value, x + moved)))
         part = kept(cost.q, self._price(u), *slopes).unsqueeze(-1) * u
         if math.isinf(cost.reach):
-            return part
+            return part, None
         most = farthest(cost, u)
         # All at once: one after the other takes twice as long for few states.
         tried = [part, most, -most]
         x3 = torch.cat([x] * 3)
-        after = self.value((x3 + self.pace.move(problem, x3, torch.cat(tried))).remainder(1.0))
+        moves = self.pace.move(problem, x3, torch.cat(tried))
+        after = self.value((x3 + moves).remainder(1.0))
         tried.append(torch.zeros_like(u))
         merits = (self._price(torch.cat(tried)) + torch.cat([after, before.value]) / a_step).chunk(4)
-        best, least = part, merits[0]
-        for other, merit in zip(tried[1:], merits[1:], strict=True):
+        best, way, least = part, moves[: len(x)], merits[0]
+        others = zip(tried[1:], (*moves[len(x) :].chunk(2), drifted), merits[1:], strict=True)
+        for other, there, merit in others:
             better = merit < least
-            best, least = torch.where(better.unsqueeze(-1), other, best), torch.where(better, merit, least)
-        return best
+            best, way = (torch.where(better.unsqueeze(-1), *pair) for pair in ((other, best), (there, way)))
+            least = torch.where(better, merit, least)
+        return best, way
 
     def _price(self, u: Tensor) -> Tensor:
         """`R(u)` of controls within the limit, where rounding is no infinite cost."""

@@ -96,11 +96,11 @@ def roll(problem: Problem, value: Field, x: Tensor, pace: Pace, steps: int, gene
     for k in range(steps + 1):
         with torch.no_grad():
             values.append(value(at.x))
-            u = policy(at.x)
+            u, moved = policy.step(at.x)
             spent = cost.cost(u)
             if k == steps:
                 return Pieces(torch.stack(states), torch.stack(values), torch.stack(costs), at.f + spent)
-            x = at.x + pace.move(problem, at.x, u)
+            x = at.x + (pace.move(problem, at.x, u) if moved is None else moved)
             if at.noise is not None:
                 drawn = torch.randn(len(x), at.noise.shape[-1], generator=generator).to(x)
                 x = x + math.sqrt(pace.step) * torch.einsum("ndk,nk->nd", at.noise, drawn)
