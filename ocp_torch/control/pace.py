@@ -22,7 +22,7 @@ DISCOUNTED, MOVED = 0.04, 0.08
 ANSWERED = 0.2
 # A Runge-Kutta step is at most this part of the time in which neighbours part `e`-fold, at nine states in ten; so many at
 # most.
-PARTED, NEARLY_ALL, MOST_SUBSTEPS = 0.6, 0.9, 8
+PARTED, NEARLY_ALL, MOST_SUBSTEPS = 1.0, 0.9, 8
 # States, and starts, at which that is looked at, and how far apart neighbours are, in turns.
 PROBED, STARTS, APART = 2**11, 2**8, 1e-3
 
