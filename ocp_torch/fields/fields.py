@@ -52,7 +52,7 @@ class Fields(nn.Module):
                 embedding.mix(_waves(problem, len(embedding.mixed)))
         for centred in (m for m in fields.modules() if isinstance(m, Centred)):
             if not centred.at.is_meta and (rest := equilibrium(problem)) is not None:
-                centred.centre(*rest, fields.trajectory_value.unit)
+                centred.centre(rest.at, rest.bend, fields.trajectory_value.unit)
         return fields
 
     @property

@@ -24,10 +24,12 @@ STILL, FLAT = 1e-3, 1e-8
 
 
 class Equilibrium(NamedTuple):
-    """The state ``at`` ``(d,)``, and the Hessian ``bend`` ``(d, d)`` of `V` there, positive semidefinite; float64."""
+    """The state ``at`` ``(d,)`` and the Hessian ``bend`` ``(d, d)`` of `V` there, semidefinite, both float64; and the
+    ``contraction``, the rate at which the linear optimal flow loses volume: where it is at least `rho`, mass gathers."""
 
     at: Tensor
     bend: Tensor
+    contraction: float
 
 
 def equilibrium(problem: Problem) -> Equilibrium | None:
@@ -61,7 +63,7 @@ def _sought(problem: Problem) -> Equilibrium | None:
         P = riccati(A, B, Q, problem.discount)
     except (ValueError, np.linalg.LinAlgError):
         return None  # no linear controller brings the state to rest
-    return Equilibrium(at.remainder(1.0), problem.discount * P)
+    return Equilibrium(at.remainder(1.0), problem.discount * P, -float((A - B @ B.T @ P).trace()))
 
 
 def _slope(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:

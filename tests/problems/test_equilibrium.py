@@ -36,13 +36,15 @@ def test_the_value_near_it_is_that_of_the_riccati_equation():
     problem = PROBLEMS["double_integrator"]()
     lengths = problem.chart.length.double()
     expected = problem.discount * problem.plane.P * lengths * lengths.unsqueeze(-1)
-    torch.testing.assert_close(equilibrium(problem).bend, expected, rtol=1e-5, atol=1e-6)
+    found = equilibrium(problem)
+    torch.testing.assert_close(found.bend, expected, rtol=1e-5, atol=1e-6)
+    assert found.contraction == pytest.approx(problem.plane.contraction, rel=1e-5)
 
 
 @pytest.mark.parametrize("name", ["cart_pole", "pendubot"])
 def test_the_linear_controller_costs_what_it_says(name):
     problem = PROBLEMS[name]()
-    at, bend = equilibrium(problem)
+    at, bend, _ = equilibrium(problem)
     B, rho = problem.control_matrix(at.unsqueeze(0))[0], problem.discount
     y = 1e-4 * torch.randn(8, problem.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     h, cost, x = 1e-3, torch.zeros(8, dtype=torch.float64), at + y

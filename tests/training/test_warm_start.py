@@ -207,6 +207,7 @@ def test_auto_stays_out_where_mass_cannot_gather_and_changes_no_bit_there():
     auto = lambda *way: small(*way, "method=dual", "warm_start.mode=auto").state.warm
     assert isinstance(auto("problem=cart_pole").source, Trajectories)
     assert isinstance(auto(*SWING).source, GridValues)
+    assert isinstance(auto("problem=cart_pole", "problem.noise=1e-3").source, Trajectories)
     assert auto("problem=cart_pole", "problem.control_limit=null") is auto("problem=pendulum") is None
 
 

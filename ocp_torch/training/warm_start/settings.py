@@ -8,6 +8,7 @@ from ocp_torch.fields import VALUE
 from ocp_torch.objectives import Objective
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
+from ocp_torch.problems.equilibrium import equilibrium
 from ocp_torch.problems.simulator.simulator import Simulator
 
 OFF, ON, AUTO = "off", "on", "auto"
@@ -40,10 +41,11 @@ class WarmStartSettings:
 
 
 def pays(problem: Problem, constants: Constants) -> bool:
-    """Whether good controllers are likely to come late without it, as in swing-ups: mass gathers without bound, more
-    coordinates move by themselves than there are controls, and these are limited. Not for a simulator, each evaluation of
-    which may be dear. What is then found to be no better than doing nothing is not used."""
+    """Whether good controllers are likely to come late without it, as in swing-ups: mass gathers, or would without noise,
+    more coordinates move by themselves than there are controls, and these are limited. Not for a simulator, each evaluation
+    of which may be dear. What is then found to be no better than doing nothing is not used."""
     underactuated = not problem.driftless and problem.control_dim < problem.dim
-    limited = math.isfinite(problem.control_cost.reach)
-    swings_up = constants.unbounded and underactuated and limited
-    return swings_up and not isinstance(problem, Simulator)
+    if not underactuated or math.isinf(problem.control_cost.reach) or isinstance(problem, Simulator):
+        return False
+    rest = equilibrium(problem)
+    return constants.unbounded or (rest is not None and rest.contraction >= problem.discount)
