@@ -7,12 +7,13 @@ import torch
 
 from ocp_torch.certificate.checks.observed import largest_jump
 from ocp_torch.control.greedy import HeldPolicy, farthest, kept
-from ocp_torch.control.pace import Pace
+from ocp_torch.control.pace import ANSWERED, Pace
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields import PeriodicMLP
-from ocp_torch.problems import Circle, Pendulum
+from ocp_torch.problems import PROBLEMS, Circle, Pendulum
 from ocp_torch.problems.control_limit import BoxLimitedCost, LimitedCost
-from support.zoo import NATURAL, on, states
+from ocp_torch.problems.starts import drawn_starts
+from support.zoo import NATURAL, Swing, on, states
 
 SWING = Pendulum(control_limit=1.0)
 
@@ -99,3 +100,33 @@ def test_the_pace_of_a_problem_is_measured_once(monkeypatch):
     assert Pace.of(problem) is first
     assert first.with_step(3.0 * first.step).substeps == 3 * first.substeps
     assert first.with_step(0.1 * first.step).substeps == first.substeps
+
+
+class Faster(Swing):
+    """`Swing` in a unit of time that is ``times`` as long."""
+
+    def __init__(self, times: float) -> None:
+        super().__init__(discount=2.0 * times)
+        self.times = times
+
+    def drift(self, x):
+        return self.times * super().drift(x)
+
+    def control_matrix(self, x):
+        return self.times * super().control_matrix(x)
+
+
+def test_the_pace_knows_no_unit_of_time():
+    for times in (1.0, 10.0, 1e-3):
+        found = Pace.of(Faster(times))
+        assert found.step * times == pytest.approx(Pace.of(Swing()).step, rel=1e-6)
+        assert found.substeps == Pace.of(Swing()).substeps
+
+
+@pytest.mark.parametrize("name", ["acrobot", "pendubot", "cart_pole", "pendulum"])
+def test_a_control_is_held_for_a_fifth_at_most_of_the_time_in_which_a_system_answers(name):
+    problem = PROBLEMS[name]()
+    x = drawn_starts(problem, 64, 1)
+    of = lambda y: torch.func.jacrev(lambda z: problem.drift(z.unsqueeze(0))[0])(y)
+    fastest = torch.linalg.eigvals(torch.stack([of(y) for y in x])).abs().amax(dim=-1)
+    assert Pace.of(problem).step * float(fastest.quantile(0.75)) < ANSWERED
