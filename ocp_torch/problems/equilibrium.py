@@ -1,6 +1,7 @@
 r"""The state of rest that a problem is controlled towards, and what `V` is like near it: known from linear theory."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -18,6 +19,8 @@ from ocp_torch.problems.systems.rest import riccati
 SEARCHED, ASCENTS, NEWTON = 2**13, 16, 8
 # Half the distance of states whose functions are compared, in turns: second differences then lose half the digits.
 APART = 1e-4
+# Second differences take four states for each pair of coordinates; of more than so many they are not taken.
+MOST_COORDINATES = 64
 # A drift slower than this part of its median over the torus is none; and directions in which the cost bends less than this
 # part of the most are taken for flat.
 STILL, FLAT = 1e-3, 1e-8
@@ -34,14 +37,18 @@ class Equilibrium(NamedTuple):
 
 def equilibrium(problem: Problem) -> Equilibrium | None:
     r"""Where the state cost of ``problem`` is least, if nothing moves there without control; else `None`, as for a simulator,
-    whose evaluations may be dear. Found once for a problem, from evaluations alone.
+    whose evaluations may be dear, and beyond 64 coordinates. Found once for a problem, from evaluations alone.
 
     `V` is about `V(at) + y'Hy / 2`, `y = x - at`, with `H = rho P` and `P` of the Riccati equation of the linear dynamics and
     the quadratic cost at that state; limits of the control aside, and for `q < 2` only of that shape.
     """
     if problem not in _found:
-        known = problem.has_simulator and not isinstance(problem, Simulator)
-        _found[problem] = _sought(problem) if known else None
+        known = problem.has_simulator and not isinstance(problem, Simulator) and problem.dim <= MOST_COORDINATES
+        _found[problem] = None
+        if known:
+            # No linear controller may bring the state to rest, and not every cost bends by a finite amount.
+            with suppress(ValueError, np.linalg.LinAlgError, torch.linalg.LinAlgError):
+                _found[problem] = _sought(problem)
     return _found[problem]
 
 
@@ -59,10 +66,7 @@ def _sought(problem: Problem) -> Equilibrium | None:
     if not float(problem.state_cost(x)) <= least or not float(problem.drift(x).norm()) <= STILL * units[1]:
         return None
     A, Q, B = _slope(problem.drift, at).T, _bend(problem.state_cost, at), problem.control_matrix(x)[0]
-    try:
-        P = riccati(A, B, Q, problem.discount)
-    except (ValueError, np.linalg.LinAlgError):
-        return None  # no linear controller brings the state to rest
+    P = riccati(A, B, Q, problem.discount)
     return Equilibrium(at.remainder(1.0), problem.discount * P, -float((A - B @ B.T @ P).trace()))
 
 

@@ -77,9 +77,15 @@ def test_a_cost_that_is_flat_or_unstable_where_nobody_can_help_has_none_or_a_fin
         def control_matrix(self, x):
             return x.new_zeros(len(x), 2, 1)
 
-    flat, helpless = equilibrium(Flat()), equilibrium(Helpless())
-    assert flat is None or bool(flat.bend.isfinite().all())
-    assert helpless is None
+    class Steep(Swing):
+        def state_cost(self, x):
+            return 1e308 * (math.pi * x).sin().square().sum(dim=-1)
+
+    for problem in (Flat(), Steep()):
+        found = equilibrium(problem)
+        assert found is None or bool(found.bend.isfinite().all())
+    assert equilibrium(Helpless()) is None
+    assert equilibrium(PROBLEMS["torus"](dim=65)) is None
 
 
 def test_a_simulator_is_not_asked():
