@@ -1,4 +1,4 @@
-"""Features that resolve a state of rest: near it `V` may rise within a hundredth of a turn from 0 to half of its largest."""
+"""Features that resolve a state of rest: near it `V` may rise within a fiftieth of a turn to a quarter of its largest."""
 
 import math
 
@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 # Where features level off: at values of `V`, in units of it, below and above which they tell states apart. An acrobot was
-# brought upright from 100 % of its starts with them, and from 3 % without, after as many rounds.
+# upright from 100 % of its starts with them, from 3 % without after as many rounds with half as many fits, and from 56 % at
+# best with a wider network of twice the modes.
 LEVELS = (0.2, 20.0)
 
 

@@ -11,8 +11,8 @@ from ocp_torch.maths.jets import Jet
 
 # The unit, in standard deviations of the state cost: far below it `V` is linear in the network, far above exponential. That
 # of a pendulum with little torque rises from 0.2 to 12 within a tenth of a radian, and must still tell 0.01 from 0.02: fitted
-# to what a grid gave, a plain network lost 9 to 48 % of the return of Pendulum-v1, and this one 7 %. With 0.05 an acrobot
-# learnt half as fast.
+# to what a grid gave, a plain network lost 9 to 48 % of the return of Pendulum-v1, and this one 7 %. After 150
+# rounds an acrobot cost 2.90 with 0.05, and 2.70 with 0.01 and a rate that falls.
 UNIT = 0.01
 
 

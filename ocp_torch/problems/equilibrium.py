@@ -13,7 +13,7 @@ from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.simulator import Simulator
-from ocp_torch.problems.systems.rest import riccati
+from ocp_torch.problems.systems.rest import occupation_bound_at_rest, riccati
 
 # States at which the least cost is sought, ascents from the best of them, and steps of Newton's method after those.
 SEARCHED, ASCENTS, NEWTON = 2**13, 16, 8
@@ -27,12 +27,12 @@ STILL, FLAT = 1e-3, 1e-8
 
 
 class Equilibrium(NamedTuple):
-    """The state ``at`` ``(d,)`` and the Hessian ``bend`` ``(d, d)`` of `V` there, semidefinite, both float64; and the
-    ``contraction``, the rate at which the linear optimal flow loses volume: where it is at least `rho`, mass gathers."""
+    """The state ``at`` ``(d,)`` and the Hessian ``bend`` ``(d, d)`` of `V` there, semidefinite, both float64; and whether
+    mass ``gathers`` there without bound, but for noise (`occupation_bound_at_rest`)."""
 
     at: Tensor
     bend: Tensor
-    contraction: float
+    gathers: bool
 
 
 def equilibrium(problem: Problem) -> Equilibrium | None:
@@ -67,7 +67,8 @@ def _sought(problem: Problem) -> Equilibrium | None:
         return None
     A, Q, B = _slope(problem.drift, at).T, _bend(problem.state_cost, at), problem.control_matrix(x)[0]
     P = riccati(A, B, Q, problem.discount)
-    return Equilibrium(at.remainder(1.0), problem.discount * P, -float((A - B @ B.T @ P).trace()))
+    gathers = occupation_bound_at_rest(A, B, Q, problem.discount, problem.exponent) is not None
+    return Equilibrium(at.remainder(1.0), problem.discount * P, gathers)
 
 
 def _slope(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:

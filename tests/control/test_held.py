@@ -10,7 +10,8 @@ from ocp_torch.control.greedy import HeldPolicy, farthest, kept
 from ocp_torch.control.pace import ANSWERED, Pace
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields import PeriodicMLP
-from ocp_torch.problems import PROBLEMS, Circle, Pendulum
+from ocp_torch.fields.fields import typical_sizes
+from ocp_torch.problems import Acrobot, Circle, Pendubot, Pendulum
 from ocp_torch.problems.control_limit import BoxLimitedCost, LimitedCost
 from ocp_torch.problems.starts import drawn_starts
 from support.zoo import NATURAL, Swing, on, states
@@ -123,10 +124,11 @@ def test_the_pace_knows_no_unit_of_time():
         assert found.substeps == Pace.of(Swing()).substeps
 
 
-@pytest.mark.parametrize("name", ["acrobot", "pendubot", "cart_pole", "pendulum"])
-def test_a_control_is_held_for_a_fifth_at_most_of_the_time_in_which_a_system_answers(name):
-    problem = PROBLEMS[name]()
-    x = drawn_starts(problem, 64, 1)
-    of = lambda y: torch.func.jacrev(lambda z: problem.drift(z.unsqueeze(0))[0])(y)
-    fastest = torch.linalg.eigvals(torch.stack([of(y) for y in x])).abs().amax(dim=-1)
-    assert Pace.of(problem).step * float(fastest.quantile(0.75)) < ANSWERED
+@pytest.mark.parametrize("problem", [Acrobot(), Pendubot()], ids=lambda p: type(p).__name__)
+def test_a_control_is_held_for_a_fifth_of_the_time_in_which_a_system_answers(problem):
+    """Where neither the discount nor the way of a step is shorter; eigenvalues by autograd."""
+    x, size = drawn_starts(problem, 256, 1), typical_sizes(problem)[1]
+    pushed = lambda u: lambda z: problem.velocity(z.unsqueeze(0), z.new_full((1, 1), u))[0]
+    found = [torch.func.jacrev(pushed(size * (-1.0) ** i))(y) for i, y in enumerate(x)]
+    fastest = torch.linalg.eigvals(torch.stack(found)).abs().amax(dim=-1)
+    assert Pace.of(problem).step * float(fastest.quantile(0.9)) == pytest.approx(ANSWERED, rel=0.25)

@@ -21,11 +21,11 @@ def centred(dim: int = 3, unit: float = 0.1) -> tuple[Centred, torch.Tensor, tor
 
 def test_the_quadratic_rise_can_be_read_from_them():
     features, at, bend = centred()
-    y = 1e-4 * torch.randn(50, 3, dtype=torch.float64)
+    y = 1e-5 * torch.randn(50, 3, dtype=torch.float64)
     rise = 0.5 * torch.einsum("ni,ij,nj->n", y, bend, y) / 0.1
     for level, found in zip(LEVELS, features(at + y + 2.0).chunk(len(LEVELS), dim=-1), strict=True):
         squares = level * found.square() / (1.0 - found.square())
-        torch.testing.assert_close(squares.sum(dim=-1), rise, rtol=1e-5, atol=0.0)
+        torch.testing.assert_close(squares.sum(dim=-1), rise, rtol=1e-6, atol=0.0)
 
 
 def test_they_are_bounded_and_periodic_and_nothing_before_there_is_a_state_of_rest():

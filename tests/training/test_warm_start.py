@@ -14,7 +14,7 @@ from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.certificate.trained import TrainedContext
 from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.control.greedy import HeldPolicy
-from ocp_torch.control.pace import MOVED, Pace
+from ocp_torch.control.pace import Pace
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.fields.fields import typical_sizes
@@ -26,7 +26,7 @@ from ocp_torch.runs.run import run_to_end
 from ocp_torch.training import evaluator
 from ocp_torch.training.monitor import Silent
 from ocp_torch.training.warm_start.grid import GridValues
-from ocp_torch.training.warm_start.iteration import ValueIteration
+from ocp_torch.training.warm_start.iteration import ALONG, ValueIteration
 from ocp_torch.training.warm_start.pieces import Trajectories, lambda_returns, roll
 from ocp_torch.training.warm_start.settings import WarmStartSettings
 from ocp_torch.training.warm_start.targets import Targets
@@ -233,14 +233,14 @@ def logarithmic(dim: int, width: int) -> Logarithmic:
         return Logarithmic(PeriodicMLP(dim, width=width), 0.1)
 
 
-def test_a_gradient_that_is_off_counts_over_the_way_of_a_step():
+def test_a_gradient_that_is_off_counts_over_a_part_of_a_turn():
     problem = PROBLEMS["pendulum"](control_limit=1.0)
     warm = ValueIteration(problem, logarithmic(2, 8), WarmStartSettings("on", 10, 8, 1, 0.5), 0)
     x, all_rows = torch.rand(64, 2), torch.arange(64)
     own = jet(warm.network, x)
     found = lambda gradients: warm._squares(Targets(x, own.value, own.value, gradients), all_rows)
     assert float(found(own.gradient).detach().abs().max()) == 0.0
-    torch.testing.assert_close(found(own.gradient + 3.0), torch.full((64,), 2 * (3.0 * MOVED) ** 2))
+    torch.testing.assert_close(found(own.gradient + 3.0), torch.full((64,), 2 * (3.0 * ALONG) ** 2))
 
 
 def test_fits_end_at_no_rate_however_trials_turn_out():

@@ -34,8 +34,7 @@ FASTEST = 2.5
 class GridValues:
     """The value of every node of a grid; found when it is first asked for, always the same."""
 
-    # A trial follows so many rounds, whose fits take about as long as it does (with a discount of 0.1 per second half as
-    # long).
+    # A trial follows so many rounds, whose fits take no less time than it does.
     trial_every, fastest = 40, FASTEST
 
     def __init__(self, problem: Problem, pace: Pace, like: Tensor) -> None:

@@ -48,4 +48,4 @@ def pays(problem: Problem, constants: Constants) -> bool:
     if not underactuated or math.isinf(problem.control_cost.reach) or isinstance(problem, Simulator):
         return False
     rest = equilibrium(problem)
-    return constants.unbounded or (rest is not None and rest.contraction >= problem.discount)
+    return constants.unbounded or (rest is not None and rest.gathers)
