@@ -12,6 +12,7 @@ from ocp_torch.problems.systems.cart_pole import CartPole
 from ocp_torch.problems.systems.double_integrator import DoubleIntegrator
 from ocp_torch.problems.systems.double_pendulum import Acrobot, Pendubot
 from ocp_torch.problems.systems.dubins import Dubins
+from ocp_torch.problems.systems.inverted_double_pendulum import InvertedDoublePendulum
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.mountain_car import MountainCar
 from ocp_torch.problems.systems.pendulum import Pendulum
@@ -43,6 +44,7 @@ PROBLEMS: dict[str, type[Problem]] = {
     "quadrotor": Quadrotor,
     "satellite": Satellite,
     "mountain_car": MountainCar,
+    "inverted_double_pendulum": InvertedDoublePendulum,
 }
 
 # What `Simulator` was called in files written before.

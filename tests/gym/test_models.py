@@ -2,6 +2,7 @@
 
 import math
 from contextlib import closing
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 from ocp_torch.control.policies import zero_policy
 from ocp_torch.errors import InputError
 from ocp_torch.gym.rollout import made, play
-from ocp_torch.problems import Acrobot, CartPole, MountainCar, Pendulum
+from ocp_torch.problems import Acrobot, CartPole, InvertedDoublePendulum, MountainCar, Pendulum
 from ocp_torch.problems.physical.system import System
 from ocp_torch.runs.metrics.classical import classical_policy
 
@@ -34,6 +35,8 @@ CASES = {
     "Acrobot-v1": (ACROBOT, [2.4, -0.7, 0.8, -1.3], [-1.0], lambda s: np.array([s[0] - math.pi, *s[1:]])),
     "MountainCarContinuous-v0": (CAR, [-0.3, 0.02], [0.6], np.array),
 }
+POLES, BALANCED = InvertedDoublePendulum(), "InvertedDoublePendulum-v5"
+mujoco = pytest.mark.skipif(not (find_spec("mujoco") and find_spec("imageio")), reason="gymnasium[mujoco] is missing")
 
 
 class Agent:
@@ -73,6 +76,33 @@ def test_a_step_of_theirs_is_one_of_the_model(name):
         assert off[1] < 0.02 * off[0] + 1e-6  # observations are in single precision
 
 
+@pytest.mark.parametrize("seed", range(4))
+@mujoco
+def test_a_step_of_mujocos_is_one_of_the_model(seed):
+    """It accelerates as the model says, but for a gravity of 1e-5 m/s^2 along the rail; and what it shows after a step, of
+    several by RK4, is off `ds/dt` times the step by its square."""
+    from mujoco import mj_forward
+
+    draws = torch.rand(7, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 0.5
+    s, force = draws[:6] * torch.tensor([1.0, 1.0, 1.0, 3.0, 6.0, 6.0]), 800.0 * float(draws[6])
+    a, B = POLES.dynamics(s[None])
+    rate, off = (a + B[..., 0] * force)[0], []
+    relative = lambda q: np.array([q[0], q[1], q[2] - q[1]])  # the second joint of theirs
+    for shorter in (0.1, 0.01):
+        with closing(made(BALANCED)) as env:
+            env.reset(seed=0)
+            own = env.unwrapped
+            own.model.opt.timestep *= shorter
+            own.set_state(relative(s[:3]), relative(s[3:]))
+            own.data.ctrl[:] = action = POLES.action(np.array([force]))
+            mj_forward(own.model, own.data)
+            assert own.data.qacc == pytest.approx(relative(rate[3:]), abs=2e-5)
+            seen = torch.from_numpy(POLES.observed(env.step(action)[0]))
+        off.append(float((seen - s - own.dt * rate).abs().max()))
+    assert 1e-4 < off[0] < 0.02
+    assert off[1] < 0.02 * off[0]
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_what_they_show_beyond_a_seam_is_taken_at_it(name):
     system, state, *_ = CASES[name]
@@ -100,11 +130,17 @@ def test_torques_between_are_rounded_and_pushes_have_a_side():
 
 @pytest.mark.parametrize(
     ("name", "least", "most"),
-    # Upright for all of an episode; the tip up in 80 to 90 steps of 500; and 100 for the goal less 0.1 a step of full force.
-    [("CartPole-v1", 500.0, 60.0), ("Acrobot-v1", -150.0, -500.0), ("MountainCarContinuous-v0", 80.0, 0.0)],
+    # Upright for all of an episode, at 1 a step, and at 10 less the square of the 0.8 m that the tip lacks of 2 m; the tip up
+    # in 80 to 90 steps of 500; and 100 for the goal less 0.1 a step of full force.
+    [
+        ("CartPole-v1", 500.0, 60.0),
+        pytest.param(BALANCED, 9359.0, 500.0, marks=mujoco),
+        ("Acrobot-v1", -150.0, -500.0),
+        ("MountainCarContinuous-v0", 80.0, 0.0),
+    ],
 )
 def test_the_models_classical_controllers_solve_theirs_and_no_control_does_not(name, least, most):
-    system = CASES[name][0]
+    system = POLES if name == BALANCED else CASES[name][0]
     with closing(made(name)) as env:
         assert play(Agent(system, classical_policy(system)), env, name, 2, 0).returns.min() >= least
         assert play(Agent(system, zero_policy(system)), env, name, 1, 0).returns.max() <= most

@@ -13,6 +13,7 @@ from support.zoo import Swing
 RESTS = {
     "pendulum": (0.0, 0.0),
     "cart_pole": (0.0,) * 4,
+    "inverted_double_pendulum": (0.0,) * 6,
     "acrobot": (0.0,) * 4,
     "pendubot": (0.0,) * 4,
     "quadrotor": (0.0, 1.5, 0.0, 0.0, 0.0, 0.0),

@@ -18,6 +18,7 @@ NEW = [
     "satellite",
     "cart_pole",
     "double_integrator",
+    "inverted_double_pendulum",
     "mountain_car",
     "phase_locked_loop",
 ]

@@ -30,6 +30,7 @@ BETTER = {
     "phase neurons n=2": ("order_after", False),
     "double integrator": ("inside", True),
     "cart-pole": ("success", True),
+    "inverted double pendulum": ("success", True),
     "phase-locked loop": ("locked", True),
 }
 
@@ -100,7 +101,7 @@ def test_a_path_through_an_obstacle_is_no_success_although_it_reaches_the_target
 
 
 @pytest.mark.nightly
-@zoo.on(["arm n=2", "unicycle", "kuramoto n=3", "pendulum", "cart-pole"])
+@zoo.on(["arm n=2", "unicycle", "kuramoto n=3", "pendulum", "cart-pole", "inverted double pendulum"])
 def test_every_system_has_a_picture_that_is_drawn(problem, tmp_path):
     figure = motion(problem, classical_policy(problem))
     figure.savefig(tmp_path / "motion.png", dpi=40)

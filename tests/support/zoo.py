@@ -14,6 +14,7 @@ from ocp_torch.problems import (
     Circle,
     DoubleIntegrator,
     Dubins,
+    InvertedDoublePendulum,
     Kuramoto,
     Manufactured,
     MountainCar,
@@ -150,6 +151,7 @@ _NATURAL = {
     "quadrotor without obstacles": partial(Quadrotor, obstacles=[], control_limit=0.5, thrust_cost=2.0),
     "satellite": Satellite,
     "mountain car": MountainCar,
+    "inverted double pendulum": InvertedDoublePendulum,
     "phase neurons n=3 type 1": partial(PhaseNeurons, neurons=3, response="type1"),
 }
 

@@ -114,6 +114,12 @@ class CartPole(System):
         """To the side the force is on: it is 10 N there, either way."""
         return np.array(control[0] > 0.0, dtype=np.int64)
 
+    def joints(self, s: Tensor) -> Tensor:
+        """The cart and the tip of the pole in m, up positive, ``(N, 2, 2)``."""
+        position, rod = s[:, 0], 2.0 * self.half_length
+        tip = torch.stack([position + rod * s[:, 1].sin(), rod * s[:, 1].cos()], dim=-1)
+        return torch.stack([torch.stack([position, torch.zeros_like(position)], dim=-1), tip], dim=1)
+
     def energy(self, s: Tensor) -> Tensor:
         """Kinetic and potential energy ``(N,)`` in J, the latter 0 with the pole upright."""
         _, pole, velocity, spin = s.unbind(-1)

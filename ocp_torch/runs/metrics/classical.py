@@ -12,6 +12,7 @@ from ocp_torch.problems.systems.cart_pole import CartPole
 from ocp_torch.problems.systems.double_integrator import DoubleIntegrator
 from ocp_torch.problems.systems.double_pendulum import DoublePendulum
 from ocp_torch.problems.systems.dubins import Dubins
+from ocp_torch.problems.systems.inverted_double_pendulum import InvertedDoublePendulum
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.mountain_car import HILLS, MountainCar
@@ -106,6 +107,7 @@ CONTROLS: dict[type[Problem], Callable[..., Tensor]] = {
     Pendulum: energy_pump,
     MountainCar: gather_speed,
     CartPole: feedback.shape_energy,
+    InvertedDoublePendulum: feedback.balance,
     DoubleIntegrator: feedback.linear_quadratic,
     DoublePendulum: feedback.swing_up,
     PhaseLockedLoop: feedback.loop_filter,

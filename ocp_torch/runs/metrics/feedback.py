@@ -9,6 +9,7 @@ from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.systems.cart_pole import CartPole
 from ocp_torch.problems.systems.double_integrator import DoubleIntegrator
 from ocp_torch.problems.systems.double_pendulum import DoublePendulum
+from ocp_torch.problems.systems.inverted_double_pendulum import InvertedDoublePendulum
 from ocp_torch.problems.systems.phase_locked_loop import PhaseLockedLoop
 from ocp_torch.problems.systems.quadrotor import Quadrotor
 from ocp_torch.problems.systems.rest import linearised, riccati
@@ -68,6 +69,12 @@ def shape_energy(problem: CartPole, x: Tensor) -> Tensor:
     P, K = (matrix.to(x) for matrix in regulator(problem, (0.0,) * 4))
     near = 0.5 * torch.einsum("ni,ij,nj->n", s, P, s) < BALANCED
     return torch.where(near.unsqueeze(-1), -s @ K.T, swing)
+
+
+def balance(problem: InvertedDoublePendulum, x: Tensor) -> Tensor:
+    """LQR about upright in the middle of the track."""
+    _, K = regulator(problem, (0.0,) * 6)
+    return -problem.from_torus(x) @ K.T.to(x)
 
 
 def linear_quadratic(problem: DoubleIntegrator, x: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.cart_pole import CartPole
 from ocp_torch.problems.systems.double_pendulum import DoublePendulum
 from ocp_torch.problems.systems.dubins import Dubins
+from ocp_torch.problems.systems.inverted_double_pendulum import InvertedDoublePendulum
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.mountain_car import MountainCar
@@ -191,6 +192,15 @@ def _(problem: CartPole, path: Path) -> dict[str, float]:
     """Success: the pole within 0.2 rad and 0.5 rad/s of upright at the end, and never off the track or out of the box."""
     s = problem.from_torus(path.states[-1])
     return _swung_up(problem, path, s[:, 1:2], s[:, 3:])
+
+
+@measure.register
+def _(problem: InvertedDoublePendulum, path: Path) -> dict[str, float]:
+    """Success: both poles within 0.2 rad and 0.5 rad/s of upright at the end, and never out of the box; and the part of the
+    starts from which the cart ever leaves the track."""
+    s = problem.from_torus(path.states[-1])
+    off = path.each(lambda x: problem.from_torus(x)[:, 0].abs() > problem.track).any(dim=0)
+    return _swung_up(problem, path, s[:, 1:3], s[:, 4:]) | {"off_track": _part(off)}
 
 
 @measure.register

@@ -6,6 +6,7 @@ import torch
 
 from ocp_torch.problems.systems.cart_pole import CartPole
 from ocp_torch.problems.systems.double_pendulum import DoublePendulum
+from ocp_torch.problems.systems.inverted_double_pendulum import InvertedDoublePendulum
 from ocp_torch.problems.systems.quadrotor import Quadrotor
 from ocp_torch.problems.systems.satellite import Satellite
 from ocp_torch.runs.metrics.measures import Path
@@ -30,28 +31,24 @@ def draw_double_pendulum(problem: DoublePendulum, axes: Any, path: Path, k: int)
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="m", title=f"{path.times[k]:.2f} s")
 
 
-def draw_cart(problem: CartPole, axes: Any, path: Path, k: int) -> None:
-    """One trajectory: cart and pole from light to dark, and the way of the tip; the ends of the track dotted. With noise the
+def draw_cart(problem: CartPole | InvertedDoublePendulum, axes: Any, path: Path, k: int) -> None:
+    """One trajectory: cart and poles from light to dark, and the way of the tip; the ends of the track dotted. With noise the
     poses are those of the mean, and the way of each tip is drawn."""
-    rod = 2.0 * problem.half_length
-    tip = lambda s: torch.stack([s[:, 0] + rod * s[:, 1].sin(), rod * s[:, 1].cos()], dim=-1)
     for end in (-problem.track, problem.track):
         axes.axvline(end, color="0.7", linestyle=":")
     axes.axhline(0.0, color="0.8", linewidth=0.8)
     *others, (mean, _) = tracks(path, k)
     for x, look in others:
-        axes.plot(*tip(problem.from_torus(x)).T, "-", **{**look, "color": "C1"})
-    s = problem.from_torus(mean)
-    tips = tip(s)
+        axes.plot(*problem.joints(problem.from_torus(x))[:, -1].T, "-", **{**look, "color": "C1"})
+    poses = problem.joints(problem.from_torus(mean))
+    reach = float(poses[0].diff(dim=0).norm(dim=-1).sum())
     for j in [*range(0, k + 1, max(1, len(path.times) // GHOSTS)), k]:
         dark = dict(color="C0", alpha=1.0 if j == k else 0.15 + 0.35 * j / len(path.times))
-        axes.plot([s[j, 0], tips[j, 0]], [0.0, tips[j, 1]], "-", linewidth=3.0 if j == k else 1.5, **dark)
-        axes.plot(s[j, 0], 0.0, "s", markersize=11 if j == k else 5, **dark)
-    axes.plot(*tips.T, "-", color="C1", linewidth=1.0)
-    wide = problem.track + 1.1 * rod
-    axes.set(
-        xlim=(-wide, wide), ylim=(-1.5 * rod, 1.5 * rod), aspect="equal", xlabel="m", title=f"{path.times[k]:.2f} s"
-    )
+        axes.plot(*poses[j].T, "-", linewidth=3.0 if j == k else 1.5, **dark)
+        axes.plot(*poses[j, 0], "s", markersize=11 if j == k else 5, **dark)
+    axes.plot(*poses[:, -1].T, "-", color="C1", linewidth=1.0)
+    limits = {"xlim": (-problem.track - 1.1 * reach, problem.track + 1.1 * reach), "ylim": (-1.5 * reach, 1.5 * reach)}
+    axes.set(**limits, aspect="equal", xlabel="m", title=f"{path.times[k]:.2f} s")
 
 
 def draw_quadrotors(problem: Quadrotor, axes: Any, path: Path, k: int) -> None:

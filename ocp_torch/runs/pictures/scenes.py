@@ -12,6 +12,7 @@ from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.systems.cart_pole import CartPole
 from ocp_torch.problems.systems.double_pendulum import DoublePendulum
+from ocp_torch.problems.systems.inverted_double_pendulum import InvertedDoublePendulum
 from ocp_torch.problems.systems.kuramoto import Kuramoto
 from ocp_torch.problems.systems.linkage import Linkage
 from ocp_torch.problems.systems.pendulum import Pendulum
@@ -123,6 +124,7 @@ SCENES = {
     PlanarVehicle: Scene(draw_vehicles, 6),
     Pendulum: Scene(draw_pendulums, 6),
     CartPole: Scene(draw_cart, 3, apart=True),
+    InvertedDoublePendulum: Scene(draw_cart, 3, apart=True),
     Kuramoto: Scene(draw_phases, 24),
     PhaseNeurons: Scene(draw_phases, 24),
     DoublePendulum: Scene(draw_double_pendulum, 3, apart=True),
