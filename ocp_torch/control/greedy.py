@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.control.pace import Pace
-from ocp_torch.maths.jets import Field, jet
+from ocp_torch.maths.jets import Field, Jet, jet
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.generator import pull_back
 from ocp_torch.problems.problem import Problem
@@ -21,12 +21,14 @@ NEWTON = 4
 
 
 class HeldPolicy:
-    r"""The `u` that minimises `R(u) + V(x_h(u)) / (rho h)`, `x_h` a step of ``pace`` later, along one direction.
+    r"""The `u` that minimises `R(u) + V(x_h(u)) / (rho h)`, `x_h` a step of ``pace`` later, among a few.
 
     The direction is the greedy control `u_0` where `x` drifts to without control. Along `s u_0`, `0 <= s <= 1`, the end of
     the step moves from there to `x_h(u_0)`, on a straight line for a short step, and the slope of `V` along it is taken to
-    change evenly: so `s` follows from the two gradients at its ends, exactly for a quadratic `V`. Where controls have a
-    limit, the farthest ones along that direction, either way, and none at all are compared with it: where `V` has ridges
+    change evenly: so `s` follows from the two gradients at its ends, exactly for a quadratic `V`. Several controls may be
+    worth different parts of `u_0` (tilting a quadrotor bends `V` more than lifting it: its cost was 0.61 with one part for
+    all, and 0.55 so): for `q = 2` the best where slopes change evenly along each of them is compared with it. Where controls
+    have a limit, the farthest ones along that direction, either way, and none at all are too: where `V` has ridges
     `s u_0` may be far from best (a pendulum in Gymnasium lost 8 to 300 % of the return by it alone, 1.7 to 5 % so; halves
     and quarters of the limit beside them gained nothing). Where the best one changes the control jumps.
     """
@@ -48,6 +50,8 @@ class HeldPolicy:
         along = (moved - drifted) / a_step
         slopes = ((end.gradient * along).sum(dim=-1) for end in (before, jet(self.value, x + moved)))
         part = kept(cost.q, self._price(u), *slopes).unsqueeze(-1) * u
+        if problem.control_dim > 1 and cost.q == 2.0:
+            part = self._apart(x, u, part, drifted, before)
         if math.isinf(cost.reach):
             return part, None
         most = farthest(cost, u)
@@ -66,9 +70,48 @@ class HeldPolicy:
             least = torch.where(better, merit, least)
         return best, way
 
+    def _apart(self, x: Tensor, u: Tensor, part: Tensor, drifted: Tensor, before: Jet) -> Tensor:
+        """``part`` ``(N, m)`` of the greedy ``u``, or where it is better the minimum of the quadratic function that has the
+        slopes at no control, ``before``, and at as much as ``u`` of each control alone."""
+        a_step, size = self.problem.discount * self.pace.step, u.norm(dim=-1, keepdim=True)
+        size = torch.where(size > 0.0, size, 1.0)
+        along, changes = list[Tensor](), list[Tensor]()
+        for axis in torch.eye(u.shape[1]).to(u):
+            moved = self.pace.move(self.problem, x, size * axis)
+            along.append((moved - drifted) / a_step)
+            changes.append(jet(self.value, x + moved).gradient - before.gradient)
+        dot = lambda a, b: (a * b).sum(dim=-1)
+        bend = [
+            [0.5 * (dot(a, c) + dot(b, e)) for b, c in zip(along, changes, strict=True)]
+            for a, e in zip(along, changes, strict=True)
+        ]
+        for i, row in enumerate(bend):
+            row[i] = row[i] + size[:, 0].square()
+        steps, bends_up = solved(bend, [-dot(a, before.gradient) for a in along])
+        found = self.problem.control_cost.within(size * torch.stack(steps, dim=-1), 1.0)
+        both, here = torch.cat([part, found]), torch.cat([x, x])
+        after = self.value((here + self.pace.move(self.problem, here, both)).remainder(1.0))
+        old, new = (self._price(both) + after / a_step).chunk(2)
+        return torch.where((bends_up & (new < old)).unsqueeze(-1), found, part)
+
     def _price(self, u: Tensor) -> Tensor:
         """`R(u)` of controls within the limit, where rounding is no infinite cost."""
         return PowerCost(self.problem.control_cost.q).cost(u)
+
+
+def solved(matrix: list[list[Tensor]], right: list[Tensor]) -> tuple[list[Tensor], Tensor]:
+    """The solutions of `N` symmetric systems, whose entries are ``(N,)``, and where the matrix is positive definite: others
+    mean nothing. By elimination, in operations that controllers can be exported with."""
+    rows, m = [[*row, b] for row, b in zip(matrix, right, strict=True)], len(right)
+    definite = torch.ones_like(right[0], dtype=torch.bool)
+    for i in range(m):
+        definite = definite & (rows[i][i] > 0.0)
+        pivot = torch.where(rows[i][i] > 0.0, rows[i][i], 1.0)
+        rows[i] = [entry / pivot for entry in rows[i]]
+        for j in range(m):
+            if j != i:
+                rows[j] = [entry - rows[j][i] * own for entry, own in zip(rows[j], rows[i], strict=True)]
+    return [row[m] for row in rows], definite
 
 
 def farthest(cost: PowerCost, u: Tensor) -> Tensor:

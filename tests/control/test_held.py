@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from ocp_torch.certificate.checks.observed import largest_jump
-from ocp_torch.control.greedy import HeldPolicy, farthest, kept
+from ocp_torch.control.greedy import HeldPolicy, farthest, kept, solved
 from ocp_torch.control.pace import ANSWERED, Pace
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields import PeriodicMLP
 from ocp_torch.fields.fields import typical_sizes
-from ocp_torch.problems import Acrobot, Circle, Pendubot, Pendulum
+from ocp_torch.problems import Acrobot, Circle, Manufactured, Pendubot, Pendulum, Quadrotor, Satellite
 from ocp_torch.problems.control_limit import BoxLimitedCost, LimitedCost
 from ocp_torch.problems.starts import drawn_starts
 from support.zoo import NATURAL, Swing, on, states
@@ -50,6 +50,50 @@ def test_within_a_limit_neither_its_ends_nor_nothing_are_better(seed):
     u = HeldPolicy(SWING, V, pace)(x).detach()
     for c in (-1.0, 0.0, 1.0):
         assert (paid(SWING, V, pace, x, u) <= paid(SWING, V, pace, x, torch.full_like(u, c)) + 1e-9).all()
+
+
+class Pushed(Manufactured):
+    """Nothing moves by itself."""
+
+    def drift(self, x):
+        return torch.zeros_like(x)
+
+
+def test_of_a_quadratic_value_it_is_the_best_of_several_controls():
+    """With the same `B` everywhere: `(rho I + h B'HB) u = -B'H y` at `y` from the least value."""
+    problem, pace = Pushed(dim=3, control_dim=2), Pace(0.05, 1)
+    H = torch.tensor([[9.0, 2.0, 0.0], [2.0, 1.0, 0.3], [0.0, 0.3, 4.0]]).double()
+    x = 0.5 + 0.1 * (states(problem, 64) - 0.5)
+    V = lambda z: 0.5 * ((z - 0.5) @ H * (z - 0.5)).sum(dim=-1)
+    B = problem.control_matrix(x)
+    A = problem.discount * torch.eye(2).double() + pace.step * B.mT @ H @ B
+    expected = -torch.linalg.solve(A, (B.mT @ H @ (x - 0.5).unsqueeze(-1))).squeeze(-1)
+    torch.testing.assert_close(HeldPolicy(problem, V, pace)(x), expected, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("problem", [Quadrotor(), Satellite()], ids=["quadrotor", "satellite"])
+def test_of_several_controls_it_comes_nearer_to_the_best_than_one_part_of_all(problem, seed, monkeypatch):
+    V, x, pace = bumpy(problem, seed), states(problem, 256), Pace.of(problem)
+    policy = HeldPolicy(problem, V, pace)
+    u = policy(x).detach()
+    monkeypatch.setattr(HeldPolicy, "_apart", lambda self, x, u, part, *_: part)
+    together = policy(x).detach()
+    cost, before = paid(problem, V, pace, x, u), paid(problem, V, pace, x, together)
+    assert (cost <= before + 1e-9 * before.abs()).all()
+    assert (cost < before - 1e-6).double().mean() > 0.05  # mostly the limit is best
+    sides = torch.tensor(problem.control_cost.sides, dtype=torch.float64)
+    assert (u.abs() <= sides * (1.0 + 1e-12)).all()
+
+
+def test_systems_are_solved_where_they_are_positive_definite():
+    draw = torch.randn(200, 3, 3, generator=torch.Generator().manual_seed(0)).double()
+    A, b = draw + draw.mT + 2.0 * torch.eye(3), draw[:, 0]
+    steps, definite = solved([list(row.unbind(-1)) for row in A.unbind(-2)], list(b.unbind(-1)))
+    assert torch.equal(definite, torch.linalg.eigvalsh(A)[:, 0] > 0.0)
+    assert 10 < int(definite.sum()) < 190
+    found = torch.stack(steps, dim=-1)[definite]
+    torch.testing.assert_close(found, torch.linalg.solve(A[definite], b[definite]), rtol=1e-6, atol=1e-9)
 
 
 def test_its_jumps_are_found_so_that_no_bound_rests_on_its_divergence():
