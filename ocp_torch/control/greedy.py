@@ -26,11 +26,12 @@ class HeldPolicy:
     The direction is the greedy control `u_0` where `x` drifts to without control. Along `s u_0`, `0 <= s <= 1`, the end of
     the step moves from there to `x_h(u_0)`, on a straight line for a short step, and the slope of `V` along it is taken to
     change evenly: so `s` follows from the two gradients at its ends, exactly for a quadratic `V`. Several controls may be
-    worth different parts of `u_0` (tilting a quadrotor bends `V` more than lifting it: its cost was 0.61 with one part for
-    all, and 0.55 so): for `q = 2` the best where slopes change evenly along each of them is compared with it. Where controls
-    have a limit, the farthest ones along that direction, either way, and none at all are too: where `V` has ridges
+    worth different parts of `u_0` (tilting a quadrotor bends `V` more than lifting it: with one part for all its cost was
+    0.61, and 0.55 so, on one seed): for `q = 2` what is best where slopes change evenly along each of them is compared with
+    it. Where controls have a limit, the farthest ones along that direction, either way, are too: where `V` has ridges
     `s u_0` may be far from best (a pendulum in Gymnasium lost 8 to 300 % of the return by it alone, 1.7 to 5 % so; halves
-    and quarters of the limit beside them gained nothing). Where the best one changes the control jumps.
+    and quarters of the limit beside them gained nothing). So is no control wherever anything is compared. Where the best one
+    changes the control jumps.
     """
 
     def __init__(self, problem: Problem, value: Field, pace: Pace) -> None:
@@ -50,20 +51,23 @@ class HeldPolicy:
         along = (moved - drifted) / a_step
         slopes = ((end.gradient * along).sum(dim=-1) for end in (before, jet(self.value, x + moved)))
         part = kept(cost.q, self._price(u), *slopes).unsqueeze(-1) * u
+        tried = [part]
         if problem.control_dim > 1 and cost.q == 2.0:
-            part = self._apart(x, u, part, drifted, before)
-        if math.isinf(cost.reach):
+            tried.append(self._apart(x, u, part, drifted, before))
+        if not math.isinf(cost.reach):
+            most = farthest(cost, u)
+            tried += [most, -most]
+        if len(tried) == 1:
             return part, None
-        most = farthest(cost, u)
         # All at once: one after the other takes twice as long for few states.
-        tried = [part, most, -most]
-        x3 = torch.cat([x] * 3)
-        moves = self.pace.move(problem, x3, torch.cat(tried))
-        after = self.value((x3 + moves).remainder(1.0))
+        repeated = torch.cat([x] * len(tried))
+        moves = self.pace.move(problem, repeated, torch.cat(tried))
+        after = self.value((repeated + moves).remainder(1.0))
         tried.append(torch.zeros_like(u))
-        merits = (self._price(torch.cat(tried)) + torch.cat([after, before.value]) / a_step).chunk(4)
+        merits = (self._price(torch.cat(tried)) + torch.cat([after, before.value]) / a_step).chunk(len(tried))
         best, way, least = part, moves[: len(x)], merits[0]
-        others = zip(tried[1:], (*moves[len(x) :].chunk(2), drifted), merits[1:], strict=True)
+        ways = [*moves.chunk(len(tried) - 1), drifted]
+        others = zip(tried[1:], ways[1:], merits[1:], strict=True)
         for other, there, merit in others:
             better = merit < least
             best, way = (torch.where(better.unsqueeze(-1), *pair) for pair in ((other, best), (there, way)))
@@ -71,8 +75,8 @@ class HeldPolicy:
         return best, way
 
     def _apart(self, x: Tensor, u: Tensor, part: Tensor, drifted: Tensor, before: Jet) -> Tensor:
-        """``part`` ``(N, m)`` of the greedy ``u``, or where it is better the minimum of the quadratic function that has the
-        slopes at no control, ``before``, and at as much as ``u`` of each control alone."""
+        """Where the quadratic function with the slopes of `V` at no control, ``before``, and at as much as ``u`` of each
+        control alone is least, ``(N, m)``; ``part`` where that function has no minimum."""
         a_step, size = self.problem.discount * self.pace.step, u.norm(dim=-1, keepdim=True)
         size = torch.where(size > 0.0, size, 1.0)
         along, changes = list[Tensor](), list[Tensor]()
@@ -89,10 +93,7 @@ class HeldPolicy:
             row[i] = row[i] + size[:, 0].square()
         steps, bends_up = solved(bend, [-dot(a, before.gradient) for a in along])
         found = self.problem.control_cost.within(size * torch.stack(steps, dim=-1), 1.0)
-        both, here = torch.cat([part, found]), torch.cat([x, x])
-        after = self.value((here + self.pace.move(self.problem, here, both)).remainder(1.0))
-        old, new = (self._price(both) + after / a_step).chunk(2)
-        return torch.where((bends_up & (new < old)).unsqueeze(-1), found, part)
+        return torch.where(bends_up.unsqueeze(-1), found, part)
 
     def _price(self, u: Tensor) -> Tensor:
         """`R(u)` of controls within the limit, where rounding is no infinite cost."""
