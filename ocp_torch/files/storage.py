@@ -22,6 +22,8 @@ from ocp_torch.files.reading import LARGEST_FILE, kind, opened
 METADATA_KEY, DIGEST_KEY = "ocp_torch", "sha256"
 # Bytes of the header of a safetensors file, and tensors in it, at most: more than any controller or recording has.
 LARGEST_HEADER, MOST_TENSORS = 2**24, 2**14
+# How the names of temporary files end, whatever they are to become.
+PART = ".part"
 
 
 def write_atomically(path: Path, write: Callable[[Path], object], make_room: Callable[[], None] | None = None) -> None:
@@ -35,7 +37,7 @@ def write_atomically(path: Path, write: Callable[[Path], object], make_room: Cal
         raise StorageError(f"{path} is no file but a folder or a device, which nothing may replace.")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", suffix=PART, delete=False) as file:
             temporary = Path(file.name)
         write(temporary)
         sync(temporary)
@@ -64,8 +66,8 @@ def sync(path: Path) -> None:
 
 def sweep_temporaries(folder: Path) -> None:
     """Remove the temporary files in ``folder`` of processes that were killed in `write_atomically`."""
-    for leftover in folder.glob(".*"):
-        if re.fullmatch(r"\..+\.(pt|json|html|safetensors|yaml)\.[a-z0-9_]{8}", leftover.name):
+    for leftover in folder.glob(f".*{PART}"):
+        if re.fullmatch(r"\..+\.[a-z0-9_]{8}", leftover.name.removesuffix(PART)):
             with contextlib.suppress(OSError):
                 leftover.unlink()
 

@@ -164,13 +164,16 @@ def test_a_run_on_a_full_disk_stops_with_a_sentence_and_can_go_on_later(tmp_path
     assert newest(folder / "checkpoints")[0]["step"] == 40
 
 
-@pytest.mark.parametrize("name", ["last.pt", "certificate.json", "controller.safetensors", "config.yaml"])
+@pytest.mark.parametrize("name", ["last.pt", "certificate.json", "controller.safetensors", "config.yaml", "unfinished"])
 def test_what_a_killed_process_left_half_written_is_removed(name, tmp_path, monkeypatch):
     def killed(path):
         monkeypatch.setattr(Path, "unlink", lambda *_, **__: None)
         raise KeyboardInterrupt
 
-    others = [tmp_path / other for other in (name, ".hidden.pt", f".{name}.bak", f"{name}.abcdefgh")]
+    others = [
+        tmp_path / other
+        for other in (name, ".hidden.pt", f".{name}.bak", f"{name}.abcdefgh", f"{name}.part", ".mine.part")
+    ]
     for other in others:
         other.touch()
     with pytest.raises(KeyboardInterrupt):
