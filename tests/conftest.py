@@ -18,6 +18,14 @@ settings.register_profile(
 settings.load_profile("repeatable")
 
 
+# Files that take longest: begun first, so that of several processes none waits for another at the end.
+LONGEST = ("test_readme.py", "test_killed.py", "test_adversarial.py", "test_warm_start.py", "test_export.py")
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
+
+
 @pytest.fixture(autouse=True, scope="session")
 def one_thread():
     """Small networks are faster on one thread, and sums are then added in one order."""

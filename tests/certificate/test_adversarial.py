@@ -39,7 +39,7 @@ pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
 
 QUICK = replace(CHEAP, occupation_states=0, tolerance=1e-2)
 # Of each kind one, in little time; a function that stands still beside one that moves.
-FEW = ("hole 2-d", "hole 5-d", "narrow start", "step", "spike", "sink in a spike", "jump", "flat")
+FEW = ("hole 2-d", "narrow start", "step", "sink in a spike", "jump", "flat")
 VALUES, DENSITIES = tuple(values(Hole(1, 0.1))), tuple(densities(Hole(1, 0.1)))
 STILL = ("sup f", "mean f", "above")
 
@@ -69,7 +69,7 @@ def test_a_few_densities_are_certified_truly(name, density):
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("name", "value", "effort", "seed"), some(8, FAMILY, VALUES, EFFORTS, (0, 1)))
+@pytest.mark.parametrize(("name", "value", "effort", "seed"), some(5, FAMILY, VALUES, EFFORTS, (0, 1)))
 def test_every_value_is_certified_truly(name, value, effort, seed):
     problem = FAMILY[name]()
     certificate = certified(problem, EFFORTS[effort], seed, value=values(problem, seed)[value])
@@ -79,7 +79,7 @@ def test_every_value_is_certified_truly(name, value, effort, seed):
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("name", "density", "effort", "seed"), some(8, FAMILY, DENSITIES, EFFORTS, (0, 1)))
+@pytest.mark.parametrize(("name", "density", "effort", "seed"), some(5, FAMILY, DENSITIES, EFFORTS, (0, 1)))
 def test_every_density_is_certified_truly(name, density, effort, seed):
     problem = FAMILY[name]()
     settings = replace(EFFORTS[effort], stage=StageSettings(steps=0))  # a fit would start from networks
@@ -90,7 +90,7 @@ def test_every_density_is_certified_truly(name, density, effort, seed):
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("name", "value"), some(4, FAMILY, (None, "sup f", "truth")))
+@pytest.mark.parametrize(("name", "value"), some(3, FAMILY, (None, "sup f", "truth")))
 def test_doing_nothing_is_certified_truly_as_a_given_controller(name, value):
     problem = FAMILY[name]()
     certificate = certified_idling(problem, THOROUGH, value=value)
@@ -99,7 +99,7 @@ def test_doing_nothing_is_certified_truly_as_a_given_controller(name, value):
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("name", "method", "seed"), some(4, FAMILY, ("dual", "primal", "pd"), (0, 1)))
+@pytest.mark.parametrize(("name", "method", "seed"), some(3, FAMILY, ("dual", "primal", "pd"), (0, 1)))
 def test_what_training_ends_with_is_certified_truly(name, method, seed, monkeypatch):
     problem = FAMILY[name]()
     assert faults(trained(problem, method, seed, monkeypatch), problem) == []

@@ -19,6 +19,7 @@ SMALL = (
 )
 
 
+@pytest.mark.nightly
 def test_of_the_lowest_bound(tmp_path):
     """Without a fitted density `G` alone bounds what a controller costs: that of `w` over the `mu` of Lemma 2."""
     trainer = small(*SMALL, "certificate.prefer=certified", "certificate.stage.steps=0")

@@ -76,7 +76,7 @@ def test_scaling_never_loses_and_never_passes_the_optimum(name, seed, size):
 
 
 @pytest.mark.nightly
-@settings(max_examples=4)
+@settings(max_examples=2)
 @given(**case)
 def test_averaging_never_loses_and_never_passes_the_optimum(name, seed, size):
     problem = zoo.build(name)
@@ -210,7 +210,7 @@ def perturbed(problem, size=1e-3, seed=0):
     return Perturbed(problem, size).double().requires_grad_(False)
 
 
-@pytest.mark.parametrize("name", ["manufactured 2-d q=1.5", "noisy 1-d"])
+@pytest.mark.parametrize("name", ["manufactured 2-d q=1.5", pytest.param("noisy 1-d", marks=pytest.mark.nightly)])
 def test_a_value_trained_on_for_the_bound_comes_closer_to_the_optimum_from_below(name, monkeypatch):
     for rounds in ("ROUNDS", "NOISY_ROUNDS"):
         monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{rounds}", ((100.0, 150),))

@@ -137,8 +137,9 @@ def test_with_noise_the_occupation_density_is_the_mean_over_paths(problem):
 
 
 @pytest.mark.usefixtures("any_variate")
-@zoo.on(("noisy 1-d", pytest.param("noisy 2-d degenerate", marks=pytest.mark.nightly)))
-@pytest.mark.parametrize("horizon", ["truncated", pytest.param("random", marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@zoo.on(("noisy 1-d", "noisy 2-d degenerate"))
+@pytest.mark.parametrize("horizon", ["truncated", "random"])
 def test_any_control_variate_gives_the_performance_with_noise(problem, horizon):
     """`Perf = E[V mu0] - E int rho e^{-rho t} Q_u` for a rough `V`, by Ito's formula; of 6 intervals 2 may miss."""
     value, missed = zoo.rough_network(problem.dim, seed=1, size=0.05), 0
@@ -154,7 +155,7 @@ def test_any_control_variate_gives_the_performance_with_noise(problem, horizon):
     assert missed <= 2
 
 
-@zoo.on(zoo.QUIET)
+@zoo.on(zoo.QUIET[:2])
 def test_what_the_truncation_leaves_out_is_within_the_bias(problem):
     """From the very starts the exact controller costs what `V*` says; steps so fine that only the tail is missing."""
     found = simulate_performance(problem, problem.exact_control, 4, 2, seed=0, tolerance=1e-9).perf
@@ -211,6 +212,7 @@ class Step(Problem):
         return (x[:, 0] < self.edge).to(x) + self.slope * (1.0 + torch.sin(2.0 * math.pi * x[:, 0]))
 
 
+@pytest.mark.nightly
 @zoo.on(("manufactured 2-d q=1.5", "noisy 1-d"))
 def test_a_density_followed_back_on_several_cores_is_the_same(problem, monkeypatch):
     """To the bit whatever the number of cores, and to rounding that of all states at once."""
@@ -287,7 +289,7 @@ def rounded_perf(problem, rounded, policy):
     return run(None if rounded is None else (rounded, None)), run(None)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize("noise", [0.0, pytest.param(0.02, marks=pytest.mark.nightly)])
 def test_a_rounded_controller_takes_the_place_of_one_that_it_agrees_with(noise):
     problem, asked = zoo.Manufactured(dim=1, noise=noise), []
 
@@ -301,7 +303,7 @@ def test_a_rounded_controller_takes_the_place_of_one_that_it_agrees_with(noise):
     assert single.bias < 1.2 * double.bias + 1e-6
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize("noise", [0.0, pytest.param(0.02, marks=pytest.mark.nightly)])
 def test_where_it_differs_along_the_way_the_bias_says_by_how_much(noise):
     """It is another controller wherever no trajectory starts."""
     problem = zoo.Manufactured(dim=1, noise=noise)
@@ -317,7 +319,7 @@ def test_where_it_differs_along_the_way_the_bias_says_by_how_much(noise):
     assert abs(found.value - exact.value) <= found.bias
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize("noise", [0.0, pytest.param(0.02, marks=pytest.mark.nightly)])
 def test_a_rounded_controller_that_differs_at_the_starts_is_not_used(noise):
     problem = zoo.Manufactured(dim=1, noise=noise)
     found, exact = rounded_perf(problem, lambda x: problem.exact_control(x) + 1e-2, problem.exact_control)

@@ -195,8 +195,7 @@ class Hidden(Circle):
         self.true_sup, self.occupation_bound = self.occupation_bound, None
 
 
-@pytest.mark.parametrize("seed", [0, 7])
-@pytest.mark.parametrize("discount", [1.05, 1.2, 2.0])
+@pytest.mark.parametrize(("discount", "seed"), [(1.05, 0), (1.2, 7), (2.0, 0)])
 def test_half_of_sup_mu_is_caught_on_a_problem_that_does_not_know_it(discount, seed):
     problem = Hidden(discount)
     half = resolve_constants(problem, occupation_bound=0.5 * problem.true_sup)

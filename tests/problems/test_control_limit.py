@@ -411,9 +411,9 @@ def test_the_kernel_methods_refuse_a_limit():
 @pytest.mark.parametrize(
     ("make", "side"),
     [
-        (partial(Manufactured, dim=1, control_limit=0.5, exponent=1.5), 128),
         (partial(Circle, control_limit=0.1), 128),
-        (partial(Manufactured, control_limit=[0.6, 0.3], seed=2), 48),
+        pytest.param(partial(Manufactured, dim=1, control_limit=0.5, exponent=1.5), 128, marks=pytest.mark.nightly),
+        pytest.param(partial(Manufactured, control_limit=[0.6, 0.3], seed=2), 48, marks=pytest.mark.nightly),
     ],
 )
 def test_the_grid_knows_the_limit(make, side):

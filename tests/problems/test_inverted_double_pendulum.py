@@ -127,6 +127,7 @@ def test_what_its_environment_shows_is_the_state_and_its_action_the_force_over_5
     assert POLES.to_action("InvertedDoublePendulum-v5", u).tolist() == pytest.approx([-0.5])
 
 
+@pytest.mark.nightly
 def test_the_classical_controller_stands_and_without_one_they_fall():
     near = torch.tensor([[0.05, 0.05, 0.1, 0.0, 0.1, 0.0], [0.0, -0.1, 0.0, 0.1, 0.0, 0.2]], dtype=torch.float64)
     x = POLES.to_torus(near)

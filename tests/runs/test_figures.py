@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from ocp_torch.certificate import Run
@@ -29,6 +30,7 @@ def test_a_bound_that_does_not_count_is_in_no_picture():
     assert "F_M ≤ OPT" in bracket(said)
 
 
+@pytest.mark.nightly
 def test_the_density_drawn_is_that_fitted_to_the_controller_handed_out(tmp_path, monkeypatch):
     trainer, seen = small("method=pd", "certificate.stage.steps=10"), []
     drawn = Shown.figures

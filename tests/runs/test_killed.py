@@ -76,7 +76,7 @@ def wholes(tmp_path_factory):
 @pytest.mark.parametrize("chain", range(KILLS))
 @pytest.mark.parametrize("way", ["pd", "a simulator"])
 def test_killed_again_and_again_a_run_leaves_what_it_would_have_left(way, chain, wholes, tmp_path):
-    """Killed outright or asked to stop at up to five random moments, by `resume` once there is something to go on from."""
+    """Killed outright or asked to stop at up to three random moments, by `resume` once there is something to go on from."""
     whole, seconds = wholes(way)
     (tmp_path / "swings.py").write_text(textwrap.dedent(SIMULATOR))
     folder, chance, known = tmp_path / "run", random.Random(f"{way} {chain}"), set()
@@ -84,7 +84,7 @@ def test_killed_again_and_again_a_run_leaves_what_it_would_have_left(way, chain,
         going_on = (folder / "checkpoints" / "last.pt").exists()
         words = (f"resume={folder}", *own(folder)) if going_on else (*WAYS[way], f"hydra.run.dir={folder}")
         command = Command("train", *words, cwd=tmp_path, before=slowly)
-        deadline = time.monotonic() + (chance.uniform(0.02, 1.0) * seconds if start < 5 else 600.0)
+        deadline = time.monotonic() + (chance.uniform(0.02, 1.0) * seconds if start < 3 else 600.0)
         while time.monotonic() < deadline and command.running:
             known |= descendants(command.process)
             time.sleep(0.005)

@@ -161,6 +161,9 @@ FEW_SMOOTH = ("manufactured 1-d q=2", "manufactured 2-d mu0", "manufactured 3-d 
 QUIET = FEW_SMOOTH[:3]  # without noise
 FEW = ("circle rho=2", "torus 2-d chain", "torus 3-d random", *FEW_SMOOTH)
 
+# Problems at most on which a quick test is run.
+MANY = 7
+
 
 @cache
 def build(name: str) -> Problem:
@@ -173,8 +176,12 @@ def fresh(name: str) -> Problem:
 
 
 def on(names):
-    """Run a test with its argument ``problem`` set to each of the problems ``names``."""
-    return pytest.mark.parametrize("problem", names, indirect=True)
+    """Run a test with its argument ``problem`` set to each of the problems ``names``; of more than `MANY` the quick tests
+    take every so many and the last one, and the nightly tests the others."""
+    every = math.ceil(len(names) / MANY)
+    rare = [] if every == 1 else [n for k, n in enumerate(names) if k % every and n != names[-1]]
+    cases = [pytest.param(name, marks=pytest.mark.nightly) if name in rare else name for name in names]
+    return pytest.mark.parametrize("problem", cases, indirect=True)
 
 
 def states(problem: Problem, count: int, seed: int = 0, dtype=torch.float64, off_kinks: bool = False) -> torch.Tensor:

@@ -107,7 +107,10 @@ def test_the_liouville_residual_is_that_of_finite_differences(way):
 
 @pytest.mark.parametrize(
     ("override", "why"),
-    [("trainer.steps=8", "all 8 steps are done"), ("trainer.max_seconds=1e-9", "trainer.max_seconds")],
+    [
+        ("trainer.steps=8", "all 8 steps are done"),
+        pytest.param("trainer.max_seconds=1e-9", "trainer.max_seconds", marks=pytest.mark.nightly),
+    ],
     ids=["steps", "seconds"],
 )
 def test_after_the_last_step_one_is_told_why_and_what_is_being_made(override, why, tmp_path, caplog):

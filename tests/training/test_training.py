@@ -115,6 +115,7 @@ def test_a_run_that_may_stop_at_a_look_has_one_on_the_way():
     assert trainer.settings.evaluate_every == 450
 
 
+@pytest.mark.nightly
 def test_a_round_ends_with_a_look_but_the_last_one_which_a_certificate_follows():
     class Looks(Silent):
         def __init__(self):
@@ -148,7 +149,7 @@ RUNS = {
 }
 
 
-@pytest.fixture(scope="module", params=RUNS, ids=lambda d: f"d={d}")
+@pytest.fixture(scope="module", params=[1, 2, pytest.param(3, marks=pytest.mark.nightly)], ids=lambda d: f"d={d}")
 def run(request, tmp_path_factory):
     """A finished run in its folder, and its configuration."""
     trainer = small(*RUNS[request.param], "certificate.points=64", "certificate.ascents=1", "seed=5")

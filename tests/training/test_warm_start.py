@@ -76,6 +76,7 @@ def test_the_exact_value_is_a_fixed_point_to_first_order_in_the_step_at_least(pr
     assert errors[1] < 0.6 * errors[0] < 0.01 * spread or errors[0] < 1e-4 * spread
 
 
+@pytest.mark.nightly
 @on([name for name in FEW_SMOOTH if name not in QUIET])
 def test_returns_along_noisy_pieces_have_the_value_as_their_mean(problem):
     x = states(problem, 4).repeat_interleave(4096, dim=0)
@@ -279,6 +280,7 @@ def warmed_up_to(*costs: float, rounds: int) -> ValueIteration:
     return warm
 
 
+@pytest.mark.nightly
 def test_the_best_controller_is_kept_and_half_of_the_rounds_are_enough_to_find_none():
     warm = warmed_up_to(4.0, 2.0, 6.0, 1.0, rounds=40)
     assert (warm.least, warm.trial.costs, warm.round, warm.found) == (1.0, [], 40, True)
