@@ -35,7 +35,7 @@ WAYS = {
     "primal": (*RUN, "method=primal"),
     "pd": (*RUN, "method=pd"),
     "a simulator": (*RUN, "problem=callable", "problem.target=swings:swing", "problem.dim=1", "problem.workers=2"),
-    "numbers of its own": (*RUN, "problem=arm", "trainer.evaluate_every=0", "trainer.steps=20"),
+    "numbers of its own": (*RUN, "problem=double_integrator", "trainer.evaluate_every=0", "trainer.steps=20"),
 }
 
 

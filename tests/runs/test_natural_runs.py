@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
 
 @pytest.mark.nightly
 def test_a_run_leaves_numbers_and_a_picture(tmp_path):
-    session(small("problem=kuramoto", "method=dual"), tmp_path)
+    session(small("problem=double_integrator", "method=dual"), tmp_path)
     assert (tmp_path / "figures" / "motion.png").stat().st_size > 0
     found = json.loads((tmp_path / METRICS).read_text())
     assert {"controller", "zero", "classical"} <= found.keys()
@@ -38,7 +38,7 @@ def test_a_run_leaves_numbers_and_a_picture(tmp_path):
 
 @pytest.mark.nightly
 def test_a_run_without_simulations_has_no_numbers(tmp_path):
-    session(small("problem=kuramoto", "method=dual", "certificate.trajectories=0", "trainer.figures=false"), tmp_path)
+    session(small("problem=double_integrator", "method=dual", "certificate.trajectories=0", "trainer.figures=false"), tmp_path)
     assert not (tmp_path / METRICS).exists()
 
 
