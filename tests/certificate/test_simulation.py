@@ -229,8 +229,7 @@ def test_a_density_followed_back_on_several_cores_is_the_same(problem, monkeypat
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("slope", [0.0, pytest.param(0.2, marks=pytest.mark.nightly)])
-@pytest.mark.parametrize("starts", [16, pytest.param(64, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(("slope", "starts"), [(0.0, 16), (0.2, 64)])
 def test_intervals_cover_the_cost_of_a_jump_however_alike_the_replicates(slope, starts):
     """The start of the stratum with the edge nearly always falls on one side. At 5 % no more than 9 of 80 may miss."""
     problem = Step(math.floor(0.4 * starts) / starts + 0.13 / starts, slope)
