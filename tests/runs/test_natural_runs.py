@@ -38,7 +38,10 @@ def test_a_run_leaves_numbers_and_a_picture(tmp_path):
 
 @pytest.mark.nightly
 def test_a_run_without_simulations_has_no_numbers(tmp_path):
-    session(small("problem=double_integrator", "method=dual", "certificate.trajectories=0", "trainer.figures=false"), tmp_path)
+    session(
+        small("problem=double_integrator", "method=dual", "certificate.trajectories=0", "trainer.figures=false"),
+        tmp_path,
+    )
     assert not (tmp_path / METRICS).exists()
 
 
