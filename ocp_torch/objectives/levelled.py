@@ -28,10 +28,13 @@ class LevelledDual(Objective):
             generator = self.generator(tail)
             slack = generator.hjb_slack(generator.chunked_jet(V))
             level = upper_quantile(slack, weight, len(samples) / (M * len(tail)))
-        # At the best level the loss does not change with it to first order; and no gradient comes from where Q is below it.
-        # What is not a number is not below, and is met by whoever looks at the loss.
+        # No gradient comes from below the level. What is not a number is not below, and is met by whoever looks at the loss.
+        # Those at the level have what the others leave of 1: weights of another sum move the constant in V at every step,
+        # which cost the bound of a pendulum with limited torque 0.5 % after 2,100 steps (2.958 for 2.972).
         above = ~(slack < level)
+        share = M * weight[above] / len(samples)
+        higher = slack[above] > level
+        share = torch.where(higher, share, (1.0 - share[higher].sum()) / (~higher).sum())
         generator = self.generator(tail.take(above))
-        excess = weight[above] * (generator.hjb_slack(generator.jet(V)) - level).clamp_min(0.0)
         paid = start.weight * V(start.x) * start.mu0
-        return {"value": level + (M * excess.sum() - paid.sum()) / len(samples)}
+        return {"value": (share * generator.hjb_slack(generator.jet(V))).sum() - paid.sum() / len(samples)}

@@ -54,3 +54,12 @@ def test_a_slack_that_is_no_number_makes_a_loss_that_is_none():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(problem, "state_cost", holed)
         assert loss(problem, value, x, 20.0).isnan()
+
+
+@pytest.mark.parametrize("M", [1.0, 7.3, 20.0, 300.0])
+def test_a_constant_in_the_value_has_no_gradient(M):
+    problem = zoo.build("limited 2-d")
+    value, x = zoo.rough_network(2, seed=4), zoo.states(problem, 300)
+    value.head.bias.requires_grad_(True)
+    (moved,) = torch.autograd.grad(loss(problem, value, x, M), [value.head.bias])
+    assert float(moved.abs().max()) < 1e-12
