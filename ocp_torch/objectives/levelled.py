@@ -30,8 +30,8 @@ class LevelledDual(Objective):
             level = upper_quantile(slack, weight, len(samples) / (M * len(tail)))
         # No gradient comes from below the level. What is not a number is not below, and is met by whoever looks at the loss.
         # Those at the level have what the others leave of 1: weights of another sum move the constant in V at every step.
-        # With such the bound of a pendulum with limited torque was 2.958 after 2,100 steps, with these 2.973; after 4,500 both
-        # have 2.993.
+        # With such the bound of a pendulum with limited torque was 2.958 after 2,100 steps, with these 2.973; after 4,500
+        # both have 2.993.
         above = ~(slack < level)
         share = M * weight[above] / len(samples)
         higher = slack[above] > level
