@@ -1,6 +1,7 @@
 """What every test shares: one thread, repeatable hypothesis examples, the devices there are, and the zoo as a fixture."""
 
 import math
+from collections import Counter
 from dataclasses import replace
 
 import pytest
@@ -23,7 +24,10 @@ LONGEST = ("test_readme.py", "test_killed.py", "test_adversarial.py", "test_warm
 
 
 def pytest_collection_modifyitems(items):
-    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
+    """The longest files, then those with most tests: what is begun last is short."""
+    many = Counter(item.path for item in items)
+    place = lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST)
+    items.sort(key=lambda item: (place(item), -many[item.path], item.path))
 
 
 @pytest.fixture(autouse=True, scope="session")
