@@ -127,6 +127,12 @@ class Certificate:
         }
 
     @property
+    def hoped_gap(self) -> float | None:
+        """The simulated gap if each lower bound counted, that of an `M` that nobody has looked at as well: to decide by, not
+        to claim. `None` where the sides cross, as with an `M` that is too small."""
+        return relative_gap(self._highest(lambda name: True), self.best_perf)
+
+    @property
     def plain_gap(self) -> float | None:
         """The simulated gap between values, without errors on top: to decide by, not to claim."""
         lower, perf = self.best_lower, self.best_perf

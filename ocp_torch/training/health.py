@@ -36,6 +36,9 @@ class Evaluation:
     gap: float | None  # relative, from the lower bound to the simulated performance, between the far ends of both
     perf: float | None  # simulated, the upper end of its interval
     noise: float
+    supposed: float | None = (
+        None  # the gap if `F_M` counts: whether its `M` is large enough is seen by the full certificate
+    )
 
     @classmethod
     def at(cls, step: int, certificate: Certificate) -> "Evaluation":
@@ -44,12 +47,16 @@ class Evaluation:
         ends += [certificate.perf[perf[0]]] if perf else []
         errors = sum(e.half_width(certificate.confidence) for e in ends if e is not None)
         unit = lower[1] if lower and gap is not None else perf[1] if perf else 1.0
-        return cls(step, gap, perf[1] if perf else None, errors / abs(unit) if unit else 0.0)
+        noise = errors / abs(unit) if unit else 0.0
+        return cls(step, gap, perf[1] if perf else None, noise, certificate.hoped_gap)
 
     def better_than(self, other: "Evaluation | None", sure: bool = False) -> bool:
-        """By the gap, or by the performance where neither has one; with ``sure``, by more than the noise of both."""
+        """By the gap, or by the performance where neither has one; with ``sure``, by more than the noise of both, and not
+        where it would be the other if `F_M` counts."""
         if other is None:
             return self.gap is not None or self.perf is not None
+        if sure and self.supposed is not None and other.supposed is not None and self.supposed > other.supposed:
+            return False
         margin = self.noise + other.noise if sure else 0.0
         if self.gap is not None and other.gap is not None:
             return self.gap + margin < other.gap

@@ -163,6 +163,11 @@ def test_the_last_fields_are_handed_out_unless_they_are_clearly_worse(tmp_path, 
     assert not noisy.better_than(worse, sure=True)
     assert noisy.better_than(Evaluation(2, 0.15, 1.0, 0.02), sure=True)
     assert noisy.better_than(Evaluation(2, None, 0.1, 0.0))
+    # A look does not see whether `F_M` counts: where that would turn it round, nothing is sure.
+    hoped = lambda step, gap, hoped: Evaluation(step, gap, 1.0, 0.01, hoped)
+    assert not hoped(1, 0.07, 0.03).better_than(hoped(2, 0.12, 0.01), sure=True)
+    assert hoped(1, 0.07, 0.01).better_than(hoped(2, 0.12, 0.03), sure=True)
+    assert hoped(1, 0.07, None).better_than(hoped(2, 0.12, 0.03), sure=True)
     assert Evaluation(1, None, 1.0, 0.01).better_than(Evaluation(2, None, 1.1, 0.01), sure=True)
     assert not Evaluation(1, None, 1.0, 0.06).better_than(Evaluation(2, None, 1.1, 0.06), sure=True)
     assert not Evaluation(1, None, None, 0.0).better_than(None)
