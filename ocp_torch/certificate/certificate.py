@@ -127,9 +127,9 @@ class Certificate:
         }
 
     @property
-    def hoped_gap(self) -> float | None:
-        """The simulated gap if each lower bound counted, that of an `M` that nobody has looked at as well: to decide by, not
-        to claim. `None` where the sides cross, as with an `M` that is too small."""
+    def supposed_gap(self) -> float | None:
+        """The simulated gap if every lower bound counted, whatever it rests on: to decide by, not to claim. `None` where the
+        sides cross, as they may where `M` is too small."""
         return relative_gap(self._highest(lambda name: True), self.best_perf)
 
     @property

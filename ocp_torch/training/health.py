@@ -36,9 +36,8 @@ class Evaluation:
     gap: float | None  # relative, from the lower bound to the simulated performance, between the far ends of both
     perf: float | None  # simulated, the upper end of its interval
     noise: float
-    supposed: float | None = (
-        None  # the gap if `F_M` counts: whether its `M` is large enough is seen by the full certificate
-    )
+    # The gap if `F_M` counts as well: whether its `M` is large enough is for the full certificate to see, not for a look.
+    supposed: float | None = None
 
     @classmethod
     def at(cls, step: int, certificate: Certificate) -> "Evaluation":
@@ -48,7 +47,7 @@ class Evaluation:
         errors = sum(e.half_width(certificate.confidence) for e in ends if e is not None)
         unit = lower[1] if lower and gap is not None else perf[1] if perf else 1.0
         noise = errors / abs(unit) if unit else 0.0
-        return cls(step, gap, perf[1] if perf else None, noise, certificate.hoped_gap)
+        return cls(step, gap, perf[1] if perf else None, noise, certificate.supposed_gap)
 
     def better_than(self, other: "Evaluation | None", sure: bool = False) -> bool:
         """By the gap, or by the performance where neither has one; with ``sure``, by more than the noise of both, and not

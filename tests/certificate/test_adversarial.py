@@ -39,7 +39,7 @@ pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
 
 QUICK = replace(CHEAP, occupation_states=0, tolerance=1e-2)
 # Of each kind one, in little time; a function that stands still beside one that moves.
-FEW = ("hole 2-d", "narrow start", "step", "sink in a spike", "jump", "flat")
+FEW = ("hole 2-d", "hole 5-d", "narrow start", "step", "spike", "sink in a spike", "jump", "flat")
 VALUES, DENSITIES = tuple(values(Hole(1, 0.1))), tuple(densities(Hole(1, 0.1)))
 STILL = ("sup f", "mean f", "above")
 

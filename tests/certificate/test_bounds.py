@@ -121,6 +121,8 @@ def test_what_its_need_says_decides_whether_it_counts(listed):
     found = certificate()
     assert not found.to_dict()["lower"]["toy"]["counts"]
     assert found.gap["lower_from"] != "toy"
+    assert found.supposed_gap == pytest.approx(found.best_perf[1] / (0.9999 * OPT) - 1.0)
+    assert found.supposed_gap < found.gap["simulated"]
     assert not found.hold
     assert "not used" in row(found, "a toy")
 
@@ -136,6 +138,7 @@ def test_one_that_rests_on_a_guess_is_conditional_until_another_refutes_it(liste
     assert found.hold
     assert (said.get("if") == "the toy is right") == (part < 1.0)
     assert (found.gap["conditional"] is not None) == (part < 1.0)
+    assert (found.supposed_gap is not None) == (part < 1.0)
     assert any("it is not so that the toy is right" in w for w in found.warnings) == (part > 1.0)
 
 

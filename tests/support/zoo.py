@@ -176,10 +176,10 @@ def fresh(name: str) -> Problem:
 
 
 def on(names):
-    """Run a test with its argument ``problem`` set to each of the problems ``names``; of more than `MANY` the quick tests
-    take every so many and the last one, and the nightly tests the others."""
-    every = math.ceil(len(names) / MANY)
-    rare = [] if every == 1 else [n for k, n in enumerate(names) if k % every and n != names[-1]]
+    """Run a test with its argument ``problem`` set to each of the problems ``names``. Of more than `MANY` the quick tests
+    take `MANY` at most, evenly spread and the last one among them, and the nightly tests the others."""
+    every = 1 if len(names) <= MANY else math.ceil(len(names) / (MANY - 1))
+    rare = [name for k, name in enumerate(names) if k % every and name != names[-1]]
     cases = [pytest.param(name, marks=pytest.mark.nightly) if name in rare else name for name in names]
     return pytest.mark.parametrize("problem", cases, indirect=True)
 
