@@ -28,10 +28,20 @@ class FourierEmbedding(nn.Module):
         self.register_buffer("wave_numbers", torch.arange(1.0, modes + 1.0), persistent=False)
         self.register_buffer("mixed", torch.zeros(waves, dim) if waves else None)
 
-    def mix(self, waves: Tensor) -> None:
-        """Take the wave vectors ``waves`` ``(W, d)``, of which there may be fewer than room is left for."""
+    @property
+    def free(self) -> list[int]:
+        """The places of ``mixed`` that hold no wave vector yet."""
+        return [] if self.mixed is None else (self.mixed == 0.0).all(dim=-1).nonzero().flatten().tolist()
+
+    def mix(self, waves: Tensor) -> tuple[list[int], list[int]]:
+        """Take the wave vectors ``waves`` ``(W, d)``, as many as there are free places. Gives the columns of the new
+        features: those of cosines, which were 1 until now, and those of sines, which were 0."""
+        places = self.free[: len(waves)]
         if self.mixed is not None:
-            self.mixed[: len(waves)] = waves[: len(self.mixed)]
+            self.mixed[places] = waves[: len(places)].to(self.mixed)
+            first = self.width // 2 - len(self.mixed)
+            places = [first + i for i in places]
+        return places, [self.width // 2 + i for i in places]
 
     def waves(self, dim: int) -> Tensor:
         """All wave vectors, ``(J, d)``, in the order of `forward`."""

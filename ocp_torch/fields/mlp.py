@@ -104,6 +104,17 @@ class PeriodicMLP(nn.Module):
             sizes = {**sizes, "modes": NOISY_MODES}
         return {**sizes, "waves": waves, "activation": "gelu" if gentle else "tanh"}
 
+    @torch.no_grad()
+    def add_waves(self, waves: Tensor) -> None:
+        """Take the wave vectors ``waves`` ``(W, d)``, as many as the embedding has room for, and stay the same function: the
+        weights of the new features start at 0, and what they made of a constant is the bias's."""
+        cosines, sines = self.embedding.mix(waves)
+        first: nn.Module = self.body[0]
+        for layer in first.modules():
+            if isinstance(layer, nn.Linear):
+                layer.bias.add_(layer.weight[:, cosines].sum(dim=1))
+                layer.weight[:, cosines + sines] = 0.0
+
     def forward(self, x: Tensor) -> Tensor:
         features = self.embedding(x)
         if self.centred is not None:

@@ -62,13 +62,17 @@ class TrainerSettings:
         available = "cuda" if torch.cuda.is_available() else "cpu"
         return torch.device(available if self.device == "auto" else self.device)
 
+    def start(self, k: int) -> int:
+        """The number of steps after which round ``k`` begins."""
+        return self.steps * (2**k - 1)
+
     def end(self, k: int) -> int:
         """The number of steps after which round ``k`` (from 0), which has `2^k` times as many as the first, is over."""
         return self.steps * (2 ** (k + 1) - 1)
 
     def part_done(self, step: int, k: int) -> float:
         """The part of round ``k`` that is done after ``step`` steps."""
-        return 1.0 - (self.end(k) - step) / (self.steps * 2**k)
+        return (step - self.start(k)) / (self.steps * 2**k)
 
     def round_at(self, step: int) -> int:
         """The round that a run is in after ``step`` steps."""

@@ -24,6 +24,7 @@ from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.health import Evaluation, sanity_warnings
 from ocp_torch.training.observer import Silent
 from ocp_torch.training.settings import TrainerSettings
+from ocp_torch.training.slack_waves import SOUGHT_AT, add_waves, missed_waves
 from ocp_torch.training.state import TrainState
 from ocp_torch.training.stopping import ASKED, MAX_SECONDS, STEPS, TARGET_GAP, Signals, in_words, reason_to_stop
 from ocp_torch.training.whole_step import whole_step
@@ -169,6 +170,10 @@ class Trainer:
         state.step += 1
         state.samples += self.ranks.size * report.samples
         state.seconds += time.perf_counter() - started
+        if state.step - settings.start(state.round) in SOUGHT_AT:
+            waves = self.ranks.from_first(lambda: missed_waves(self.problem, self.averaged_fields))
+            for fields in (self.fields, self.averaged_fields):
+                add_waves(fields, waves)
         due = lambda every: every > 0 and state.step % every == 0
         last = state.step == self.end
         log = due(settings.log_every) or last
