@@ -18,8 +18,9 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.studies.benchmark import measure
 from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender, RLContender, require_rl
 from ocp_torch.studies.benchmark.contest import Contest
+from ocp_torch.studies.benchmark.families import Family, by_dimension, exponent, joined, seconds_until
 from ocp_torch.studies.benchmark.measure import Curve, Judge, Point, due, median_and_spread, relative, tabulated
-from ocp_torch.studies.benchmark.report import contest_table, reference, save
+from ocp_torch.studies.benchmark.report import contest_table, reference
 from ocp_torch.studies.paper import figures
 from ocp_torch.studies.paper.reproduce import check, report, reproduce
 from ocp_torch.studies.paper.runs import RECIPES, carry_out, circle, compare_with_exact
@@ -143,18 +144,80 @@ def test_looks_grow_by_a_factor_and_spreads_are_medians():
     assert median_and_spread([3.0, 1.0, 2.0]) == (2.0, 1.0, 3.0)
 
 
-def test_the_report_says_what_was_reached_and_its_file_holds_the_curves(tmp_path):
+def test_the_report_says_what_was_reached():
     curves = [curve("slow", s, [1.5, 1.2, 1.1]) for s in (0, 1)] + [curve("fast", 0, [1.5, 1.005, 1.004], 0.003)]
-    text = save(curves, 1.0, tmp_path)
+    text = contest_table(curves, 1.0)
     assert "not reached" in text
     assert "0.3 %" in text
     row = next(line for line in text.splitlines() if line.startswith("| fast"))
     assert "| 20 |" in row
-    assert json.loads((tmp_path / "curves.json").read_text()) == [dataclasses.asdict(c) for c in curves]
     assert "1 % on Perf in the fewest samples: fast, 20." in text
     assert "slow" not in text.rsplit("\n\n", 1)[1]
     assert reference(curves, None) == (0.9, "the best lower bound found")
     assert "the best lower bound found" in contest_table(curves, None)
+
+
+def family(dim, *curves, problem="torus", exact=1.0) -> Family:
+    return Family(problem, dim, exact, list(curves), {"torch": "1"})
+
+
+def test_a_family_is_read_as_it_was_written_without_what_was_not_finite(tmp_path):
+    written = family(2, curve("a", 0, [1.5, math.nan, 1.004], 0.003), curve("b", 1, [1.2]))
+    written.write(tmp_path)
+    read = Family.read(tmp_path / "curves.json")
+    assert read.curves[1] == written.curves[1]
+    assert read.curves[0].points[1].numbers == {"F_M": 0.9, "J": 1.2}
+    assert (read.title, read.exact, read.versions) == ("torus, d = 2", 1.0, {"torch": "1"})
+
+
+def test_of_families_of_one_title_the_first_one_s_curves_stay_and_others_join():
+    new, old = curve("a", 0, [1.1]), curve("a", 0, [1.5])
+    more = [curve("a", 1, [1.5]), curve("sac", 0, [2.0])]
+    found = joined([family(3, new), family(1, old), family(3, old, *more), family(1, old, problem="arm")])
+    assert [f.title for f in found] == ["torus, d = 1", "torus, d = 3", "arm, d = 1"]
+    assert found[1].curves == [new, *more]
+
+
+def test_seconds_until_a_gap_lie_on_a_power_law_between_points():
+    """A gap of `1 / (1 + seconds)^2` here, at seconds of 1, 3 and 9; nothing that rises again counts."""
+    at = lambda s, gap: Point(1, s, {"value": 1.0 + gap, "F_M": 1.0})
+    falling = Curve("a", 0, [at(s, s**-2.0) for s in (1.0, 3.0, 9.0)])
+    for gap in (0.5, 0.05, 0.0124):
+        assert seconds_until(falling, gap) == pytest.approx(gap**-0.5)
+    assert seconds_until(falling, 2.0) == 1.0
+    assert seconds_until(falling, 0.01) == math.inf
+    assert seconds_until(Curve("a", 0, [*falling.points, at(10.0, 0.3)]), 0.05) == math.inf
+    assert seconds_until(Curve("a", 0, [Point(1, 0.5, {"value": 1.0, "F_M": -1.0}), at(2.0, 0.01)]), 0.05) == 2.0
+
+
+def test_the_cost_of_dimensions_has_an_exponent_where_there_are_three():
+    reached = lambda seconds: Curve("a", 0, [Point(1, seconds, {"value": 1.001, "F_M": 1.0})])
+    never = Curve("a", 1, [Point(1, 1.0, {"value": 2.0, "F_M": 1.0})])
+    three = [family(d, reached(0.5 * d**1.5)) for d in (1, 4, 16)]
+    ((name, pairs),) = by_dimension([*three, family(2, reached(1.0), problem="arm")], 0.01).items()
+    assert name == "torus, a"
+    assert exponent(pairs) == pytest.approx(1.5)
+    assert by_dimension([*three[:2], family(16, reached(1.0), never)], 0.01) == {}
+
+
+def test_what_was_measured_before_is_drawn_beside(tmp_path):
+    for dim in (1, 2, 8):
+        family(dim, curve("mlp dual", 0, [1.5, 0.9008]), problem="manufactured").write(tmp_path / str(dim))
+    config = composed("benchmark", ["contenders=[]", f"beside=[{tmp_path}]"])
+    assert Contest(config).run(tmp_path / "drawn") == []
+    files = {path.name for path in (tmp_path / "drawn").iterdir()}
+    assert files == {"benchmark.md", "benchmark.png", "dimensions.png"}
+    text = (tmp_path / "drawn" / "benchmark.md").read_text()
+    assert "## manufactured, d = 8" in text
+    assert "CPU seconds to a simulated gap of 0.5 % as d^" in text
+
+
+@pytest.mark.parametrize("content", [None, "{}", "[]", '{"curves": [{"points": 3}]}', '{"curves": [], "x": 1}'])
+def test_what_is_no_benchmark_is_not_drawn_beside(content, tmp_path):
+    if content is not None:
+        (tmp_path / "curves.json").write_text(content)
+    with pytest.raises(InputError, match=str(tmp_path)):
+        Contest(composed("benchmark", ["contenders=[]", f"beside=[{tmp_path}]"]))
 
 
 def test_certified_gaps_are_held_against_the_paper_s_primal_dual():

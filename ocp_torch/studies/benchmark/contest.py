@@ -8,13 +8,15 @@ import torch
 from tqdm import tqdm
 
 from ocp_torch.certificate.settings import require_possible
+from ocp_torch.control.controller import problem_name
 from ocp_torch.errors import InputError, call, require_choice, require_integer, require_number, require_section
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.runs.build import build_certificate_settings, build_problem, build_trainer
+from ocp_torch.runs.canvas import save
 from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender, RLContender, require_rl
+from ocp_torch.studies.benchmark.families import Family, joined, pictures, read_beside, tables, versions
 from ocp_torch.studies.benchmark.measure import Curve, Judge
-from ocp_torch.studies.benchmark.report import plot, save
 from ocp_torch.training.budgets import fill
 
 log = logging.getLogger(__name__)
@@ -56,7 +58,9 @@ class Contest:
         torch.set_num_threads(1)
         self.constants = resolve_constants(self.problem)
         names, seeds = config["contenders"], config["seeds"]
-        if not isinstance(names, list) or not names:
+        self.beside = read_beside(config["beside"])
+        self.gap = require_number("equal_gap", config["equal_gap"], above=0.0)
+        if not isinstance(names, list) or not (names or self.beside):
             raise InputError(f"contenders is {names!r}, but must be a list of {', '.join(EVERYONE)}.")
         if not isinstance(seeds, list) or not seeds:
             raise InputError(f"seeds is {seeds!r}, but must be a list of whole numbers, as in [0,1,2].")
@@ -71,11 +75,13 @@ class Contest:
         require_possible(self.problem, self.certificate)
 
     def run(self, folder: Path) -> list[Curve]:
-        """Run everyone with every seed; what is there so far is saved after each run.
+        """Run everyone with every seed; what is there so far is saved after each run. The pictures have the families beside,
+        if there are any; of no contender nothing but these is drawn.
 
         A kernel method without a time of its own gets that of the longest run before it: they are compared at equal time.
         """
-        judge, exact = Judge(self.problem, self.constants), self.problem.exact_optimum
+        folder.mkdir(parents=True, exist_ok=True)
+        judge = Judge(self.problem, self.constants)
         curves: list[Curve] = []
         with tqdm(total=len(self.contenders) * len(self.seeds), unit="run", disable=None) as bar:
             for one in self.contenders:
@@ -84,11 +90,18 @@ class Contest:
                 for seed in self.seeds:
                     bar.set_postfix_str(f"{one.name}, seed {seed}")
                     curves.append(one.run(seed, judge, self.certificate))
-                    text = save(curves, exact, folder)
+                    self._family(curves).write(folder)
                     bar.update()
-        plot(curves, exact).savefig(folder / "benchmark.png", dpi=130)
+        families = joined([*([self._family(curves)] if curves else []), *self.beside])
+        text = tables(families, self.gap)
+        (folder / "benchmark.md").write_text(text + "\n")
+        save(pictures(families, self.gap), folder)
         log.info("\n%s\n\nwritten to %s", text, folder)
         return curves
+
+    def _family(self, curves: list[Curve]) -> Family:
+        problem = self.problem
+        return Family(problem_name(problem), problem.dim, problem.exact_optimum, curves, versions())
 
 
 def _require_numbers(config: dict) -> None:

@@ -52,7 +52,16 @@ class Point:
     def gap(self) -> float:
         """From the highest lower bound to the lowest upper one, relative to the former: infinite where one is missing, or the
         lower is not positive."""
-        upper = min((self.numbers[n] for n in bounds.on(UPPER) if n in self.numbers), default=math.inf)
+        return self._above_the_lower(
+            min((self.numbers[n] for n in bounds.on(UPPER) if n in self.numbers), default=math.inf)
+        )
+
+    @property
+    def simulated(self) -> float:
+        """The same, from the highest lower bound to the better controller's performance."""
+        return self._above_the_lower(self.perf)
+
+    def _above_the_lower(self, upper: float) -> float:
         lower = max((self.numbers[n] for n in bounds.on(LOWER) if n in self.numbers), default=-math.inf)
         return (upper - lower) / lower if lower > 0.0 else math.inf
 

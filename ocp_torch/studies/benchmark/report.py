@@ -1,10 +1,7 @@
 """Curves of several seeds as a table and as plots."""
 
-import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
-from pathlib import Path
 from statistics import median
 
 import numpy as np
@@ -124,12 +121,3 @@ def draw(axis, curves: list[Curve], place, height, color: str, name: str) -> Non
     x, values = x[usable], values[usable]
     axis.plot(x, np.median(values, axis=1), color=color, label=name, marker=".")
     axis.fill_between(x, values.min(axis=1), values.max(axis=1), color=color, alpha=0.2)
-
-
-def save(curves: list[Curve], exact: float | None, folder: Path) -> str:
-    """Write `benchmark.md` and `curves.json`; returns the table."""
-    folder.mkdir(parents=True, exist_ok=True)
-    text = contest_table(curves, exact)
-    (folder / "benchmark.md").write_text(text + "\n")
-    (folder / "curves.json").write_text(json.dumps([asdict(c) for c in curves], indent=1, default=float) + "\n")
-    return text

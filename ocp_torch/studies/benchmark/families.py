@@ -1,0 +1,187 @@
+"""Problems beside each other: a benchmark's file of curves, read again, and the pictures of several of them."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from ocp_torch import __version__
+from ocp_torch.errors import InputError
+from ocp_torch.files.reading import FILE, FOLDER, kind, read_json
+from ocp_torch.files.storage import finite, write_atomically
+from ocp_torch.runs.canvas import blank_figure
+from ocp_torch.studies.benchmark.measure import Curve, Point
+from ocp_torch.studies.benchmark.report import by_contender, contest_table, draw, plot, reference
+
+CURVES = "curves.json"
+# Whose numbers may differ from version to version.
+PACKAGES = ("torch", "stable_baselines3")
+# Dimensions from which on an exponent of the cost is more than a line through two points.
+FEWEST = 3
+
+
+@dataclass(frozen=True)
+class Family:
+    """The curves of one problem; ``exact`` is its `OPT`, `None` where it is not known, ``versions`` are of what ran."""
+
+    problem: str
+    dim: int
+    exact: float | None
+    curves: list[Curve]
+    versions: dict[str, str]
+
+    @property
+    def title(self) -> str:
+        return f"{self.problem}, d = {self.dim}"
+
+    @property
+    def optimum(self) -> float:
+        """`OPT`, or the best lower bound found."""
+        return reference(self.curves, self.exact)[0]
+
+    def write(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(finite(asdict(self)), indent=1) + "\n"
+        write_atomically(folder / CURVES, lambda path: path.write_text(text))
+
+    @classmethod
+    def read(cls, path: Path) -> "Family":
+        """From a file of `write`. Raises `InputError` for any other."""
+        data = read_json(path)
+        try:
+            curves = [Curve(**{**c, "points": list(map(_point, c["points"]))}) for c in data.pop("curves")]
+            return cls(curves=curves, **data)
+        except (TypeError, KeyError, AttributeError):
+            raise InputError(f"{path} is no file of curves that scripts/benchmark.py wrote.") from None
+
+    def with_those_of(self, other: "Family") -> "Family":
+        """These curves, and the other's of whoever is not among them with that seed."""
+        own = {(c.contender, c.seed) for c in self.curves}
+        more = [c for c in other.curves if (c.contender, c.seed) not in own]
+        return Family(self.problem, self.dim, self.exact, self.curves + more, {**other.versions, **self.versions})
+
+
+def _point(saved: dict) -> Point:
+    """A point as it was saved, where a number that was not finite is a word."""
+    return Point(**{**saved, "numbers": {name: n for name, n in saved["numbers"].items() if not isinstance(n, str)}})
+
+
+def versions() -> dict[str, str]:
+    """Of this package, and of `PACKAGES` as far as they are installed."""
+    found = {"ocp_torch": __version__}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def read_beside(beside: object) -> list[Family]:
+    """The families in the files, or in all JSON files in the folders, that ``beside`` lists. Raises `InputError`."""
+    if not isinstance(beside, list):
+        raise InputError(f"beside is {beside!r}, but must be a list of files and folders of benchmarks.")
+    found: list[Family] = []
+    for each in map(Path, map(str, beside)):
+        files = {FILE: [each], FOLDER: sorted(each.rglob("*.json"))}.get(kind(each) or "", [])
+        if not files:
+            raise InputError(f"beside names {each}, but there is no file of curves there.")
+        found += map(Family.read, files)
+    return found
+
+
+def joined(families: Sequence[Family]) -> list[Family]:
+    """One family for each title, in order of dimension within a problem; the first ones' curves come first."""
+    found: dict[str, Family] = {}
+    for one in families:
+        found[one.title] = found[one.title].with_those_of(one) if one.title in found else one
+    order = list(dict.fromkeys(f.problem for f in found.values()))
+    return sorted(found.values(), key=lambda f: (order.index(f.problem), f.dim))
+
+
+def tables(families: list[Family], gap: float) -> str:
+    """The table of each family, and the exponents of `by_dimension`, as Markdown."""
+    text = [f"## {f.title}\n\n{contest_table(f.curves, f.exact)}" for f in families]
+    for name, pairs in by_dimension(families, gap).items():
+        listed = ", ".join(f"{seconds:.3g} in {d}" for d, seconds in pairs)
+        text.append(
+            f"{name}: CPU seconds to a simulated gap of {100.0 * gap:g} % as d^{exponent(pairs):.2g} ({listed} dimensions)."
+        )
+    return "\n\n".join(text)
+
+
+def pictures(families: list[Family], gap: float) -> dict:
+    """Figures by name: one family against samples and seconds or several against seconds, and seconds against dimension."""
+    (first, *more), costs = families, by_dimension(families, gap)
+    found = {"benchmark": side_by_side(families) if more else plot(first.curves, first.exact)}
+    return found | ({"dimensions": cost_figure(costs, gap)} if costs else {})
+
+
+def side_by_side(families: list[Family]):
+    """Sub-optimality of the controller and the simulated gap against CPU seconds of training, a column for each family."""
+    figure = blank_figure(3.2 * len(families) + 1.0, 6.5)
+    axes = figure.subplots(2, len(families), squeeze=False, sharex="col")
+    names = list(dict.fromkeys(c.contender for f in families for c in f.curves))
+    rows = ("controller above the optimum, %", "simulated gap, %")
+    for j, family in enumerate(families):
+        heights = (lambda p, o=family.optimum: 100.0 * (p.perf / o - 1.0), lambda p: 100.0 * p.simulated)
+        for i, height in enumerate(heights):
+            for name, own in by_contender(family.curves).items():
+                draw(axes[i, j], own, lambda p: p.seconds, height, f"C{names.index(name)}", name)
+            axes[i, j].set(xscale="log", yscale="log", ylabel=rows[i] if j == 0 else "")
+            axes[i, j].grid(alpha=0.3)
+        axes[0, j].set_title(family.title, fontsize=10)
+        axes[1, j].set_xlabel("CPU seconds of training")
+    shown = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(list(shown.values()), list(shown), loc="outside lower center", ncols=len(shown), fontsize=8)
+    return figure
+
+
+def seconds_until(curve: Curve, gap: float) -> float:
+    """CPU seconds of training until the simulated gap is at most ``gap`` for good, between points along a power law;
+    infinite where that never happens."""
+    within = len(curve.points)
+    while within and curve.points[within - 1].simulated <= gap:
+        within -= 1
+    if within == len(curve.points):
+        return math.inf
+    before, after = curve.points[max(within - 1, 0)], curve.points[within]
+    if not within or not math.isfinite(before.simulated) or min(before.seconds, after.simulated) <= 0.0:
+        return after.seconds
+    part = math.log(gap / before.simulated) / math.log(after.simulated / before.simulated)
+    return before.seconds * (after.seconds / before.seconds) ** part
+
+
+def by_dimension(families: list[Family], gap: float) -> dict[str, list[tuple[int, float]]]:
+    """For each contender on each problem of three dimensions or more: pairs of a dimension and the median over seeds of the
+    `seconds_until` the simulated gap is at most ``gap``, where each seed comes to that."""
+    found: dict[str, list[tuple[int, float]]] = {}
+    for family in families:
+        for name, own in by_contender(family.curves).items():
+            seconds = [seconds_until(curve, gap) for curve in own]
+            if all(map(math.isfinite, seconds)):
+                found.setdefault(f"{family.problem}, {name}", []).append((family.dim, median(seconds)))
+    return {name: pairs for name, pairs in found.items() if len(pairs) >= FEWEST}
+
+
+def exponent(pairs: list[tuple[int, float]]) -> float:
+    """Of the power law that is nearest to ``pairs``, in the logarithm."""
+    d, seconds = np.log(np.array(pairs)).T
+    return float(np.polyfit(d, seconds, 1)[0])
+
+
+def cost_figure(costs: dict[str, list[tuple[int, float]]], gap: float):
+    """What `by_dimension` found, with the exponent of each."""
+    figure = blank_figure(5.0, 4.0)
+    axis = figure.subplots()
+    for name, pairs in costs.items():
+        axis.plot(*zip(*pairs, strict=True), marker="o", label=f"{name}: d^{exponent(pairs):.2g}")
+    axis.set(xscale="log", yscale="log", xlabel="d", ylabel=f"CPU seconds to a simulated gap of {100.0 * gap:g} %")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8)
+    return figure
