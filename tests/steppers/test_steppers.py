@@ -235,8 +235,9 @@ def test_the_average_is_over_the_iterates_that_count(stepper, average):
     for _ in counted:
         game.step()
     ema = counted[0]
-    for z in counted[1:]:
-        ema = [0.8 * old + 0.2 * new for old, new in zip(ema, z, strict=True)]
+    for n, z in enumerate(counted[1:], 1):
+        kept = min(0.8, (1 + n) / (10 + n))
+        ema = [kept * old + (1 - kept) * new for old, new in zip(ema, z, strict=True)]
     uniform = [np.mean(p, axis=0) for p in zip(*counted, strict=True)]
     wanted = {"uniform": uniform, "ema": ema, "none": counted[-1]}[average]
     # torch keeps the uniform weight 1 / n in single precision.
