@@ -113,8 +113,9 @@ class Average(AveragedModel):
 
 def exponential(decay: float) -> Callable[..., None]:
     """The rule of an average that keeps the part ``decay`` of itself at each step, but at the `n`-th at most
-    `(1 + n) / (10 + n)`: the first iterates, which are far off, are soon forgotten. After 40 steps on the circle, a third of a second,
-    the controller is then .2 % off the optimum, and 19 % without."""
+    `(1 + n) / (10 + n)`: the first iterates, which are far off, are soon forgotten. After 40 steps on the circle, a third of
+    a second, the controller is then .2 % off the optimum, and 19 % without."""
+
 
     def rule(own: list[Tensor], iterate: list[Tensor], count: Tensor) -> None:
         n = int(count)
