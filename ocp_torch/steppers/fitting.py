@@ -116,7 +116,6 @@ def exponential(decay: float) -> Callable[..., None]:
     `(1 + n) / (10 + n)`: the first iterates, which are far off, are soon forgotten. After 40 steps on the circle, a third of
     a second, the controller is then .2 % off the optimum, and 19 % without."""
 
-
     def rule(own: list[Tensor], iterate: list[Tensor], count: Tensor) -> None:
         n = int(count)
         torch._foreach_lerp_(own, iterate, 1.0 - min(decay, (1.0 + n) / (10.0 + n)))
