@@ -125,7 +125,7 @@ def pictures(families: list[Family], gap: float) -> dict:
 def side_by_side(families: list[Family]):
     """Sub-optimality of the controller and the simulated gap against CPU seconds of training, a column for each family."""
     figure = blank_figure(3.2 * len(families) + 1.0, 6.5)
-    axes = figure.subplots(2, len(families), squeeze=False, sharex="col")
+    axes = figure.subplots(2, len(families), squeeze=False, sharex="col", sharey="row")
     names = list(dict.fromkeys(c.contender for f in families for c in f.curves))
     rows = ("controller above the optimum, %", "simulated gap, %")
     for j, family in enumerate(families):
@@ -182,6 +182,9 @@ def cost_figure(costs: dict[str, list[tuple[int, float]]], gap: float):
     for name, pairs in costs.items():
         axis.plot(*zip(*pairs, strict=True), marker="o", label=f"{name}: d^{exponent(pairs):.2g}")
     axis.set(xscale="log", yscale="log", xlabel="d", ylabel=f"CPU seconds to a simulated gap of {100.0 * gap:g} %")
+    dims = sorted({d for pairs in costs.values() for d, _ in pairs})
+    axis.set_xticks(dims, labels=[str(d) for d in dims])
+    axis.minorticks_off()
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8)
     return figure
