@@ -18,7 +18,7 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.studies.benchmark import measure
 from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender, RLContender, require_rl
 from ocp_torch.studies.benchmark.contest import Contest
-from ocp_torch.studies.benchmark.families import Family, by_dimension, exponent, joined, seconds_until
+from ocp_torch.studies.benchmark.families import Family, by_dimension, exponent, joined, seconds_until, titles
 from ocp_torch.studies.benchmark.measure import Curve, Judge, Point, due, median_and_spread, relative, tabulated
 from ocp_torch.studies.benchmark.report import contest_table, reference
 from ocp_torch.studies.paper import figures
@@ -157,8 +157,8 @@ def test_the_report_says_what_was_reached():
     assert "the best lower bound found" in contest_table(curves, None)
 
 
-def family(dim, *curves, problem="torus", exact=1.0) -> Family:
-    return Family(problem, dim, exact, list(curves), {"torch": "1"})
+def family(dim, *curves, problem="torus", exact=1.0, **fields) -> Family:
+    return Family(problem, dim, {"dim": dim, **fields}, exact, list(curves), {"torch": "1"})
 
 
 def test_a_family_is_read_as_it_was_written_without_what_was_not_finite(tmp_path):
@@ -167,15 +167,27 @@ def test_a_family_is_read_as_it_was_written_without_what_was_not_finite(tmp_path
     read = Family.read(tmp_path / "curves.json")
     assert read.curves[1] == written.curves[1]
     assert read.curves[0].points[1].numbers == {"F_M": 0.9, "J": 1.2}
-    assert (read.title, read.exact, read.versions) == ("torus, d = 2", 1.0, {"torch": "1"})
+    assert (read.problem, read.dim, read.fields, read.exact, read.versions) == (
+        *("torus", 2, {"dim": 2}, 1.0),
+        {"torch": "1"},
+    )
 
 
-def test_of_families_of_one_title_the_first_one_s_curves_stay_and_others_join():
+def test_of_families_of_one_problem_the_first_one_s_curves_stay_and_others_join():
     new, old = curve("a", 0, [1.1]), curve("a", 0, [1.5])
     more = [curve("a", 1, [1.5]), curve("sac", 0, [2.0])]
     found = joined([family(3, new), family(1, old), family(3, old, *more), family(1, old, problem="arm")])
-    assert [f.title for f in found] == ["torus, d = 1", "torus, d = 3", "arm, d = 1"]
+    assert titles(found) == ["torus, d = 1", "torus, d = 3", "arm, d = 1"]
     assert found[1].curves == [new, *more]
+
+
+def test_a_problem_with_other_fields_is_another_problem_and_is_called_so():
+    here, there = curve("a", 0, [1.1]), curve("a", 1, [1.5])
+    families = joined([family(2, here, noise=0.0, seed=0), family(2, there, noise=0.01, seed=0)])
+    assert [f.curves for f in families] == [[here], [there]]
+    assert titles(families) == ["torus, d = 2, noise = 0.0", "torus, d = 2, noise = 0.01"]
+    quick = Curve("a", 0, [Point(1, 1.0, {"value": 1.001, "F_M": 1.0})])
+    assert by_dimension([family(d, quick, noise=0.1 * d) for d in (1, 2, 3)], 0.01) == {}
 
 
 def test_seconds_until_a_gap_lie_on_a_power_law_between_points():

@@ -55,6 +55,7 @@ class Contest:
 
     def __init__(self, config: dict) -> None:
         self.problem = build_problem(config["problem"])
+        self.fields = {name: value for name, value in config["problem"].items() if name != "_target_"}
         torch.set_num_threads(1)
         self.constants = resolve_constants(self.problem)
         names, seeds = config["contenders"], config["seeds"]
@@ -101,7 +102,7 @@ class Contest:
 
     def _family(self, curves: list[Curve]) -> Family:
         problem = self.problem
-        return Family(problem_name(problem), problem.dim, problem.exact_optimum, curves, versions())
+        return Family(problem_name(problem), problem.dim, self.fields, problem.exact_optimum, curves, versions())
 
 
 def _require_numbers(config: dict) -> None:

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import median
@@ -11,7 +11,7 @@ from statistics import median
 import numpy as np
 
 from ocp_torch import __version__
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, require_section
 from ocp_torch.files.reading import FILE, FOLDER, kind, read_json
 from ocp_torch.files.storage import finite, write_atomically
 from ocp_torch.runs.canvas import blank_figure
@@ -27,17 +27,20 @@ FEWEST = 3
 
 @dataclass(frozen=True)
 class Family:
-    """The curves of one problem; ``exact`` is its `OPT`, `None` where it is not known, ``versions`` are of what ran."""
+    """The curves of one problem, made of ``fields``; ``exact`` is its `OPT`, `None` where it is not known, ``versions`` are
+    those of what ran."""
 
     problem: str
     dim: int
+    fields: dict
     exact: float | None
     curves: list[Curve]
     versions: dict[str, str]
 
     @property
-    def title(self) -> str:
-        return f"{self.problem}, d = {self.dim}"
+    def kind(self) -> str:
+        """The problem in whatever dimension."""
+        return f"{self.problem} {json.dumps({k: v for k, v in self.fields.items() if k != 'dim'}, sort_keys=True)}"
 
     @property
     def optimum(self) -> float:
@@ -55,7 +58,8 @@ class Family:
         data = read_json(path)
         try:
             curves = [Curve(**{**c, "points": list(map(_point, c["points"]))}) for c in data.pop("curves")]
-            return cls(curves=curves, **data)
+            family = cls(curves=curves, **data)
+            return replace(family, fields=require_section("fields", family.fields))
         except (TypeError, KeyError, AttributeError):
             raise InputError(f"{path} is no file of curves that scripts/benchmark.py wrote.") from None
 
@@ -63,7 +67,7 @@ class Family:
         """These curves, and the other's of whoever is not among them with that seed."""
         own = {(c.contender, c.seed) for c in self.curves}
         more = [c for c in other.curves if (c.contender, c.seed) not in own]
-        return Family(self.problem, self.dim, self.exact, self.curves + more, {**other.versions, **self.versions})
+        return replace(self, curves=self.curves + more, versions={**other.versions, **self.versions})
 
 
 def _point(saved: dict) -> Point:
@@ -96,17 +100,29 @@ def read_beside(beside: object) -> list[Family]:
 
 
 def joined(families: Sequence[Family]) -> list[Family]:
-    """One family for each title, in order of dimension within a problem; the first ones' curves come first."""
-    found: dict[str, Family] = {}
+    """One family for each problem, those of a kind in order of dimension; the first ones' curves come first."""
+    found: dict[tuple, Family] = {}
     for one in families:
-        found[one.title] = found[one.title].with_those_of(one) if one.title in found else one
-    order = list(dict.fromkeys(f.problem for f in found.values()))
-    return sorted(found.values(), key=lambda f: (order.index(f.problem), f.dim))
+        key = (one.kind, one.dim)
+        found[key] = found[key].with_those_of(one) if key in found else one
+    order = list(dict.fromkeys(f.kind for f in found.values()))
+    return sorted(found.values(), key=lambda f: (order.index(f.kind), f.dim))
+
+
+def titles(families: list[Family]) -> list[str]:
+    """The problem of each and its dimension, and the fields in which it differs from others of that name."""
+    found = []
+    for one in families:
+        others = [f.fields for f in families if f.problem == one.problem]
+        differ = [k for k, v in one.fields.items() if k != "dim" and any(fields.get(k) != v for fields in others)]
+        found.append(", ".join([one.problem, f"d = {one.dim}", *(f"{k} = {one.fields[k]}" for k in differ)]))
+    return found
 
 
 def tables(families: list[Family], gap: float) -> str:
     """The table of each family, and the exponents of `by_dimension`, as Markdown."""
-    text = [f"## {f.title}\n\n{contest_table(f.curves, f.exact)}" for f in families]
+    named = zip(titles(families), families, strict=True)
+    text = [f"## {title}\n\n{contest_table(f.curves, f.exact)}" for title, f in named]
     for name, pairs in by_dimension(families, gap).items():
         listed = ", ".join(f"{seconds:.3g} in {d}" for d, seconds in pairs)
         text.append(
@@ -135,7 +151,7 @@ def side_by_side(families: list[Family]):
                 draw(axes[i, j], own, lambda p: p.seconds, height, f"C{names.index(name)}", name)
             axes[i, j].set(xscale="log", yscale="log", ylabel=rows[i] if j == 0 else "")
             axes[i, j].grid(alpha=0.3)
-        axes[0, j].set_title(family.title, fontsize=10)
+        axes[0, j].set_title(titles(families)[j], fontsize=10)
         axes[1, j].set_xlabel("CPU seconds of training")
     shown = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     figure.legend(list(shown.values()), list(shown), loc="outside lower center", ncols=len(shown), fontsize=8)
@@ -160,13 +176,13 @@ def seconds_until(curve: Curve, gap: float) -> float:
 def by_dimension(families: list[Family], gap: float) -> dict[str, list[tuple[int, float]]]:
     """For each contender on each problem of three dimensions or more: pairs of a dimension and the median over seeds of the
     `seconds_until` the simulated gap is at most ``gap``, where each seed comes to that."""
-    found: dict[str, list[tuple[int, float]]] = {}
+    found: dict[tuple[str, str], list[tuple[int, float]]] = {}
     for family in families:
         for name, own in by_contender(family.curves).items():
             seconds = [seconds_until(curve, gap) for curve in own]
             if all(map(math.isfinite, seconds)):
-                found.setdefault(f"{family.problem}, {name}", []).append((family.dim, median(seconds)))
-    return {name: pairs for name, pairs in found.items() if len(pairs) >= FEWEST}
+                found.setdefault((family.kind, name), []).append((family.dim, median(seconds)))
+    return {f"{kind.split()[0]}, {name}": pairs for (kind, name), pairs in found.items() if len(pairs) >= FEWEST}
 
 
 def exponent(pairs: list[tuple[int, float]]) -> float:
