@@ -49,6 +49,9 @@ NOISY_STEPS = 2000
 DENSITY_BATCH = 256
 # Evenly spread states leave more steep spots than independent ones, and the worst state is in one.
 SAMPLER, WORST_STATE_SAMPLER = "sobol", "uniform"
+# States at which a certificate computes the occupation density, and at most so many differences at them, `d + 1` for each:
+# with 64 coordinates 144 states took eight of a certificate's twelve minutes.
+OCCUPATION_STATES, OCCUPATION_DIFFERENCES = 144, 144 * 17
 # Steps between looks at most, and where one of them may end the run. A look with noise takes as long as 100 to 200 steps;
 # every 600 steps they were a third of the training of a pendulum.
 LOOKS_APART, TARGET_APART = 1200, 600
@@ -81,6 +84,7 @@ def fill(config: dict, problem: Problem) -> dict:
         "trainer.batch": budget.batch,
         "optimizer.lr": LEARNING_RATE if unbounded else budget.lr,
         "sampler.name": WORST_STATE_SAMPLER if unbounded else SAMPLER,
+        "certificate.occupation_states": min(OCCUPATION_STATES, OCCUPATION_DIFFERENCES // (problem.dim + 1)),
         "certificate.stage.steps": budget.stage_steps,
         "certificate.stage.lr": budget.stage_lr,
     }

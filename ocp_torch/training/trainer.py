@@ -166,14 +166,14 @@ class Trainer:
         """One step, and what is due after it."""
         settings, state = self.settings, self.state
         started = time.perf_counter()
-        report = whole_step(self.state, self.phase, self.ranks)
-        state.step += 1
-        state.samples += self.ranks.size * report.samples
-        state.seconds += time.perf_counter() - started
         if state.step - settings.start(state.round) in SOUGHT_AT:
             waves = self.ranks.from_first(lambda: missed_waves(self.problem, self.averaged_fields))
             for fields in (self.fields, self.averaged_fields):
                 add_waves(fields, waves)
+        report = whole_step(self.state, self.phase, self.ranks)
+        state.step += 1
+        state.samples += self.ranks.size * report.samples
+        state.seconds += time.perf_counter() - started
         due = lambda every: every > 0 and state.step % every == 0
         last = state.step == self.end
         log = due(settings.log_every) or last

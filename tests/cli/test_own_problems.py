@@ -159,25 +159,29 @@ def test_a_run_goes_on_with_the_arguments_it_has(finished, module):
 
 @pytest.mark.nightly
 @pytest.mark.parametrize(
-    ("how", "words", "stopped"),
+    ("how", "calls", "words", "stopped"),
     [
-        ("always", r"state_cost of own.*Ageing raised RuntimeError: licence expired ask your admin", ("failed",)),
-        ("somewhere", "raised ValueError: no such state at x = [0.9", ("failed",)),
-        # What meets it first: a look, or a step.
-        ("holes", "is not finiteown.*; it must be finite on the whole torus", ("failed", "not_finite")),
+        ("always", 4500, r"state_cost of own.*Ageing raised RuntimeError: licence expired ask your admin", "failed"),
+        ("somewhere", 4500, "raised ValueError: no such state at x = [0.9", "failed"),
+        (
+            "holes",
+            50,
+            "where the state cost of the problem is not finite; it must be finite on the whole torus",
+            "not_finite",
+        ),
     ],
 )
-def test_a_problem_that_fails_late_leaves_a_sentence_and_the_best_look(how, words, stopped, module):
+def test_a_problem_that_fails_late_leaves_a_sentence_and_the_best_look(how, calls, words, stopped, module):
     folder, name = module
     run = folder / f"late_{how}"
-    mine = (f"problem._target_={name}.Ageing", f"problem.how={how}", "problem.calls=4500", f"hydra.run.dir={run}")
+    mine = (f"problem._target_={name}.Ageing", f"problem.how={how}", f"problem.calls={calls}", f"hydra.run.dir={run}")
     ended = train(*SMALL, *mine, "trainer.steps=400", "trainer.evaluate_every=20", cwd=folder)
     assert ended.status == 2
     for word in words.split("own.*"):
         assert word in ended.sentence
     assert "Training stopped at step" in ended.sentence
     certificate = json.loads((run / "certificate.json").read_text())
-    assert certificate["stopped"] in stopped
+    assert certificate["stopped"] == stopped
     assert certificate["step"] % 20 == 0 < certificate["step"]
     assert any("Training stopped" in w for w in certificate["warnings"])
     assert (run / "controller.safetensors").exists()

@@ -52,7 +52,7 @@ class Lacking(torch.nn.Module):
         self.embedding = network(problem.dim, waves=24).embedding
         kept = [i for i in range(len(problem.V0.waves)) if i not in left_out]
         self.embedding.mix(problem.V0.waves[kept])
-        self.dummy = torch.nn.Parameter(torch.zeros((), dtype=torch.float64))
+        self.precision = torch.nn.Parameter(torch.zeros((), dtype=torch.float64))  # of the states it is asked at
 
     def forward(self, x):
         V0 = self.problem.V0
@@ -95,9 +95,8 @@ def test_a_run_takes_them_and_goes_on_from_any_step_to_the_same_bits(method, mon
     whole.fit(Saving())
     now = [len(n.embedding.free) for n in whole.fields.networks.values()]
     assert all(b < a for a, b in zip(at_first, now, strict=True))
-    for fields in (whole.fields, whole.averaged_fields):
-        assert torch.equal(fields.value.embedding.mixed, whole.fields.value.embedding.mixed)
-    for step in (2, 4):
+    assert torch.equal(whole.averaged_fields.value.embedding.mixed, whole.fields.value.embedding.mixed)
+    for step in (2, 3, 4):  # before they are sought for the first time, just before, and after
         resumed = build_trainer(config)
         resumed.resume(tmp_path / f"{step}.pt")
         resumed.fit(Silent())

@@ -302,8 +302,8 @@ def test_the_best_controller_is_kept_and_half_of_the_rounds_are_enough_to_find_n
 
 
 @pytest.mark.nightly
-@on(NATURAL[::2])
-def test_systems_can_be_warmed_up(problem):
+@on(NATURAL)
+def test_every_system_can_be_warmed_up(problem):
     warm = ValueIteration(problem, logarithmic(problem.dim, 8), WarmStartSettings("on", 1, 8, 2, 0.95), 0)
     assert warm.advance()
     assert warm.done

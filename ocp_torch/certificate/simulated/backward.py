@@ -19,8 +19,8 @@ from ocp_torch.problems.problem import Problem
 # The integral over the past is taken in pieces of so many discount times, until the last one adds next to nothing; what
 # has not settled after so many pieces is extrapolated.
 PIECE, PIECES, SETTLED = 5.0, 8, 1e-2
-# Steps of a piece: in each no more than that part of a discount time passes, and no coordinate of a state moves farther than
-# that part of a turn, but so few and so many at least and at most; more are more exact and take longer.
+# Steps of a piece: in each no more than that part of a discount time passes, and no state moves farther than that part of a
+# turn, but so few and so many at least and at most; more are more exact and take longer.
 DISCOUNTED, MOVED, FEWEST_STEPS, MOST_STEPS = 0.25, 0.1, 20, 150
 # The logarithm at which the growth of a density is cut off, so that it stays a number: e^60 is unbounded to any check.
 LARGEST_GROWTH = 60.0
@@ -29,9 +29,6 @@ LARGEST_GROWTH = 60.0
 FEW_EVALUATIONS, EVALUATIONS, FEWEST_PATHS = 48, 192, 4
 # Of the states looked at, the highest are looked at again from close by.
 TOP, NEARBY = 6, 48
-# States times differences at once, which beyond 16 coordinates leave fewer states: in 64, 144 of them took eight of a
-# certificate's twelve minutes.
-MOST_DIFFERENCES = 144 * 17
 # Ascents to the suprema of the a-priori bound, which is shown beside the density itself and decides nothing.
 ASCENTS, ASCENT_STEPS = 16, 20
 # Step of a difference quotient of the velocity: truncation is then about 1e-7 of its second derivatives, rounding 1e-9.
@@ -79,7 +76,7 @@ def settled_occupation(
     rho, dynamics = problem.discount, backward_flow(problem, policy, together)
     horizon = PIECE / rho
     with torch.no_grad():
-        speed = float(problem.velocity(x, policy(x)).abs().max())
+        speed = float(problem.velocity(x, policy(x)).norm(dim=-1).max())
     wanted = math.ceil(horizon * max(rho / DISCOUNTED, speed / MOVED))
     steps = int(min(MOST_STEPS, max(FEWEST_STEPS, wanted)))
     paths = max(FEWEST_PATHS, evaluations // (problem.dim + 1)) if problem.noisy else 1
@@ -119,8 +116,6 @@ def estimated_sup_occupation(
 ) -> float:
     """The largest `mu^u` met: at the ends of trajectories, where mass accumulates, at uniform states, and then near the
     highest of them; ``together`` as in `backward_flow`."""
-    most = max(TOP, MOST_DIFFERENCES // (problem.dim + 1))
-    states, nearby = min(states, most), min(NEARBY, most)
     count = max(1, 2 * states // 3)
     picked = end_states[:: max(1, len(end_states) // count)][:count]
     generator = fixed_generator()
@@ -132,9 +127,9 @@ def estimated_sup_occupation(
     if not bool(torch.isfinite(density).all()):
         return math.inf
     top = x[density.topk(min(TOP, len(x))).indices]
-    around = top[torch.arange(nearby) % len(top)]
+    around = top[torch.arange(NEARBY) % len(top)]
     steps = torch.randn(around.shape, dtype=x.dtype, generator=generator) / math.sqrt(problem.dim)
-    sizes = 10.0 ** (-1.0 - 2.0 * torch.rand(nearby, 1, dtype=x.dtype, generator=generator))
+    sizes = 10.0 ** (-1.0 - 2.0 * torch.rand(NEARBY, 1, dtype=x.dtype, generator=generator))
     near = torch.cat([top, (around + sizes * steps).remainder(1.0)])
     return max(float(density.max()), float(met(near, EVALUATIONS).max()))
 

@@ -14,7 +14,7 @@ DEPTH = 0.3
 # How far the random part of the mean goes from the identity, in standard deviations, before it is divided by sqrt(d): small
 # enough that the columns stay apart.
 MIX = 0.25
-# Cosines of a vector field taken at once, 2 MiB in float64: 32 MiB took 1.5 to 2 times as long.
+# Cosines of a vector field taken at once, 2 MiB in float64: 32 MiB took 1.6 to 2.7 times as long.
 MOST_COSINES = 2**18
 
 
