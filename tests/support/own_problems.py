@@ -21,7 +21,7 @@ MODULE = """
             return torch.stack([push, -push], dim=1)
 
     class Ageing(Problem):
-        # Good for so many calls of its cost; with holes, which a step is to meet first, for so many steps (of 16 states 12 are drawn).
+        # Good for so many calls of its cost; with holes, for so many steps, which draw 12 of their 16 states.
         def __init__(self, calls: int, how: str):
             super().__init__(dim=1)
             self.left, self.calls, self.how = calls, calls, how
