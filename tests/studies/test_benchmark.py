@@ -222,7 +222,10 @@ def test_what_was_measured_before_is_drawn_beside(tmp_path):
     assert "CPU seconds to a simulated gap of 0.5 % as d^" in text
 
 
-@pytest.mark.parametrize("content", [None, "{}", "[]", '{"curves": [{"points": 3}]}', '{"curves": [], "x": 1}'])
+ODD = '{"problem": "a", "dim": "two", "fields": {}, "exact": null, "curves": [], "versions": {}}'
+
+
+@pytest.mark.parametrize("content", [None, "{}", "[]", '{"curves": [{"points": 3}]}', '{"curves": [], "x": 1}', ODD])
 def test_what_is_no_benchmark_is_not_drawn_beside(content, tmp_path):
     if content is not None:
         (tmp_path / "curves.json").write_text(content)

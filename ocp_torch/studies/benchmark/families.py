@@ -11,7 +11,7 @@ from statistics import median
 import numpy as np
 
 from ocp_torch import __version__
-from ocp_torch.errors import InputError, require_section
+from ocp_torch.errors import InputError, require_integer, require_number, require_section
 from ocp_torch.files.reading import FILE, FOLDER, kind, read_json
 from ocp_torch.files.storage import finite, write_atomically
 from ocp_torch.runs.canvas import blank_figure
@@ -58,9 +58,11 @@ class Family:
         data = read_json(path)
         try:
             curves = [Curve(**{**c, "points": list(map(_point, c["points"]))}) for c in data.pop("curves")]
-            family = cls(curves=curves, **data)
-            return replace(family, fields=require_section("fields", family.fields))
-        except (TypeError, KeyError, AttributeError):
+            require_integer("dim", data["dim"], 1)
+            if data["exact"] is not None:
+                require_number("exact", data["exact"])
+            return cls(curves=curves, **{**data, "fields": require_section("fields", data["fields"])})
+        except (InputError, TypeError, KeyError, AttributeError):
             raise InputError(f"{path} is no file of curves that scripts/benchmark.py wrote.") from None
 
     def with_those_of(self, other: "Family") -> "Family":
