@@ -51,9 +51,19 @@ class FourierEmbedding(nn.Module):
         return single if self.mixed is None else torch.cat([single, self.mixed])
 
     def forward(self, x: Tensor) -> Tensor:
-        wrapped = x - x.floor()
-        turns = (wrapped.unsqueeze(-1) * self.wave_numbers).flatten(-2)
-        if self.mixed is not None:
-            turns = torch.cat([turns, wrapped @ self.mixed.T], dim=-1)
-        angles = 2.0 * math.pi * turns
+        angles = self.angles(x - x.floor())
         return torch.cat([angles.cos(), angles.sin()], dim=-1)
+
+    def angles(self, x: Tensor) -> Tensor:
+        """`2 pi k . x` for each wave vector, ``(..., d) -> (..., J)``."""
+        turns = (x.unsqueeze(-1) * self.wave_numbers).flatten(-2)
+        if self.mixed is not None:
+            turns = torch.cat([turns, x @ self.mixed.T], dim=-1)
+        return 2.0 * math.pi * turns
+
+    def pulled_back(self, slopes: Tensor, dim: int) -> Tensor:
+        """The transpose of `angles`, ``(N, J) -> (N, d)``."""
+        single = slopes[:, : dim * len(self.wave_numbers)].unflatten(-1, (dim, -1)) @ self.wave_numbers
+        if self.mixed is not None:
+            single = torch.addmm(single, slopes[:, -len(self.mixed) :], self.mixed)
+        return 2.0 * math.pi * single

@@ -7,7 +7,6 @@ fewer, and one reverse pass gives the gradient, or where they are as many and th
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from ocp_torch.fields.activations import DERIVATIVES, Derivatives
 from ocp_torch.fields.embedding import FourierEmbedding
 from ocp_torch.maths.decisions import decided
 
@@ -105,7 +105,7 @@ class Sweep:
         if along.enough:
             return Sweep(*Activated.apply(self.value, self.slopes, self.curvature, derivatives))
         value, first, second, _ = derivatives(self.value)
-        bent = second * along.form(self.slopes, self.slopes)
+        bent = second() * along.form(self.slopes, self.slopes)
         return Sweep(value, first * self.slopes, first * self.curvature + bent)
 
     def times(self, other: "Sweep", along: Along) -> "Sweep":
@@ -123,8 +123,9 @@ class Activated(torch.autograd.Function):
     ``(p, N, F)`` numbers, and a step a quarter longer."""
 
     @staticmethod
-    def forward(ctx: Any, z: Tensor, slopes: Tensor, curvature: Tensor, derivatives: "Derivatives") -> Any:
-        value, first, second, third = derivatives(z)
+    def forward(ctx: Any, z: Tensor, slopes: Tensor, curvature: Tensor, derivatives: Derivatives) -> Any:
+        value, first, bent, third = derivatives(z)
+        second = bent()
         square = 0.5 * _contracted(slopes, slopes)
         if any(ctx.needs_input_grad):
             ctx.save_for_backward(slopes, curvature, square, first, second, third())
@@ -146,43 +147,3 @@ def _contracted(left: Tensor, right: Tensor) -> Tensor:
     for one, other in zip(left[1:], right[1:], strict=True):
         total.addcmul_(one, other)
     return total
-
-
-# A smooth function with its first three derivatives, each of the shape of its argument, the last one if it is asked for.
-Third = Callable[[], Tensor]
-Derivatives = Callable[[Tensor], tuple[Tensor, Tensor, Tensor, Third]]
-
-
-def _tanh(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Third]:
-    s = torch.tanh(z)
-    slope = 1.0 - s * s
-    return s, slope, -2.0 * s * slope, lambda: slope * (4.0 - 6.0 * slope)
-
-
-def _gelu(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Third]:
-    below, square = torch.special.ndtr(z), z * z
-    density = torch.exp(-0.5 * square - 0.5 * math.log(2.0 * math.pi))
-    third = lambda: (square - 4.0) * z * density
-    return z * below, torch.addcmul(below, z, density), (2.0 - square) * density, third
-
-
-def _silu(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Third]:
-    s = torch.sigmoid(z)
-    slope, tilt = s * (1.0 - s), 1.0 - 2.0 * s
-    third = lambda: slope * (3.0 * tilt + z * (1.0 - 6.0 * slope))
-    return z * s, s + z * slope, slope * (2.0 + z * tilt), third
-
-
-def _softplus(z: Tensor) -> tuple[Tensor, Tensor, Tensor, Third]:
-    s = torch.sigmoid(z)
-    slope = s * (1.0 - s)
-    return nn.functional.softplus(z), s, slope, lambda: slope * (1.0 - 2.0 * s)
-
-
-# Each activation with its derivatives.
-DERIVATIVES: dict[type[nn.Module], Derivatives] = {
-    nn.Tanh: _tanh,
-    nn.GELU: _gelu,
-    nn.SiLU: _silu,
-    nn.Softplus: _softplus,
-}

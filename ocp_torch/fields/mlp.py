@@ -1,18 +1,19 @@
 """Smooth multilayer perceptrons on a periodic embedding."""
 
 from math import inf
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from ocp_torch.errors import require_choice, require_flag, require_integer
+from ocp_torch.fields.activations import ACTIVATIONS
 from ocp_torch.fields.centred import Centred
 from ocp_torch.fields.embedding import FourierEmbedding
 from ocp_torch.fields.forward_sweep import Along, Sweep
-from ocp_torch.maths.jets import Jet, reverse_jet
+from ocp_torch.fields.reverse_sweep import Dense, Layer, Product, swept_jet
+from ocp_torch.maths.jets import Jet, is_data, reverse_jet
 
-# Smooth activations only: the gradient of a field is part of every loss.
-ACTIVATIONS = {"gelu": nn.GELU, "silu": nn.SiLU, "tanh": nn.Tanh, "softplus": nn.Softplus}
 # Sizes up to so many coordinates. Kinks want Fourier modes, affordable in one and two dimensions; in many dimensions products
 # of tanh learn terms that couple coordinates several times faster.
 SIZES = {
@@ -123,8 +124,11 @@ class PeriodicMLP(nn.Module):
         return out.squeeze(-1) if self.scalar else out
 
     def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
-        """The jet of a scalar network at states ``(N, d)``: by one reverse pass, and with noise ``sigma`` ``(N, d, k)``
-        there by a sweep forward, of `min(d, k) + 2` times the work of `forward`; a ``centred`` one by reverse passes."""
+        """The jet of a scalar network at states ``(N, d)``: by a sweep back (`reverse_sweep`), and with noise ``sigma``
+        ``(N, d, k)`` there by one forward, of `min(d, k) + 2` times the work of `forward`; of a ``centred`` one, and where
+        states are differentiated, by autograd's reverse passes."""
+        if sigma is None and self.centred is None and is_data(x):
+            return swept_jet(self, x)
         if sigma is None or self.centred is not None:
             return reverse_jet(self, x, sigma)
         along = Along.of(sigma)
@@ -140,6 +144,13 @@ class PeriodicMLP(nn.Module):
 
         of = reverse_jet(value, x)
         return Jet(of.value, of.gradient, curvature[0] if torch.is_grad_enabled() else curvature[0].detach())
+
+    def layers(self) -> list[Layer]:
+        """The hidden layers, for `ReverseSweep`."""
+        hidden: list[Any] = list(self.body)
+        if isinstance(hidden[0], Gated):
+            return [Product(layer.gate, layer.linear, layer.activation) for layer in hidden]
+        return [Dense(linear, activation) for linear, activation in zip(hidden[::2], hidden[1::2], strict=True)]
 
     def _swept(self, x: Tensor, along: Along) -> Sweep:
         """The field ``(N,)``, its derivatives ``(p, N)`` and its curvature ``(N,)``."""

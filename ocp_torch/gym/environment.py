@@ -2,7 +2,6 @@
 
 import math
 from importlib.util import find_spec
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import drawn_starts, starts_narrowly
-from ocp_torch.runs.canvas import blank_figure
+from ocp_torch.runs.canvas import blank_figure, drawn
 
 # Rejections at most for one start: `mu0` has mean 1, so that a bound of its supremum is met soon.
 MOST_TRIES = 10_000
@@ -173,6 +172,4 @@ def clocks(x: torch.Tensor) -> np.ndarray:
         axis.plot(np.cos(turn), np.sin(turn), "C7", linewidth=1.0)
         axis.plot([0.0, math.cos(angle)], [0.0, math.sin(angle)], "C0", linewidth=3.0)
         axis.set(aspect="equal", title=f"$x_{{{i + 1}}}$", xlim=(-1.1, 1.1), ylim=(-1.1, 1.1))
-    figure.canvas.draw()
-    canvas: Any = figure.canvas  # that of Agg, which has its pixels
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    return drawn({"clocks": figure})["clocks"]

@@ -94,6 +94,11 @@ def _differentiable(x: Tensor) -> Tensor | None:
         return None
 
 
+def is_data(x: Tensor) -> bool:
+    """Whether nothing is differentiated in ``x``: neither by a graph, nor by a transform of `torch.func`."""
+    return not (torch.is_grad_enabled() and x.requires_grad) and _differentiable(x) is not None
+
+
 @torch.no_grad()
 def chunked_jet(field: Field, x: Tensor, sigma: Tensor | None = None, chunk: int = CHUNK) -> Jet:
     """The jet of a scalar ``field`` at many states, without a graph; on all cores that of a network of this package, which is

@@ -67,31 +67,35 @@ def climb(
     first NaN that any of them meets, which is then the value of its row."""
     step = torch.full_like(best, start_step)
     generator = fixed_generator()
+    slope = value_and_gradient(function, x)[1] if differentiable and steps else torch.zeros_like(x)
     for _ in range(steps):
-        direction = _gradient(function, x) if differentiable else torch.randn(x.shape, generator=generator).to(x)
+        direction = slope if differentiable else torch.randn(x.shape, generator=generator).to(x)
         direction = direction / direction.norm(dim=-1, keepdim=True).clamp_min(1e-30)
         candidate = x + step.unsqueeze(-1) * direction
-        with torch.no_grad():
-            reached = function(candidate)
+        if differentiable:
+            reached, ahead = value_and_gradient(function, candidate)
+        else:
+            reached, ahead = batched(function, candidate), slope
         odd = torch.isnan(reached)
         better = (reached > best) | odd
         x = torch.where(better.unsqueeze(-1), candidate, x)
         best = torch.where(better, reached, best)
         if odd.any():
             break
+        slope = torch.where(better.unsqueeze(-1), ahead, slope)
         step = torch.where(better, GROWTH * step, SHRINKAGE * step)
     return x, best
 
 
-def _gradient(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
-    """Gradient of ``function`` at each row of ``x``; 0 where it is one of constants, piece by piece."""
+def value_and_gradient(function: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, Tensor]:
+    """``function`` and its gradient at each row of ``x``; that is 0 where it is one of constants, piece by piece."""
     with torch.enable_grad():
         x = x.detach().requires_grad_(True)
-        total = function(x).sum()
-        if not total.requires_grad:
-            return torch.zeros_like(x)
-        (gradient,) = torch.autograd.grad(total, x, materialize_grads=True)
-    return gradient
+        value = function(x)
+        if not value.requires_grad:
+            return value, torch.zeros_like(x)
+        (gradient,) = torch.autograd.grad(value.sum(), x, materialize_grads=True)
+    return value.detach(), gradient
 
 
 def minimiser(function: Callable[[float], float], low: float, high: float) -> float:

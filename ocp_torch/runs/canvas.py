@@ -4,6 +4,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ocp_torch.files.storage import write_atomically
 
 if TYPE_CHECKING:
@@ -12,17 +14,32 @@ else:
     Figure = Any
 
 
+DPI = 120
+
+
 def blank_figure(width: float, height: float, **options) -> Figure:
     """A figure of so many inches that needs no screen; ``options`` are those of `matplotlib.figure.Figure`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), **{"layout": "constrained", **options})
+    figure = Figure(figsize=(width, height), **{"layout": "constrained", "dpi": DPI, **options})
     FigureCanvasAgg(figure)
     return figure
 
 
-def save(figures: dict[str, Figure], folder: Path) -> None:
-    """Write `<name>.png` of each in ``folder``."""
+def drawn(figures: dict[str, Figure]) -> dict[str, np.ndarray]:
+    """The pixels ``(H, W, 3)`` of each, for files and for TensorBoard: a figure takes longer to lay out than to compute."""
+    pixels = {}
     for name, figure in figures.items():
-        write_atomically(folder / f"{name}.png", partial(figure.savefig, dpi=120, format="png"))
+        canvas: Any = figure.canvas  # that of Agg, which has its pixels
+        canvas.draw()
+        pixels[name] = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    return pixels
+
+
+def save(pictures: dict[str, np.ndarray], folder: Path) -> None:
+    """Write `<name>.png` of each of the ``pictures``, as `drawn` gives them, in ``folder``."""
+    if pictures:
+        from matplotlib.image import imsave
+    for name, pixels in pictures.items():
+        write_atomically(folder / f"{name}.png", partial(imsave, arr=pixels, dpi=DPI, format="png"))

@@ -154,7 +154,7 @@ def certify_in(given: dict, folder: Path) -> Certificate:
     """Certify what `arguments` gave; print the table and leave `certificate.json` and its figure in ``folder``."""
     certificate = certify(**given)
     certificate.save(folder / "certificate.json")
-    canvas.save({"certificate": interval_figure(certificate.to_dict())}, folder / "figures")
+    canvas.save(canvas.drawn({"certificate": interval_figure(certificate.to_dict())}), folder / "figures")
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
     log.info("in %s", folder)
     return certificate

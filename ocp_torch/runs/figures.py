@@ -128,7 +128,8 @@ class Shown:
         if learned is None and how is not None and (problem.has_simulator or how == NETWORK):
             learned = occupation_density(how, problem, fields, self.constants)
         if problem.dim in BINS and problem.has_simulator and not self.quick:
-            simulated = simulated_occupation(problem, policies.get(self.kind or "") or next(iter(policies.values())))
+            quick = trained_policies(how, problem, fields.rounded, self.constants)  # as exact as a histogram can show
+            simulated = simulated_occupation(problem, quick.get(self.kind or "") or next(iter(quick.values())))
         if learned is not None or simulated is not None:
             drawn["occupation"] = {"learned": learned, "exact": problem.exact_occupation, "simulated": simulated}
         return drawn

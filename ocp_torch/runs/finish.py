@@ -5,6 +5,8 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ocp_torch.certificate import Certificate, CertificateSettings
 from ocp_torch.control.controller import FILE_NAME, Controller
 from ocp_torch.errors import InputError, StorageError
@@ -13,7 +15,6 @@ from ocp_torch.files.storage import write_atomically
 from ocp_torch.maths.seeds import generators_kept
 from ocp_torch.problems.blame import blamed
 from ocp_torch.runs import canvas
-from ocp_torch.runs.canvas import Figure
 from ocp_torch.runs.figures import Shown, interval_figure
 from ocp_torch.runs.loading import policy_of
 from ocp_torch.runs.metrics.measures import has_metrics
@@ -101,28 +102,28 @@ def hand_out(
     controller = controller_of(trainer, certificate, kind, fields)
     controller.save(folder / FILE_NAME)
     write_atomically(folder / "certificate.json", certificate.save)
-    drawn = {}
+    drawn: dict = {}
     if trainer.settings.figures:
         monitor.stages("figures")
-        drawn = {"certificate": interval_figure(certificate.to_dict())}
+        figures = {"certificate": interval_figure(certificate.to_dict())}
         with unless_it_failed(failure, trainer):
             how = trainer.constants, trainer.objective.occupation
-            drawn |= Shown(
-                trainer.problem, fields, *how, certificate.followed or kind, certificate.occupation
-            ).figures()
+            followed = certificate.followed or kind, certificate.occupation
+            figures |= Shown(trainer.problem, fields, *how, *followed).figures()
             moved = motion(trainer.problem, policy_of(controller), trainer.seed)
-            drawn |= {} if moved is None else {"motion": moved}
+            figures |= {} if moved is None else {"motion": moved}
+        drawn = canvas.drawn(figures)
         canvas.save(drawn, folder / "figures")
     monitor.finish(certificate, drawn, _flat(trainer.config), trainer.step)
     return controller
 
 
-def glimpse(trainer: Trainer) -> dict[str, Figure]:
-    """`V`, `u` and `mu` as they are in the middle of training; a problem that draws random numbers goes on as if nobody had
-    looked."""
+def glimpse(trainer: Trainer) -> dict[str, np.ndarray]:
+    """Pictures of `V`, `u` and `mu` as they are in the middle of training; a problem that draws random numbers goes on as if
+    nobody had looked."""
     how = trainer.constants, trainer.objective.occupation
     with generators_kept():
-        return Shown(trainer.problem, trainer.averaged_fields, *how, quick=True).figures()
+        return canvas.drawn(Shown(trainer.problem, trainer.averaged_fields, *how, quick=True).figures())
 
 
 def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields: Fields) -> Controller:

@@ -125,8 +125,8 @@ class Monitor(Silent):
 
     def evaluated(self, trainer: Trainer, certificate: Certificate) -> None:
         record(self.writer, certificate, trainer.step)
-        for name, figure in self.pictures(trainer).items():
-            self.writer.add_figure(f"fields/{name}", figure, trainer.step, close=False)
+        for name, pixels in self.pictures(trainer).items():
+            self.writer.add_image(f"fields/{name}", pixels, trainer.step, dataformats="HWC")
         shown = certificate.lower | certificate.upper
         values = {name: f"{e.value:.6f}" for name in ("F_M", "J") if (e := shown.get(name)) is not None}
         gaps = [gap for kind in ("certified", "simulated") if (gap := certificate.gap[kind]) is not None]
@@ -153,16 +153,16 @@ class Monitor(Silent):
         self.bar.refresh()
         self.stages.begin(seconds)
 
-    def finish(self, certificate: Certificate, figures: dict, settings: dict, step: int) -> None:
-        """The last points: all numbers of ``certificate``, the Matplotlib ``figures`` by name, and the run's ``settings``,
-        one level deep, for the HParams tab; in a file of their own, which replaces one left half-written by a kill."""
+    def finish(self, certificate: Certificate, pictures: dict, settings: dict, step: int) -> None:
+        """The last points: all numbers of ``certificate``, ``pictures`` by name, and the run's ``settings``, one
+        level deep, for the HParams tab; in a file of their own, which replaces one left half-written by a kill."""
         suffix = f".end-{step}"
         for half in self._folder.glob(f"{EVENTS}*{suffix}"):
             half.unlink()
         with SummaryWriter(str(self._folder), filename_suffix=suffix) as writer:
             record(writer, certificate, step)
-            for name, figure in figures.items():
-                writer.add_figure(f"fields/{name}", figure, step, close=False)
+            for name, pixels in pictures.items():
+                writer.add_image(f"fields/{name}", pixels, step, dataformats="HWC")
             allowed = {k: v if isinstance(v, bool | int | float | str) else str(v) for k, v in settings.items()}
             gaps = {f"hparam/{k}": v for k, v in certificate.gap.items() if isinstance(v, float)}
             results = gaps or {"hparam/none": torch.nan}

@@ -23,7 +23,7 @@ from ocp_torch.certificate.proof.network_model import embed, network_model, prod
 from ocp_torch.certificate.proof.rigorous import contradiction, obstacle, rigorous_lower_bound
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
-from ocp_torch.fields.mlp import ACTIVATIONS
+from ocp_torch.fields.activations import ACTIVATIONS, Tanh
 from ocp_torch.maths.jets import jet
 from ocp_torch.problems import Circle, Lipschitz, Manufactured, Problem, Torus
 from ocp_torch.problems.constants import resolve_constants
@@ -160,7 +160,7 @@ def test_rounding_is_enclosed_on_the_smallest_cells(gated):
         if gated:
             h = np.tanh(line(layer.gate, h)) * line(layer.linear, h)
         else:
-            h = np.tanh(h) if isinstance(layer, torch.nn.Tanh) else line(layer, h)
+            h = np.tanh(h) if isinstance(layer, Tanh) else line(layer, h)
     truth = exact(V.shift) + exact(V.scale) * line(V.head, h)[:, 0]
     error = np.abs(exact(value.coefficients[0]) - truth)
     assert (error <= exact(value.radius)).all()

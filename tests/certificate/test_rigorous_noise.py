@@ -18,7 +18,7 @@ from ocp_torch.certificate.proof.network_model import network_model
 from ocp_torch.certificate.proof.rigorous import contradiction, obstacle, rigorous_lower_bound
 from ocp_torch.certificate.proof.waves import matrix_model
 from ocp_torch.fields import Fields, PeriodicMLP, SobolevField
-from ocp_torch.fields.mlp import ACTIVATIONS
+from ocp_torch.fields.activations import ACTIVATIONS
 from ocp_torch.maths.jets import jet
 from ocp_torch.problems import Circle, Lipschitz, Manufactured, Torus
 from ocp_torch.problems.constants import resolve_constants

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from ocp_torch.fields import PeriodicMLP, SobolevField
+from ocp_torch.fields.activations import ACTIVATIONS
 from ocp_torch.fields.forward_sweep import Along
-from ocp_torch.fields.mlp import ACTIVATIONS
 from ocp_torch.maths import cores
 from ocp_torch.maths.batch_jet import PIECE, batch_jet
 from ocp_torch.maths.jets import chunked_jet, jet, reverse_jet

@@ -168,7 +168,7 @@ def test_a_name_in_a_figure_is_no_formula(run, tmp_path):
     certificate = json.loads((run / "certificate.json").read_text())
     for name in ("$\\nothing{", "$x$", ESCAPE, "x" * 10**5):
         figure = interval_figure({**certificate, "problem": name})
-        canvas.save({"certificate": figure}, tmp_path)
+        canvas.save(canvas.drawn({"certificate": figure}), tmp_path)
         assert figure.axes[0].get_title().startswith(visible(name)[:20])
     (tmp_path / "runs" / "$\\bad{").mkdir(parents=True)
     (tmp_path / "runs" / "$\\bad{" / "certificate.json").write_text(json.dumps(certificate))

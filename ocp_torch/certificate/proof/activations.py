@@ -15,6 +15,8 @@ import torch
 from numpy.polynomial import Polynomial
 from torch import Tensor, nn
 
+from ocp_torch.fields import activations
+
 # Rounding of one derivative relative to the sum of its terms.
 RELATIVE = 2.0**-46
 # The ceilings are computed in floating point themselves.
@@ -126,7 +128,7 @@ class Silu(_Sigmoid):
 
 SERIES: dict[type[nn.Module], type[Gelu | Tanh | Softplus | Silu]] = {
     nn.GELU: Gelu,
-    nn.Tanh: Tanh,
+    activations.Tanh: Tanh,
     nn.Softplus: Softplus,
     nn.SiLU: Silu,
 }

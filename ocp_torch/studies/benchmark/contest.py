@@ -13,7 +13,7 @@ from ocp_torch.errors import InputError, call, require_choice, require_integer, 
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.runs.build import build_certificate_settings, build_problem, build_trainer
-from ocp_torch.runs.canvas import save
+from ocp_torch.runs.canvas import drawn, save
 from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender, RLContender, require_rl
 from ocp_torch.studies.benchmark.families import Family, joined, pictures, read_beside, tables, versions
 from ocp_torch.studies.benchmark.measure import Curve, Judge
@@ -96,7 +96,7 @@ class Contest:
         families = joined([*([self._family(curves)] if curves else []), *self.beside])
         text = tables(families, self.gap)
         (folder / "benchmark.md").write_text(text + "\n")
-        save(pictures(families, self.gap), folder)
+        save(drawn(pictures(families, self.gap)), folder)
         log.info("\n%s\n\nwritten to %s", text, folder)
         return curves
 
