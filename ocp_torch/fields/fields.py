@@ -32,10 +32,13 @@ class Fields(nn.Module):
         self.networks = nn.ModuleDict(networks)
 
     @classmethod
-    def build(cls, problem: Problem, names: Iterable[str], network: NetworkFactory, seed: int) -> "Fields":
+    def build(
+        cls, problem: Problem, names: Iterable[str], network: NetworkFactory, seed: int, waves: Tensor | None = None
+    ) -> "Fields":
         """Fresh networks for ``names`` in the units of ``problem``, initialised from ``seed`` alone.
 
-        An embedding with room for them gets the problem's `prominent_waves`, one for a state of rest its `equilibrium`.
+        An embedding with room for them gets ``waves`` ``(W, d)``, those that are not 0, or else the problem's
+        `prominent_waves`; one for a state of rest its `equilibrium`.
         """
         cost, control = typical_sizes(problem)
         forms: dict[str, dict[str, Any]] = {
@@ -49,7 +52,8 @@ class Fields(nn.Module):
             fields = cls({name: made(name, network, dim=problem.dim, **forms[name]) for name in names})
         for embedding in (m for m in fields.modules() if isinstance(m, FourierEmbedding)):
             if embedding.mixed is not None and not embedding.mixed.is_meta:
-                embedding.mix(_waves(problem, len(embedding.mixed)))
+                known = None if waves is None else waves[(waves != 0.0).any(dim=-1)]
+                embedding.mix(_waves(problem, len(embedding.mixed)) if known is None else known)
         for centred in (m for m in fields.modules() if isinstance(m, Centred)):
             if not centred.at.is_meta and (rest := equilibrium(problem)) is not None:
                 centred.centre(rest.at, rest.bend, fields.trajectory_value.unit)

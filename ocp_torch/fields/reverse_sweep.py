@@ -16,6 +16,9 @@ from torch.autograd.function import once_differentiable
 from ocp_torch.fields.activations import DERIVATIVES
 from ocp_torch.maths.jets import Jet
 
+# States whose products with others are computed at once.
+ROWS = 128
+
 
 class Layer(ABC):
     """One hidden layer during the sweeps of one batch, called in this order; rows are states."""
@@ -33,12 +36,40 @@ class Layer(ABC):
         """The derivative along `g` of what comes out, from that of what comes in."""
 
     @abstractmethod
-    def differentiated(self, adjoint: Tensor) -> list[Tensor]:
-        """The slopes of `sum v V + sum g . grad V` in the layer's parameters, from those in what comes out."""
+    def turned(self, adjoint: Tensor) -> None:
+        """Take the slopes of `sum v V + sum g . grad V` in what comes out."""
 
     @abstractmethod
     def inward(self) -> Tensor:
         """The same in what comes in."""
+
+    @property
+    @abstractmethod
+    def factors(self) -> list[tuple[Tensor, Tensor]]:
+        """For each affine map its `(z, p)`: with ``came``, `h`, and ``moved_in``, `y`, the slopes in its matrix are
+        `sum z h^T + p y^T`, those in its bias `sum z`."""
+
+    came: Tensor
+    moved_in: Tensor
+
+    @property
+    def slopes(self) -> list[Tensor]:
+        """The slopes in the layer's parameters."""
+        found = []
+        for z, p in self.factors:
+            found += [torch.addmm(z.T @ self.came, p.T, self.moved_in), z.sum(dim=0)]
+        return found
+
+    def add_products(self, gram: Tensor, rows: slice, others: slice) -> None:
+        """Add to ``gram`` the inner products of the slopes in the layer's parameters that the states ``rows`` have and those
+        that ``others`` have, without those slopes."""
+        came = self.came, self.moved_in
+        products = [[one[rows] @ other[others].T for other in came] for one in came]
+        products[0][0] += 1.0  # for the bias
+        for pair in self.factors:
+            for one, across in zip(pair, products, strict=True):
+                for other, product in zip(pair, across, strict=True):
+                    gram.addcmul_(one[rows] @ other[others].T, product)
 
 
 class Dense(Layer):
@@ -62,13 +93,15 @@ class Dense(Layer):
         self.moved = moved @ self.weight.T
         return self.first * self.moved
 
-    def differentiated(self, adjoint: Tensor) -> list[Tensor]:
+    def turned(self, adjoint: Tensor) -> None:
         self.adjoint = (adjoint * self.first).addcmul_(self.second() * self.moved, self.slope)
-        weight = torch.addmm(self.adjoint.T @ self.came, self.pre.T, self.moved_in)
-        return [weight, self.adjoint.sum(dim=0)]
 
     def inward(self) -> Tensor:
         return self.adjoint @ self.weight
+
+    @property
+    def factors(self) -> list[tuple[Tensor, Tensor]]:
+        return [(self.adjoint, self.pre)]
 
 
 class Product(Layer):
@@ -94,22 +127,22 @@ class Product(Layer):
         self.moved_open = self.first * self.moved_gate
         return (self.moved_open * self.factor).addcmul_(self.opened, self.moved_linear)
 
-    def differentiated(self, adjoint: Tensor) -> list[Tensor]:
+    def turned(self, adjoint: Tensor) -> None:
         steep = (adjoint * self.factor).addcmul_(self.slope, self.moved_linear)
         bent = (self.second() * self.moved_gate).mul_(self.factor)
         self.of_gate = (steep * self.first).addcmul_(bent, self.slope)
         self.of_linear = (adjoint * self.opened).addcmul_(self.slope, self.moved_open)
-        found = []
-        for of, pre in ((self.of_gate, self.pre_gate), (self.of_linear, self.pre_linear)):
-            found += [torch.addmm(of.T @ self.came, pre.T, self.moved_in), of.sum(dim=0)]
-        return found
 
     def inward(self) -> Tensor:
         return torch.addmm(self.of_gate @ self.gate.weight, self.of_linear, self.linear.weight)
 
+    @property
+    def factors(self) -> list[tuple[Tensor, Tensor]]:
+        return [(self.of_gate, self.pre_gate), (self.of_linear, self.pre_linear)]
+
 
 class ReverseSweep:
-    """The sweeps of the perceptron ``network`` over the states ``x`` ``(N, d)``; first `jet`, then `differentiated`."""
+    """The sweeps of the perceptron ``network`` over the states ``x`` ``(N, d)``; first `jet`, then `turn`, then the rest."""
 
     def __init__(self, network: Any, x: Tensor) -> None:
         self.head, self.scale, self.shift = network.head, network.scale, network.shift
@@ -131,23 +164,34 @@ class ReverseSweep:
         of_cosines, of_sines = slope.chunk(2, dim=-1)
         return value, self.embedding.pulled_back(cosines * of_sines - sines * of_cosines, self.dim)
 
-    def differentiated(self, of_value: Tensor, of_gradient: Tensor) -> list[Tensor]:
-        """The slopes in all parameters, in the network's order, of what has the slopes ``of_value`` ``(N,)`` and
-        ``of_gradient`` ``(N, d)`` in the jet."""
+    def turn(self, of_value: Tensor, of_gradient: Tensor) -> None:
+        """Take what has the slopes ``of_value`` `v` ``(N,)`` and ``of_gradient`` `g` ``(N, d)`` in the jet."""
         turned = self.embedding.angles(of_gradient)
         cosines, sines = self.embedded.chunk(2, dim=-1)
         moved = torch.cat([-sines * turned, cosines * turned], dim=-1)
         for layer in self.layers:
             moved = layer.along(moved)
-        scaled = self.scale * of_value
-        head = self.scale * moved.sum(dim=0) + scaled @ self.last
-        adjoint = scaled.unsqueeze(-1) * self.head.weight
-        found = [head.unsqueeze(0), scaled.sum().unsqueeze(0)]
+        self.of_bias = self.scale * of_value
+        self.of_head = (self.scale * moved).addcmul_(self.of_bias.unsqueeze(-1), self.last)
+        adjoint = self.of_bias.unsqueeze(-1) * self.head.weight
         for layer in reversed(self.layers):
-            found = layer.differentiated(adjoint) + found
+            layer.turned(adjoint)
             if layer is not self.layers[0]:  # the embedding has no weights
                 adjoint = layer.inward()
-        return found
+
+    def slopes(self) -> list[Tensor]:
+        """Its slopes in all parameters, in the network's order."""
+        head = [self.of_head.sum(dim=0, keepdim=True), self.of_bias.sum(dim=0, keepdim=True)]
+        return [slope for layer in self.layers for slope in layer.slopes] + head
+
+    def products(self) -> Tensor:
+        """The inner products ``(N, N)`` of each two states' own slopes in all parameters, below the diagonal and on it."""
+        gram = self.of_head @ self.of_head.T + torch.outer(self.of_bias, self.of_bias)
+        for first in range(0, len(gram), ROWS):  # in strips that fit the cache
+            rows, others = slice(first, first + ROWS), slice(0, first + ROWS)
+            for layer in self.layers:
+                layer.add_products(gram[rows, others], rows, others)
+        return gram
 
 
 class _Swept(torch.autograd.Function):
@@ -163,7 +207,8 @@ class _Swept(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, of_value: Tensor, of_gradient: Tensor) -> Any:
         _ = ctx.saved_tensors
-        return None, None, *ctx.sweep.differentiated(of_value, of_gradient)
+        ctx.sweep.turn(of_value, of_gradient)
+        return None, None, *ctx.sweep.slopes()
 
 
 def swept_jet(network: Any, x: Tensor) -> Jet:

@@ -46,6 +46,7 @@ class Branch(IntEnum):
     TIGHTENING = 30  # states on which V is trained on for the shifted bound
     WARM_START = 31  # pieces of trajectory of the warm start; below, their starts, those of trials, the noise of these
     RUNNING = 32  # states and paths of the running estimates
+    REFINEMENT = 33  # states of the Gauss-Newton steps that end a round; below, the round
     AUDIT = 1000  # which trajectories are simulated again with finer steps
 
 

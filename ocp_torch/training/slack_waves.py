@@ -4,6 +4,8 @@ Where `V` is close to `V*`, the slack `Q` is about linear in what is missing: a 
 does not have, and that was too small to be seen in the problem's data, is then the largest that `Q` is made of.
 """
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
@@ -13,11 +15,14 @@ from ocp_torch.fields.waves import STATES, standardised, waves_of
 from ocp_torch.problems import Problem
 from ocp_torch.problems.generator import Generator
 
+if TYPE_CHECKING:
+    from ocp_torch.training.trainer import Trainer
+
 # Steps of a round after which they are sought. With 32 coordinates one of 64 terms is missing at first, with 64 coordinates
 # 18 of 127; all are found after 200 steps, and F_M ends .026 and .021 % below OPT after 600 (with 32 .174 % without), on a
 # torus in three dimensions, with kinks, .041 for .074 %. Sought after 100 as well, F_M is .109 % below in 64 coordinates
 # where it was 1.06 after 165 steps; a torus and eight coordinates end as before.
-SOUGHT_AT = (100, 200, 300, 400)
+SOUGHT_AT = (100, 200, 300)
 # A slack below so much of the state cost's standard deviation is rounding in single precision.
 ROUNDING = 1e-6
 
@@ -45,3 +50,11 @@ def add_waves(fields: Fields, waves: Tensor) -> None:
     for network in fields.networks.values():
         if isinstance(network, PeriodicMLP):
             network.add_waves(waves)
+
+
+def seek_waves(trainer: "Trainer") -> None:
+    """Before some steps of a round: take what is missed."""
+    if trainer.step - trainer.settings.start(trainer.state.round) in SOUGHT_AT:
+        waves = trainer.ranks.from_first(lambda: missed_waves(trainer.problem, trainer.averaged_fields))
+        for fields in (trainer.fields, trainer.averaged_fields):
+            add_waves(fields, waves)

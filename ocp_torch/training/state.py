@@ -2,6 +2,7 @@
 
 import copy
 import random
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,8 +12,9 @@ import torch
 from ocp_torch.errors import InputError, notes, require_integer, require_number, visible
 from ocp_torch.fields import Fields
 from ocp_torch.maths.seeds import Branch, derive_seed
+from ocp_torch.objectives import Phase
 from ocp_torch.problems.constants import Constants
-from ocp_torch.steppers import Average, NonFiniteError, Stepper
+from ocp_torch.steppers import Average, NonFiniteError, Stepper, advance
 from ocp_torch.training.batches import Batches
 from ocp_torch.training.health import Health
 from ocp_torch.training.settings import TrainerSettings
@@ -21,7 +23,7 @@ from ocp_torch.training.warm_start.iteration import ValueIteration
 # What decides the learning rates: where one of these differs at a resume, they are those of the new configuration.
 rates_of = lambda config: (config["optimizer"], config["schedule"], config["trainer"]["steps"])
 # What is saved just as it is.
-PLAIN = ("config", "step", "round", "samples", "seconds", "elapsed", "pending", "retry", "ended")
+PLAIN = ("config", "step", "round", "samples", "seconds", "elapsed", "pending", "retry", "ended", "refined")
 
 
 @dataclass
@@ -44,6 +46,7 @@ class TrainState:
     pending: bool = False  # a full certificate may reach the target gap, and is to be made
     retry: int = 0  # none is made before this step
     ended: bool = False  # nothing was left to do when it was saved
+    refined: bool = False  # the Gauss-Newton steps at the end of the round are done
     warm: ValueIteration | None = None  # the warm start, where there is one
 
     def state_dict(self) -> dict:
@@ -80,6 +83,7 @@ class TrainState:
         self.seconds = require_number("seconds of the checkpoint", saved["seconds"], at_least=0.0)
         self.elapsed = require_number("elapsed of the checkpoint", saved["elapsed"], at_least=0.0)
         self.pending, self.retry = bool(saved["pending"]), int(saved["retry"])
+        self.refined = bool(saved.get("refined", True))  # runs from before there were such steps have none
         constants = saved["bounds"]
         warnings, unbounded = notes(constants["warnings"]), bool(constants["unbounded"])
         self.constants = replace(self.constants, M=constants["M"], warnings=warnings, unbounded=unbounded)
@@ -99,6 +103,11 @@ class TrainState:
             self.warm.load_state_dict(saved["warm"])
         # Last: to restore the rest may draw from them.
         restore_generators(saved["generators"])
+
+    def try_step(self, phase: Phase) -> None:
+        """One step of all players shows whether their optimisers can work with what they were given; it is not undone."""
+        with suppress(NonFiniteError):  # the run itself will say so
+            advance(self.stepper, self.average, self.batches.draw, phase)
 
     def require_finite(self) -> None:
         """Raise `NonFiniteError` where a weight is not finite: such a state is neither evaluated nor saved."""

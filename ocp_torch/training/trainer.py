@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -18,13 +17,13 @@ from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import blamed
 from ocp_torch.problems.constants import Constants
-from ocp_torch.steppers import NonFiniteError, advance
 from ocp_torch.training.checkpoint import BEST, load_checkpoint, save_checkpoint
 from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.health import Evaluation, sanity_warnings
 from ocp_torch.training.observer import Silent
+from ocp_torch.training.refinement import refine
 from ocp_torch.training.settings import TrainerSettings
-from ocp_torch.training.slack_waves import SOUGHT_AT, add_waves, missed_waves
+from ocp_torch.training.slack_waves import seek_waves
 from ocp_torch.training.state import TrainState
 from ocp_torch.training.stopping import ASKED, MAX_SECONDS, STEPS, TARGET_GAP, Signals, in_words, reason_to_stop
 from ocp_torch.training.whole_step import whole_step
@@ -121,16 +120,24 @@ class Trainer:
         self.ranks.from_first(lambda: self._warm_up(monitor, checkpoint, signals))
         for module in (self.fields, self.state.average):
             module.load_state_dict(self.ranks.from_first(module.state_dict))
-        reason = self.ranks.from_first(lambda: self._reason)
+        reason = self.ranks.from_first(self._reason)
         while reason is None:
             if self.step < self.end:
                 self._advance(monitor, checkpoint)
+            elif not self.state.refined:
+                refine(self, lambda: self.asked or signals.received is not None)
+                if (
+                    self.state.refined
+                    and self.state.round + 1 < self.settings.rounds
+                    and self._due(self.settings.evaluate_every)
+                ):
+                    self.state.pending = self.ranks.from_first(lambda: self._evaluate(monitor, checkpoint))
             elif self.ranks.from_first(self._wants_another_round):
                 self.state.round += 1
                 monitor.extended(self)
             else:
                 return STEPS
-            asked, over, *came = self.ranks.agree([self.asked, self._reason == MAX_SECONDS, *signals.came()])
+            asked, over, *came = self.ranks.agree([self.asked, self._reason() == MAX_SECONDS, *signals.came()])
             if any(came):
                 self.ranks.from_first(lambda: self.save(checkpoint))
                 signals.raise_first(came)
@@ -142,21 +149,20 @@ class Trainer:
         """The reason for which `fit` stopped, in words."""
         return in_words(self.stopped, self.settings, self.state)
 
-    @property
     def _reason(self) -> str | None:
         return ASKED if self.asked else reason_to_stop(self.settings, self.state)
 
     def _warm_up(self, monitor: Silent, checkpoint: Path | None, signals: Signals) -> None:
         """What is left of the warm start; `V` then begins as its best one, which itself stays a candidate."""
         state, warm = self.state, self.state.warm
-        while warm is not None and not warm.done and self._reason is None:
+        while warm is not None and not warm.done and self._reason() is None:
             started = time.perf_counter()
             looked = warm.advance()
             if looked:
                 warm.hand_over([self.fields, self.averaged_fields])
             state.samples += warm.drawn
-            spent = time.perf_counter() - started
-            state.seconds, state.elapsed = state.seconds + spent, state.elapsed + spent
+            state.seconds += (spent := time.perf_counter() - started)
+            state.elapsed += spent
             monitor.warmed(self, looked)
             if looked or signals.received is not None:
                 self.save(checkpoint)
@@ -164,28 +170,25 @@ class Trainer:
 
     def _advance(self, monitor: Silent, checkpoint: Path | None) -> None:
         """One step, and what is due after it."""
-        settings, state = self.settings, self.state
-        started = time.perf_counter()
-        if state.step - settings.start(state.round) in SOUGHT_AT:
-            waves = self.ranks.from_first(lambda: missed_waves(self.problem, self.averaged_fields))
-            for fields in (self.fields, self.averaged_fields):
-                add_waves(fields, waves)
+        settings, state, started = self.settings, self.state, time.perf_counter()
+        seek_waves(self)
         report = whole_step(self.state, self.phase, self.ranks)
-        state.step += 1
+        state.step, state.refined = state.step + 1, False
         state.samples += self.ranks.size * report.samples
         state.seconds += time.perf_counter() - started
-        due = lambda every: every > 0 and state.step % every == 0
         last = state.step == self.end
-        log = due(settings.log_every) or last
-        if log:
+        if log := self._due(settings.log_every) or last:
             for sentence in self.health.stepped(state.step, report.losses, self.stepper.parameters):
                 monitor.noticed(sentence)
         monitor.stepped(self, report, log)
-        if due(settings.evaluate_every) and not (last and state.round + 1 == settings.rounds):
+        if self._due(settings.evaluate_every) and not last:
             state.pending = self.ranks.from_first(lambda: self._evaluate(monitor, checkpoint))
         state.elapsed += time.perf_counter() - started
-        if due(settings.checkpoint_every) or state.pending:
+        if self._due(settings.checkpoint_every) or state.pending:
             self.save(checkpoint)
+
+    def _due(self, every: int) -> bool:
+        return every > 0 and self.step % every == 0
 
     def _evaluate(self, monitor: Silent, checkpoint: Path | None) -> bool:
         """A quick certificate: keep the state if it is the best so far, and see whether it may be good enough to end."""
@@ -193,14 +196,13 @@ class Trainer:
         certificate = self.evaluator.evaluate(self.run)
         monitor.evaluated(self, certificate)
         best = self.health.evaluated(Evaluation.at(self.step, certificate), self.averaged_fields, certificate)
-        late = 2 * self.step >= self.settings.steps  # early on, what is not learnt yet says nothing
-        tell = late and not self.health.warned
+        # Early on, what is not learnt yet says nothing.
+        tell = 2 * self.step >= self.settings.steps and not self.health.warned
         found = sanity_warnings(self.problem, self.constants, certificate, self.seed) if tell else []
         for sentence in self.health.doubts(self.step, certificate.contradiction, found):
             monitor.noticed(sentence)
         target, gap = self.settings.target_gap, certificate.plain_gap
-        tried = self.step < self.state.retry  # too short a time ago
-        self.state.pending = target is not None and gap is not None and gap <= target and not tried
+        self.state.pending = target is not None and gap is not None and gap <= target and self.step >= self.state.retry
         if best and checkpoint is not None:
             save_checkpoint(checkpoint.with_name(BEST), self.state_dict())
         return self.state.pending
@@ -236,9 +238,7 @@ class Trainer:
         try:
             state = load_checkpoint(checkpoint) if state is None else state
             self.state.load_state_dict(state, self.settings)
-            with suppress(NonFiniteError):  # the run itself will say so
-                # One step of all players for nothing shows whether their optimisers can work with what they were given.
-                advance(self.stepper, self.state.average, self.batches.draw, replace(self.phase, progress=1.0))
+            self.state.try_step(replace(self.phase, progress=1.0))
             self.state.load_state_dict(state, self.settings)
             self.evaluator.latest = None  # what was seen of another state at the same step says nothing
         except Exception as error:  # a crafted state raises whatever its odd part leads to

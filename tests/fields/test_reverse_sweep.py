@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ocp_torch.fields import PeriodicMLP
+from ocp_torch.fields import PeriodicMLP, reverse_sweep
 from ocp_torch.fields.activations import ACTIVATIONS
 from ocp_torch.maths.jets import jet, reverse_jet
 
@@ -82,3 +82,20 @@ def test_frozen_networks_and_no_graphs():
     field, x = network(2).requires_grad_(False), torch.rand(5, 2, dtype=torch.float64)
     assert not field.jet(x).gradient.requires_grad
     assert field.requires_grad_(True).jet(x).gradient.grad_fn is not None
+
+
+@pytest.mark.parametrize("gated", [False, True])
+def test_products_of_slopes_are_had_without_the_slopes(gated, monkeypatch):
+    """In strips of rows, below the diagonal."""
+    monkeypatch.setattr(reverse_sweep, "ROWS", 4)
+    field, x = network(2, gated=gated), torch.rand(11, 2, dtype=torch.float64)
+    of_value, of_gradient = torch.randn(11, dtype=torch.float64), torch.randn(11, 2, dtype=torch.float64)
+    of = reverse_jet(field, x)
+    each = of_value * of.value + (of_gradient * of.gradient).sum(dim=-1)
+    slopes = [torch.autograd.grad(e, list(field.parameters()), retain_graph=True) for e in each]
+    rows = torch.stack([torch.cat([s.flatten() for s in own]) for own in slopes])
+    with torch.no_grad():
+        sweep = reverse_sweep.ReverseSweep(field, x)
+        sweep.jet()
+        sweep.turn(of_value, of_gradient)
+        torch.testing.assert_close(sweep.products().tril(), (rows @ rows.T).tril(), **CLOSE)

@@ -10,6 +10,7 @@ from ocp_torch.certificate.estimate import integral
 from ocp_torch.certificate.upper.multiples import best_multiple, terms_on
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import require_integer, require_number
+from ocp_torch.fields.embedding import FourierEmbedding
 from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
 from ocp_torch.maths.jets import CHUNK, Field
 from ocp_torch.maths.sampling import SobolSampler
@@ -25,7 +26,7 @@ from ocp_torch.steppers import advance, short_fit
 from ocp_torch.steppers.fitting import LARGEST_RATE
 
 # The closed loop's data are computed once on so many states at most: their divergences cost more than a step.
-POOL = 2**16
+POOL = 2**15
 # Beyond that ratio of the two suprema of the slack the residual is not weighed any more lopsidedly.
 MOST_LOPSIDED = 16.0
 # Where `mu` is nearly 0 so is every gradient of the fit, and large first steps may lead there (dubins with noise: two seeds
@@ -74,7 +75,9 @@ def fit_closed_loop(
     like = torch.zeros(()) if fields is None else next(fields.parameters())
     loop = ClosedLoop(problem, policy)
     names = (LOG_OCCUPATION, VALUE) if trained is None else (LOG_OCCUPATION,)
-    fitted = Fields.build(problem, names, network, derive_seed(seed, Branch.POLICY_EVALUATION, 0)).to(like)
+    known = getattr(trained, "embedding", None)  # has the waves that were found in the slack of V too
+    waves = known.mixed if isinstance(known, FourierEmbedding) else None
+    fitted = Fields.build(problem, names, network, derive_seed(seed, Branch.POLICY_EVALUATION, 0), waves).to(like)
     if fields is not None and fields.log_occupation is not None:
         fitted.log_occupation.load_state_dict(fields.log_occupation.state_dict())
     count = min(POOL, settings.steps * settings.batch)

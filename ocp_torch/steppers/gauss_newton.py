@@ -1,0 +1,106 @@
+r"""Gauss-Newton steps for one scalar perceptron: the squares of a residual `r` of its value and gradient at each state.
+
+With the Jacobian `J` of the residuals of a batch in all weights, a step is
+
+    phi_k = m phi_{k-1} + J^T (J J^T + l I)^{-1} (r - m J phi_{k-1}),   theta_{k+1} = theta_k - phi_k :
+
+the change that takes all residuals of the batch to 0, as far as they are linear, and is nearest to the one before (SPRING:
+Goldshlager, Abrahamsen and Lin, 2024). The system has a row for each state, and `J J^T` is had without `J`
+(`ReverseSweep.products`). Where the solution is smooth this converges geometrically: 16 coordinates have a slack of 2e-4 of
+the cost after 300 steps of SOAP, of 2e-6 after 40 of these, which take half as long.
+"""
+
+import copy
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ocp_torch.fields.mlp import PeriodicMLP
+from ocp_torch.fields.reverse_sweep import ReverseSweep
+from ocp_torch.maths.jets import Jet
+from ocp_torch.problems.samples import Samples
+
+# States of a step: in 64 coordinates steps on 512 diverge, on 1,024 they converge.
+STATES = 1024
+# The damping `l` relative to the mean of the diagonal, and the momentum `m`. With 1e-3 convergence is several times slower;
+# with no momentum it is hardly any, and with .9 for .8 the residual is a tenth after 36 steps and not after 24.
+DAMPING, MOMENTUM = 1e-6, 0.8
+# The length of the difference by which `J phi` is computed, relative to that of `phi`.
+DIFFERENCE = 1e-3
+# Residuals of smooth solutions grow at first, up to threefold, and fall by half every four steps later on. Beside a kink,
+# which no smooth function has, the first step makes them a hundred times as large: then there are no more.
+GROWTH = 10.0
+# The residual, relative to what it was, that is small enough; weights in single precision do not allow for much less.
+ENOUGH = 0.01
+
+Residual = Callable[[Samples, Jet], Tensor]
+
+
+class GaussNewton:
+    """Steps of ``network``, in float64 and frozen, on the squares of ``residual`` ``(N,)`` of samples and the jet there."""
+
+    def __init__(self, network: PeriodicMLP, residual: Residual) -> None:
+        self.network, self.residual = network, residual
+        self.weights: list[Any] = list(network.parameters())
+        self.momentum: list[Any] | None = None
+
+    @torch.no_grad()
+    def step(self, samples: Samples) -> float:
+        """One step on ``samples``; the root mean square of their residuals before it, infinite where none could be made."""
+        sweep = ReverseSweep(self.network, samples.x)
+        with torch.enable_grad():
+            jet = Jet(*(part.requires_grad_(True) for part in sweep.jet()))
+            residual = self.residual(samples, jet)
+            slopes = torch.autograd.grad(residual.sum(), (jet.value, jet.gradient))
+        residual = residual.detach()
+        sweep.turn(*slopes)
+        gram = sweep.products()
+        gram.diagonal().add_(DAMPING * gram.diagonal().mean())
+        wanted = residual if self.momentum is None else residual - MOMENTUM * self._along(samples)
+        factor, failed = torch.linalg.cholesky_ex(gram)
+        if failed:
+            return math.inf
+        each = torch.cholesky_solve(wanted.unsqueeze(-1), factor).squeeze(-1)
+        sweep.turn(each * slopes[0], each.unsqueeze(-1) * slopes[1])
+        move = sweep.slopes()
+        if self.momentum is not None:
+            torch._foreach_add_(move, self.momentum, alpha=MOMENTUM)
+        torch._foreach_sub_(self.weights, move)
+        self.momentum = move
+        return float(residual.square().mean().sqrt())
+
+    def _along(self, samples: Samples) -> Tensor:
+        """`J phi` ``(N,)`` of the last move `phi`, by a difference."""
+        assert self.momentum is not None  # else there was none
+        length = DIFFERENCE / max(float(torch.nn.utils.get_total_norm(self.momentum)), 1e-300)
+        ends = []
+        for way in (length, -2.0 * length):
+            torch._foreach_add_(self.weights, self.momentum, alpha=way)
+            ends.append(self.residual(samples, self.network.jet(samples.x)))
+        torch._foreach_add_(self.weights, self.momentum, alpha=length)
+        return (ends[0] - ends[1]) / (2.0 * length)
+
+
+def refined(
+    network: PeriodicMLP,
+    residual: Residual,
+    draw: Callable[[int], Samples],
+    steps: int,
+    stop: Callable[[], bool] = lambda: False,
+) -> PeriodicMLP | None:
+    """``network`` after so many ``steps`` on samples ``draw(count)`` in float64 on the CPU; `None` where the residual does
+    not fall to half, or where told to ``stop``."""
+    own = copy.deepcopy(network).to("cpu").double().requires_grad_(False)
+    judged = draw(STATES)
+    size = lambda: float(residual(judged, own.jet(judged.x)).square().mean().sqrt())
+    before, stepper = size(), GaussNewton(own, residual)
+    for _ in range(steps):
+        seen = math.inf if stop() else stepper.step(draw(STATES))
+        if not seen < GROWTH * before:
+            return None
+        if seen < ENOUGH * before:
+            break
+    return own.to(next(network.parameters())) if size() < 0.5 * before else None

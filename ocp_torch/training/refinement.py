@@ -1,0 +1,46 @@
+"""What ends a round of training: Gauss-Newton steps by which `V` solves the Hamilton-Jacobi-Bellman equation."""
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import torch
+
+from ocp_torch.fields import Fields, PeriodicMLP
+from ocp_torch.maths.sampling import SobolSampler
+from ocp_torch.maths.seeds import Branch, derive_seed
+from ocp_torch.problems import Problem
+from ocp_torch.problems.generator import Generator
+from ocp_torch.problems.samples import Samples
+from ocp_torch.steppers.gauss_newton import refined
+
+if TYPE_CHECKING:
+    from ocp_torch.training.trainer import Trainer
+
+
+def refine(trainer: "Trainer", stop: Callable[[], bool]) -> None:
+    """Refine the averaged `V` of ``trainer``, from which the next round starts, if that helps; to be done anew where it was
+    told to ``stop``."""
+    state, started = trainer.state, time.perf_counter()
+    steps, seed = trainer.settings.newton_steps, derive_seed(trainer.seed, Branch.REFINEMENT, state.round)
+    weights = trainer.ranks.from_first(
+        lambda: refined_value(trainer.problem, trainer.averaged_fields, steps, seed, stop)
+    )
+    if weights is not None:
+        for fields in (trainer.fields, trainer.averaged_fields):
+            fields.value.load_state_dict(weights)
+        trainer.evaluator.latest = None  # it is of the `V` before
+    state.refined = not trainer.ranks.from_first(stop)
+    state.elapsed += time.perf_counter() - started
+
+
+def refined_value(problem: Problem, fields: Fields, steps: int, seed: int, stop: Callable[[], bool]) -> dict | None:
+    """The weights of the `V` of ``fields`` after so many ``steps`` on its slack at evenly spread states of ``seed``; `None`
+    where they do not help, as beside kinks or with noise, and where told to ``stop``."""
+    network = fields.value
+    if not steps or problem.noisy or not problem.has_simulator or not isinstance(network, PeriodicMLP):
+        return None
+    states = SobolSampler(problem.dim, seed, torch.float64)
+    slack = lambda samples, V: Generator.of(problem, samples).hjb_slack(V)
+    found = refined(network, slack, lambda count: Samples.of(problem, states.draw(count)), steps, stop)
+    return None if found is None else found.state_dict()

@@ -1,0 +1,99 @@
+"""Gauss-Newton steps: each against its formula with a Jacobian that is written down, and where they lead."""
+
+import pytest
+import torch
+
+from ocp_torch.fields import PeriodicMLP
+from ocp_torch.maths.jets import reverse_jet
+from ocp_torch.problems import Manufactured, Torus
+from ocp_torch.problems.generator import Generator
+from ocp_torch.problems.samples import Samples
+from ocp_torch.steppers import gauss_newton
+from ocp_torch.steppers.gauss_newton import DAMPING, MOMENTUM, GaussNewton, refined
+
+
+def slack_of(problem):
+    return lambda samples, V: Generator.of(problem, samples).hjb_slack(V)
+
+
+def draw_of(problem, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return lambda count: Samples.of(problem, torch.rand(count, problem.dim, generator=generator, dtype=torch.float64))
+
+
+def network(dim, **form):
+    torch.manual_seed(0)
+    made = PeriodicMLP(dim, modes=2, width=24, activation="tanh", **form)
+    torch.nn.init.normal_(made.head.weight, std=0.3)
+    return made
+
+
+@pytest.mark.parametrize("gated", [False, True])
+def test_steps_are_those_of_the_formula(gated):
+    problem = Manufactured(dim=2, exponent=1.7)
+    field, draw = network(2, depth=2, gated=gated).double().requires_grad_(False), draw_of(problem)
+    stepper, before = GaussNewton(field, slack_of(problem)), None
+    for _ in range(3):
+        samples, weights = draw(20), [p.clone().requires_grad_(True) for p in field.parameters()]
+        apply = lambda x, at=weights: torch.func.functional_call(
+            field, dict(zip(dict(field.named_parameters()), at, strict=True)), x
+        )
+        residual = slack_of(problem)(samples, reverse_jet(apply, samples.x))
+        rows = [torch.autograd.grad(r, weights, retain_graph=True, materialize_grads=True) for r in residual]
+        J = torch.stack([torch.cat([g.flatten() for g in row]) for row in rows])
+        phi = torch.zeros(J.shape[1], dtype=J.dtype) if before is None else MOMENTUM * before
+        gram = J @ J.T
+        gram.diagonal().add_(DAMPING * gram.diagonal().mean())
+        wanted = phi + J.T @ torch.linalg.solve(gram, residual.detach() - J @ phi)
+        assert stepper.step(samples) == pytest.approx(float(residual.detach().square().mean().sqrt()), rel=1e-10)
+        before = torch.cat([(w - p).flatten() for w, p in zip(weights, field.parameters(), strict=True)]).detach()
+        torch.testing.assert_close(before, wanted, rtol=1e-4, atol=1e-4 * float(wanted.abs().max()))
+
+
+def fitted(problem):
+    """A network that is about where training leaves it."""
+    made, x = network(problem.dim, waves=4), torch.rand(512, problem.dim)
+    wanted = problem.exact_value(x.double()).float()
+    fit = torch.optim.LBFGS(made.parameters(), max_iter=60, line_search_fn="strong_wolfe")
+
+    def closure():
+        fit.zero_grad()
+        off = (made(x) - wanted).square().mean()
+        off.backward()
+        return off
+
+    fit.step(closure)
+    return made
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_smooth_solution_is_found_to_many_digits(seed):
+    problem = Manufactured(dim=1, seed=seed)
+    start, draw = fitted(problem), draw_of(problem)
+    found = refined(start, slack_of(problem), draw, steps=40)
+    assert found is not None
+    assert next(found.parameters()).dtype == torch.float32
+    y = torch.rand(4096, 1, dtype=torch.float64)
+    error = lambda of: float((of.double()(y) - problem.exact_value(y)).abs().max())
+    assert error(found) < 0.1 * error(start)
+
+
+@pytest.mark.parametrize("case", ["a kink", "not at all", "told to stop"])
+def test_where_steps_do_not_help_there_are_none(case):
+    problem = Torus(dim=1) if case == "a kink" else Manufactured(dim=1)
+    start, told = fitted(problem), []
+    kept = [p.clone() for p in start.parameters()]
+    stop = lambda: told.append(0) is not None or (case == "told to stop" and len(told) > 2)
+    steps = {"a kink": 20, "not at all": 0, "told to stop": 20}[case]
+    assert refined(start, slack_of(problem), draw_of(problem), steps, stop) is None
+    assert all(torch.equal(p, k) for p, k in zip(start.parameters(), kept, strict=True))
+    assert len(told) == 3 or case != "told to stop"
+
+
+def test_states_that_are_all_alike_and_numbers_that_are_none_end_the_steps(monkeypatch):
+    problem = Manufactured(dim=1)
+    monkeypatch.setattr(gauss_newton, "DAMPING", -1.0)  # no positive definite system
+    assert (
+        GaussNewton(network(1).double().requires_grad_(False), slack_of(problem)).step(draw_of(problem)(8)) == torch.inf
+    )
+    assert refined(network(1), slack_of(problem), draw_of(problem), steps=4) is None

@@ -1,0 +1,153 @@
+"""Gauss-Newton steps at the end of a round: where there are any, what takes them, and exact repetition."""
+
+import pytest
+import torch
+
+from ocp_torch.runs.build import build_trainer
+from ocp_torch.training import refinement
+from ocp_torch.training.observer import Silent
+from ocp_torch.training.stopping import Preempted, Signals
+from support.bits import differences
+from support.small import configured, small, state_of
+
+LITTLE = (
+    "method=dual",
+    "trainer.newton_steps=3",
+    "trainer.rounds=2",
+    "trainer.evaluate_every=20",
+    "trainer.good_gap=1e-9",
+)
+
+
+@pytest.fixture
+def halved(monkeypatch):
+    """In place of the steps weights are halved. Gives the states drawn each time, and a list of what comes meanwhile."""
+    drawn, stopping = [], []
+
+    def refined(network, residual, draw, steps, stop):
+        assert steps == 3
+        drawn.append(draw(4).x)
+        if stopping and stopping.pop(0)():
+            assert stop()
+            return None
+        return Halved(network)
+
+    class Halved:
+        def __init__(self, network):
+            self.network = network
+
+        def state_dict(self):
+            halves = dict(self.network.named_parameters())
+            return {k: 0.5 * v if k in halves else v for k, v in self.network.state_dict().items()}
+
+    monkeypatch.setattr(refinement, "refined", refined)
+    return drawn, stopping
+
+
+def weights(fields) -> torch.Tensor:
+    return torch.cat([p.detach().flatten() for p in fields.value.parameters()])
+
+
+def test_both_the_average_and_the_next_round_take_them(halved):
+    drawn, _ = halved
+    trainer, plain = small(*LITTLE), small(*LITTLE, "trainer.newton_steps=0", "trainer.rounds=1")
+    seen = []
+
+    class Seeing(Silent):
+        def evaluated(self, trainer, certificate):
+            seen.append((trainer.step, weights(trainer.averaged_fields)))
+
+    plain.fit(Silent())
+    trainer.fit(Seeing())
+    assert len(drawn) == 2
+    assert not torch.equal(*drawn)  # each round has states of its own
+    (step, looked_at), *_ = seen
+    assert step == 20
+    assert torch.equal(looked_at, 0.5 * weights(plain.averaged_fields))
+    assert trainer.state.refined
+    assert trainer.step == 60
+
+
+def test_a_run_goes_on_to_the_same_bits_from_anywhere(halved, tmp_path):
+    class Saving(Silent):
+        def stepped(self, trainer, report, log):
+            trainer.save(tmp_path / f"{trainer.step}.pt")
+
+        def extended(self, trainer):
+            trainer.save(tmp_path / "after.pt")
+
+    whole = small(*LITTLE)
+    whole.fit(Saving())
+    for name in ("19", "20", "after", "21", "60"):
+        resumed = small(*LITTLE)
+        resumed.resume(tmp_path / f"{name}.pt")
+        resumed.fit(Silent())
+        assert differences(state_of(resumed), state_of(whole)) == [], name
+
+
+@pytest.mark.parametrize("how", ["a signal", "asked to stop"])
+def test_what_ends_them_ends_them_soon_and_they_are_made_anew(halved, how, tmp_path):
+    _, stopping = halved
+    whole = small(*LITTLE)
+    whole.fit(Silent())
+    trainer, signals = small(*LITTLE), Signals()
+
+    def come():
+        if how == "a signal":
+            signals.received = 15
+        else:
+            trainer.asked = True
+        return True
+
+    stopping.append(come)
+    if how == "a signal":
+        with pytest.raises(Preempted):
+            trainer.fit(Silent(), tmp_path / "last.pt", signals)
+    else:
+        trainer.fit(Silent(), tmp_path / "last.pt")
+    assert trainer.step == 20
+    assert not trainer.state.refined
+    resumed = small(*LITTLE)
+    resumed.resume(tmp_path / "last.pt")
+    resumed.fit(Silent())
+    assert differences(state_of(resumed), state_of(whole)) == []
+
+
+def test_a_checkpoint_from_before_there_were_any_goes_on(tmp_path):
+    trainer = small(*LITTLE)
+    state = trainer.state_dict()
+    del state["refined"]
+    trainer.state.load_state_dict(state, trainer.settings)
+    assert trainer.state.refined
+
+
+@pytest.mark.parametrize(
+    ("overrides", "some"),
+    [
+        (("problem=manufactured",), True),
+        (("problem=manufactured", "problem.dim=16", "method=pd"), True),
+        (("problem=manufactured", "problem.dim=4"), False),
+        (("problem=manufactured", "problem.noise=0.1"), False),
+        (("problem=manufactured", "optimizer=sgd"), False),
+        (("problem=manufactured", "trainer.steps=20"), False),
+        (("problem=pendulum",), False),
+    ],
+)
+def test_there_are_some_by_default_where_they_were_found_to_help(overrides, some):
+    assert (build_trainer(configured("trainer.device=cpu", *overrides)).settings.newton_steps > 0) == some
+
+
+def test_a_smooth_problem_is_solved_to_many_more_digits():
+    def slack(*more):
+        trainer = build_trainer(
+            configured(
+                "trainer.device=cpu", "problem=manufactured", "problem.dim=1", "method=dual", "trainer.steps=300", *more
+            )
+        )
+        trainer.fit(Silent())
+        with torch.no_grad():
+            samples = trainer.problem.independent_samples(4096)
+            generator = trainer.objective.generator(samples)
+            return float(generator.hjb_slack(generator.jet(trainer.averaged_fields.value.double())).abs().mean())
+
+    assert slack() < 0.1 * slack("trainer.newton_steps=0")
