@@ -22,6 +22,7 @@ class Budget:
     good_gap: float
     stage_steps: int
     newton_steps: int = 0
+    short: int | None = None  # steps of a round that these end, where nothing but V is trained
     stage_lr: float = 1e-2
     lr: float = LEARNING_RATE  # where M is known
 
@@ -30,17 +31,19 @@ class Budget:
 # at 5e-3 does not (.05). In two a second round starts at .3 %: a noisy pendulum had .53 % after one, .28 % after two. In
 # eight one run of twelve at 1e-2 lost what it had learnt once hardly a slack was above 0 and gradients were small: F_M ended
 # .044 % below OPT, at 5e-3 .0014 %. Where nothing is lost 5e-3 costs little: .0013 for .0009, .0014 for .0008 %.
-# Beyond four coordinates Gauss-Newton steps end a round, and it is a third as long for it: after 400 steps and 40 of those
-# the slack is a hundredth of what 1,200 leave. In three and four they hardly converge.
+# Gauss-Newton steps end a round; beyond four coordinates it is half as long for it: after 400 steps and 40 of those the slack
+# is a hundredth of what 1,200 leave. In three and four they hardly converge.
 BUDGETS = (
     Budget(1, steps=900, batch=256, good_gap=0.005, stage_steps=300, newton_steps=24),
     Budget(2, steps=900, batch=256, good_gap=0.003, stage_steps=400, newton_steps=24),
     Budget(4, steps=1200, batch=384, good_gap=0.005, stage_steps=600),
-    Budget(8, steps=500, batch=512, good_gap=0.003, stage_steps=300, newton_steps=40, lr=5e-3),
-    Budget(math.inf, steps=500, batch=512, good_gap=0.005, stage_steps=400, newton_steps=40, stage_lr=5e-3),
+    Budget(8, steps=1000, batch=512, good_gap=0.01, stage_steps=600, newton_steps=40, short=500, lr=5e-3),
+    Budget(math.inf, steps=1200, batch=512, good_gap=0.02, stage_steps=800, newton_steps=40, short=500, stage_lr=5e-3),
 )
 # Before V is near V* they do not converge: there are none after a shorter round.
 FEWEST_STEPS = 100
+# A short round that is not ended by them, as beside kinks, leaves a gap that wants another one.
+SHORT_GOOD_GAP = 0.003
 
 # Where no M is known the bound is decided by the worst state: that wants more states at once, and, without noise, longer.
 # With noise two and three coordinates want less: after rounds of 600 and 1,200 steps a pendulum's certified gap is .55 % and
@@ -75,6 +78,13 @@ def fill(config: dict, problem: Problem) -> dict:
     method = require_section("method", config.get("method") or {})
     model = MODELS[require_choice("model.name", config["model"].get("name"), MODELS)]
     unbounded = is_unbounded(problem, method.get("occupation_bound"))
+    name = method.get("name")
+    if (
+        problem.noisy or unbounded or config["optimizer"].get("name") != "soap"
+    ):  # kinks, curvature, or a method of the user's
+        budget = replace(budget, newton_steps=0, short=None)
+    if name == "dual" and budget.short:
+        budget = replace(budget, steps=budget.short, good_gap=SHORT_GOOD_GAP, stage_steps=budget.stage_steps // 2)
     if problem.noisy and problem.dim == 1:
         budget = replace(budget, steps=NOISY_STEPS)
     if unbounded:
@@ -93,20 +103,19 @@ def fill(config: dict, problem: Problem) -> dict:
         "certificate.stage.steps": budget.stage_steps,
         "certificate.stage.lr": budget.stage_lr,
     }
-    if unbounded and method.get("name") == "pd" and config["trainer"].get("batch") is None:
+    if unbounded and name == "pd" and config["trainer"].get("batch") is None:
         defaults["method.density_batch"] = DENSITY_BATCH
     given = config["trainer"].get("steps")
     steps = given if isinstance(given, int) and given > 0 else budget.steps
-    smooth = not problem.noisy and not unbounded and config["optimizer"].get("name") == "soap" and steps >= FEWEST_STEPS
-    defaults["trainer.newton_steps"] = budget.newton_steps if smooth else 0
+    defaults["trainer.newton_steps"] = budget.newton_steps if steps >= FEWEST_STEPS else 0
     apart = LOOKS_APART if config["trainer"].get("target_gap") is None else TARGET_APART
     defaults["trainer.evaluate_every"] = math.ceil(steps / math.ceil(steps / apart))
     for path, value in defaults.items():
-        *groups, name = path.split(".")
+        *groups, field = path.split(".")
         section = filled
         for depth, group in enumerate(groups, start=1):
             require_section(".".join(groups[:depth]), section.setdefault(group, {}))
             section = section[group]
-        if section.get(name) is None:
-            section[name] = value
+        if section.get(field) is None:
+            section[field] = value
     return filled
