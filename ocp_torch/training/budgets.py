@@ -78,12 +78,12 @@ def fill(config: dict, problem: Problem) -> dict:
     method = require_section("method", config.get("method") or {})
     model = MODELS[require_choice("model.name", config["model"].get("name"), MODELS)]
     unbounded = is_unbounded(problem, method.get("occupation_bound"))
-    name = method.get("name")
+    method_name = method.get("name")
     if (
         problem.noisy or unbounded or config["optimizer"].get("name") != "soap"
     ):  # kinks, curvature, or a method of the user's
         budget = replace(budget, newton_steps=0, short=None)
-    if name == "dual" and budget.short:
+    if method_name == "dual" and budget.short:
         budget = replace(budget, steps=budget.short, good_gap=SHORT_GOOD_GAP, stage_steps=budget.stage_steps // 2)
     if problem.noisy and problem.dim == 1:
         budget = replace(budget, steps=NOISY_STEPS)
@@ -103,7 +103,7 @@ def fill(config: dict, problem: Problem) -> dict:
         "certificate.stage.steps": budget.stage_steps,
         "certificate.stage.lr": budget.stage_lr,
     }
-    if unbounded and name == "pd" and config["trainer"].get("batch") is None:
+    if unbounded and method_name == "pd" and config["trainer"].get("batch") is None:
         defaults["method.density_batch"] = DENSITY_BATCH
     given = config["trainer"].get("steps")
     steps = given if isinstance(given, int) and given > 0 else budget.steps
