@@ -79,9 +79,8 @@ def fill(config: dict, problem: Problem) -> dict:
     model = MODELS[require_choice("model.name", config["model"].get("name"), MODELS)]
     unbounded = is_unbounded(problem, method.get("occupation_bound"))
     method_name = method.get("name")
-    if (
-        problem.noisy or unbounded or config["optimizer"].get("name") != "soap"
-    ):  # kinks, curvature, or a method of the user's
+    plain = config["optimizer"].get("name") != "soap"  # the user's own way
+    if problem.noisy or unbounded or plain:
         budget = replace(budget, newton_steps=0, short=None)
     if method_name == "dual" and budget.short:
         budget = replace(budget, steps=budget.short, good_gap=SHORT_GOOD_GAP, stage_steps=budget.stage_steps // 2)
