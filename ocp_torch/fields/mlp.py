@@ -123,14 +123,19 @@ class PeriodicMLP(nn.Module):
         out = self.shift + self.scale * self.head(self.body(features))
         return out.squeeze(-1) if self.scalar else out
 
+    @property
+    def can_be_swept(self) -> bool:
+        """Whether the sweeps, which go layer by layer, give what `forward` gives."""
+        return self.centred is None and type(self).forward is PeriodicMLP.forward
+
     def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
         """The jet of a scalar network at states ``(N, d)``: by a sweep back (`reverse_sweep`), and with noise ``sigma``
-        ``(N, d, k)`` there by one forward, of `min(d, k) + 2` times the work of `forward`; of a ``centred`` one, and where
-        states are differentiated, by autograd's reverse passes."""
-        if sigma is None and self.centred is None and is_data(x):
-            return swept_jet(self, x)
-        if sigma is None or self.centred is not None:
+        ``(N, d, k)`` there by one forward, of `min(d, k) + 2` times the work of `forward`; where states
+        are differentiated, and where it `can_be_swept` by neither, by autograd's reverse passes."""
+        if not self.can_be_swept or (sigma is None and not is_data(x)):
             return reverse_jet(self, x, sigma)
+        if sigma is None:
+            return swept_jet(self, x)
         along = Along.of(sigma)
         if along.columns is None:
             swept = self._swept(x, along)

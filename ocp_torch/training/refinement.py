@@ -38,7 +38,8 @@ def refined_value(problem: Problem, fields: Fields, steps: int, seed: int, stop:
     """The weights of the `V` of ``fields`` after so many ``steps`` on its slack at evenly spread states of ``seed``; `None`
     where they do not help, as beside kinks or with noise, and where told to ``stop``."""
     network = fields.value
-    if not steps or problem.noisy or not problem.has_simulator or not isinstance(network, PeriodicMLP):
+    ours = isinstance(network, PeriodicMLP) and network.can_be_swept
+    if not steps or problem.noisy or not problem.has_simulator or not ours:
         return None
     states = SobolSampler(problem.dim, seed, torch.float64)
     slack = lambda samples, V: Generator.of(problem, samples).hjb_slack(V)

@@ -78,6 +78,20 @@ def test_a_weight_that_changed_before_its_slope_was_taken_is_told():
         total.backward()
 
 
+@pytest.mark.parametrize("noisy", [False, True])
+def test_who_computes_something_else_is_not_swept(noisy):
+    class Doubled(PeriodicMLP):
+        def forward(self, x):
+            return 2.0 * super().forward(x)
+
+    torch.manual_seed(0)
+    field, x = Doubled(2, modes=2, width=8).double(), torch.rand(5, 2, dtype=torch.float64)
+    sigma = torch.rand(5, 2, 2, dtype=torch.float64) if noisy else None
+    found, expected = field.jet(x, sigma), reverse_jet(field, x, sigma)
+    assert torch.equal(found.value, field(x))
+    assert torch.equal(found.gradient, expected.gradient)
+
+
 def test_frozen_networks_and_no_graphs():
     field, x = network(2).requires_grad_(False), torch.rand(5, 2, dtype=torch.float64)
     assert not field.jet(x).gradient.requires_grad
