@@ -52,6 +52,7 @@ def _softplus(z: Tensor) -> tuple[Tensor, Tensor, Later, Later]:
 # Each activation with its derivatives.
 DERIVATIVES: dict[type[nn.Module], Derivatives] = {
     Tanh: _tanh,
+    nn.Tanh: _tanh,
     nn.GELU: _gelu,
     nn.SiLU: _silu,
     nn.Softplus: _softplus,

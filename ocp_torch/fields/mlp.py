@@ -130,8 +130,8 @@ class PeriodicMLP(nn.Module):
 
     def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
         """The jet of a scalar network at states ``(N, d)``: by a sweep back (`reverse_sweep`), and with noise ``sigma``
-        ``(N, d, k)`` there by one forward, of `min(d, k) + 2` times the work of `forward`; where states
-        are differentiated, and where it `can_be_swept` by neither, by autograd's reverse passes."""
+        ``(N, d, k)`` there by one forward, of `min(d, k) + 2` times the work of `forward`; where states are differentiated,
+        and where neither `can_be_swept`, by autograd's reverse passes."""
         if not self.can_be_swept or (sigma is None and not is_data(x)):
             return reverse_jet(self, x, sigma)
         if sigma is None:

@@ -129,6 +129,7 @@ class Silu(_Sigmoid):
 SERIES: dict[type[nn.Module], type[Gelu | Tanh | Softplus | Silu]] = {
     nn.GELU: Gelu,
     activations.Tanh: Tanh,
+    nn.Tanh: Tanh,
     nn.Softplus: Softplus,
     nn.SiLU: Silu,
 }
