@@ -136,6 +136,13 @@ class Monitor(Silent):
         # To train.log, not to the terminal.
         log.debug("step %d: %s", trainer.step, ", ".join(f"{k} {v}" for k, v in values.items()))
 
+    def refined(self, trainer: Trainer, helped: bool | None) -> None:
+        if not trainer.settings.newton_steps:
+            return
+        self.bar.set_description_str("Gauss-Newton steps" if helped is None else "")
+        if helped is not None:
+            log.debug("step %d: Gauss-Newton steps %s", trainer.step, "refined V" if helped else "did not help")
+
     def noticed(self, sentence: str) -> None:
         log.warning("warning: %s", sentence)
 

@@ -16,6 +16,9 @@ class Silent:
     def warmed(self, trainer, looked: bool) -> None:
         """A round of the warm start was made; ``looked`` says whether its controller was tried after it."""
 
+    def refined(self, trainer, helped: bool | None) -> None:
+        """Gauss-Newton steps begin (``helped`` is `None`), or have ended."""
+
     def extended(self, trainer) -> None:
         """Another round begins."""
 

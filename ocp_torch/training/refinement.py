@@ -14,6 +14,7 @@ from ocp_torch.problems import Problem
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers.gauss_newton import refined
+from ocp_torch.training.observer import Silent
 
 if TYPE_CHECKING:
     from ocp_torch.training.trainer import Trainer
@@ -22,17 +23,19 @@ if TYPE_CHECKING:
 JUDGED = 8192
 
 
-def refine(trainer: "Trainer", stop: Callable[[], bool]) -> None:
+def refine(trainer: "Trainer", monitor: Silent, stop: Callable[[], bool]) -> None:
     """Refine the averaged `V` of ``trainer``, from which the next round starts, if that helps; to be done anew where it was
     told to ``stop``."""
     state, started = trainer.state, time.perf_counter()
     seed = derive_seed(trainer.seed, Branch.REFINEMENT, state.round)
     how = trainer.constants.M, trainer.settings.newton_steps, seed, stop
+    monitor.refined(trainer, None)
     weights = trainer.ranks.from_first(lambda: refined_value(trainer.problem, trainer.averaged_fields, *how))
     if weights is not None:
         for fields in (trainer.fields, trainer.averaged_fields):
             fields.value.load_state_dict(weights)
         trainer.evaluator.latest = None  # it is of the `V` before
+    monitor.refined(trainer, weights is not None)
     state.refined = not trainer.ranks.from_first(stop)
     state.elapsed += time.perf_counter() - started
 

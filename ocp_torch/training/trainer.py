@@ -125,7 +125,7 @@ class Trainer:
             if self.step < self.end:
                 self._advance(monitor, checkpoint)
             elif not self.state.refined:
-                refine(self, lambda: self.asked or signals.received is not None)
+                refine(self, monitor, lambda: self.asked or signals.received is not None)
                 if (
                     self.state.refined
                     and self.state.round + 1 < self.settings.rounds
