@@ -26,9 +26,16 @@ JUDGED = 8192
 def refine(trainer: "Trainer", monitor: Silent, stop: Callable[[], bool]) -> None:
     """Refine the averaged `V` of ``trainer``, from which the next round starts, if that helps; to be done anew where it was
     told to ``stop``."""
-    state, started = trainer.state, time.perf_counter()
+    state, limit, started, told = trainer.state, trainer.settings.max_seconds, time.perf_counter(), []
+    spent = lambda: time.perf_counter() - started
+
+    def stopping() -> bool:
+        if stop() or (limit is not None and state.elapsed + spent() >= limit):
+            told.append(True)  # what comes after the last step is late: then they are done
+        return bool(told)
+
     seed = derive_seed(trainer.seed, Branch.REFINEMENT, state.round)
-    how = trainer.constants.M, trainer.settings.newton_steps, seed, stop
+    how = trainer.constants.M, trainer.settings.newton_steps, seed, stopping
     monitor.refined(trainer, None)
     weights = trainer.ranks.from_first(lambda: refined_value(trainer.problem, trainer.averaged_fields, *how))
     if weights is not None:
@@ -36,8 +43,8 @@ def refine(trainer: "Trainer", monitor: Silent, stop: Callable[[], bool]) -> Non
             fields.value.load_state_dict(weights)
         trainer.evaluator.latest = None  # it is of the `V` before
     monitor.refined(trainer, weights is not None)
-    state.refined = not trainer.ranks.from_first(stop)
-    state.elapsed += time.perf_counter() - started
+    state.refined = trainer.ranks.from_first(lambda: not told)
+    state.elapsed += spent()
 
 
 def refined_value(

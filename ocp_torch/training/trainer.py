@@ -126,11 +126,8 @@ class Trainer:
                 self._advance(monitor, checkpoint)
             elif not self.state.refined:
                 refine(self, monitor, lambda: self.asked or signals.received is not None)
-                if (
-                    self.state.refined
-                    and self.state.round + 1 < self.settings.rounds
-                    and self._due(self.settings.evaluate_every)
-                ):
+                more = self.state.round + 1 < self.settings.rounds and self._due(self.settings.evaluate_every)
+                if self.state.refined and more:
                     self.state.pending = self.ranks.from_first(lambda: self._evaluate(monitor, checkpoint))
             elif self.ranks.from_first(self._wants_another_round):
                 self.state.round += 1

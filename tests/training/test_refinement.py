@@ -29,7 +29,7 @@ def halved(monkeypatch):
     def refined(network, residual, draw, steps, stop):
         assert steps == 3
         drawn.append(draw(4).x)
-        if stopping and stopping.pop(0)():
+        if stopping and stopping[0]():
             assert stop()
             return None
         own = copy.deepcopy(network)
@@ -93,7 +93,7 @@ def test_those_that_make_the_bound_worse_are_not_taken(halved, monkeypatch):
     assert torch.equal(weights(trainer.averaged_fields), weights(plain.averaged_fields))
 
 
-@pytest.mark.parametrize("how", ["a signal", "asked to stop"])
+@pytest.mark.parametrize("how", ["a signal", "asked to stop", "late"])
 def test_what_ends_them_ends_them_soon_and_they_are_made_anew(halved, how, tmp_path):
     _, stopping = halved
     whole = small(*LITTLE)
@@ -101,24 +101,34 @@ def test_what_ends_them_ends_them_soon_and_they_are_made_anew(halved, how, tmp_p
     trainer, signals = small(*LITTLE), Signals()
 
     def come():
-        if how == "a signal":
-            signals.received = 15
-        else:
+        if how == "asked to stop":
             trainer.asked = True
-        return True
+        else:
+            signals.received = 15
+        return how != "late"  # after the last step
 
     stopping.append(come)
-    if how == "a signal":
+    if how == "asked to stop":
+        trainer.fit(Silent(), tmp_path / "last.pt")
+    else:
         with pytest.raises(Preempted):
             trainer.fit(Silent(), tmp_path / "last.pt", signals)
-    else:
-        trainer.fit(Silent(), tmp_path / "last.pt")
+    stopping.clear()
     assert trainer.step == 20
-    assert not trainer.state.refined
+    assert trainer.state.refined == (how == "late")
     resumed = small(*LITTLE)
     resumed.resume(tmp_path / "last.pt")
     resumed.fit(Silent())
     assert differences(state_of(resumed), state_of(whole)) == []
+
+
+def test_they_end_where_a_run_has_no_seconds_left():
+    trainer = small(*LITTLE, "trainer.max_seconds=1000")
+    trainer.state.step, trainer.state.elapsed = 20, 999.999
+    before = weights(trainer.averaged_fields)
+    refinement.refine(trainer, Silent(), lambda: False)
+    assert not trainer.state.refined
+    assert torch.equal(weights(trainer.averaged_fields), before)
 
 
 def test_a_checkpoint_from_before_there_were_any_goes_on(tmp_path):
