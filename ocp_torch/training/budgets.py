@@ -37,8 +37,8 @@ BUDGETS = (
     Budget(1, steps=900, batch=256, good_gap=0.005, stage_steps=300, newton_steps=24),
     Budget(2, steps=900, batch=256, good_gap=0.003, stage_steps=400, newton_steps=24),
     Budget(4, steps=1200, batch=384, good_gap=0.005, stage_steps=600),
-    Budget(8, steps=1000, batch=512, good_gap=0.01, stage_steps=600, newton_steps=40, short=500, lr=5e-3),
-    Budget(math.inf, steps=1200, batch=512, good_gap=0.02, stage_steps=800, newton_steps=40, short=500, stage_lr=5e-3),
+    Budget(8, steps=1000, batch=512, good_gap=0.01, stage_steps=600, newton_steps=40, short=350, lr=5e-3),
+    Budget(math.inf, steps=1200, batch=512, good_gap=0.02, stage_steps=800, newton_steps=40, short=350, stage_lr=5e-3),
 )
 # Before V is near V* they do not converge: there are none after a shorter round.
 FEWEST_STEPS = 100
