@@ -31,8 +31,9 @@ class Budget:
 # at 5e-3 does not (.05). In two a second round starts at .3 %: a noisy pendulum had .53 % after one, .28 % after two. In
 # eight one run of twelve at 1e-2 lost what it had learnt once hardly a slack was above 0 and gradients were small: F_M ended
 # .044 % below OPT, at 5e-3 .0014 %. Where nothing is lost 5e-3 costs little: .0013 for .0009, .0014 for .0008 %.
-# Gauss-Newton steps end a round; beyond four coordinates it is half as long for it: after 400 steps and 40 of those the slack
-# is a hundredth of what 1,200 leave. In three and four they hardly converge.
+# Gauss-Newton steps end a round; beyond four coordinates it is a third as long for it: after 350 steps and 30 of those the
+# slack is a hundredth of what 1,000 leave, and with kinks a second round makes as many steps in all as before. In three and
+# four coordinates they hardly converge.
 BUDGETS = (
     Budget(1, steps=900, batch=256, good_gap=0.005, stage_steps=300, newton_steps=24),
     Budget(2, steps=900, batch=256, good_gap=0.003, stage_steps=400, newton_steps=24),
