@@ -80,8 +80,14 @@ def fill(config: dict, problem: Problem) -> dict:
     model = MODELS[require_choice("model.name", config["model"].get("name"), MODELS)]
     unbounded = is_unbounded(problem, method.get("occupation_bound"))
     method_name = method.get("name")
-    plain = config["optimizer"].get("name") != "soap"  # the user's own way
-    if problem.noisy or unbounded or plain:
+    usual = (
+        config["optimizer"].get("name") == "soap"
+        and model is MODELS["mlp"]
+        and config["trainer"].get("newton_steps") != 0
+    )
+    if (
+        not usual or problem.noisy or unbounded or not problem.has_simulator
+    ):  # no Gauss-Newton steps, and so no short rounds
         budget = replace(budget, newton_steps=0, short=None)
     if method_name == "dual" and budget.short:
         budget = replace(budget, steps=budget.short, good_gap=SHORT_GOOD_GAP, stage_steps=budget.stage_steps // 2)

@@ -31,6 +31,7 @@ def uniform(d, seed=0, device="cpu", dtype=torch.float64):
 def test_value_and_gradient_of_a_network(d, device):
     network, x = zoo.rough_network(d, seed=d).to(device), uniform(d, device=device)
     V = jets.jet(network, x)
+    # Layer by layer, in another order of operations than PyTorch's modules: the last digits differ.
     torch.testing.assert_close(V.value, network(x), rtol=1e-14, atol=1e-14)
     torch.testing.assert_close(V.gradient, partials(network, x), **TOLERANCE)
 

@@ -5,8 +5,10 @@ import copy
 import pytest
 import torch
 
+from ocp_torch.problems import Manufactured
 from ocp_torch.runs.build import build_trainer
 from ocp_torch.training import refinement
+from ocp_torch.training.budgets import fill
 from ocp_torch.training.observer import Silent
 from ocp_torch.training.stopping import Preempted, Signals
 from support.bits import differences
@@ -153,6 +155,21 @@ def test_a_checkpoint_from_before_there_were_any_goes_on(tmp_path):
 )
 def test_there_are_some_by_default_where_they_were_found_to_help(overrides, some):
     assert (build_trainer(configured("trainer.device=cpu", *overrides)).settings.newton_steps > 0) == some
+
+
+@pytest.mark.parametrize(
+    ("override", "steps"),
+    [("method.residual=0.3", 350), ("trainer.newton_steps=0", 1000), ("model=sobolev", 1000), ("optimizer=adam", 1000)],
+)
+def test_rounds_are_short_only_where_such_steps_end_them(override, steps):
+    config = configured("problem=manufactured", "problem.dim=5", "method=dual", override)
+    assert fill(config, Manufactured(dim=5))["trainer"]["steps"] == steps
+
+
+def test_rounds_on_recordings_are_not_short(monkeypatch):
+    monkeypatch.setattr(Manufactured, "has_simulator", False)
+    config = configured("problem=manufactured", "problem.dim=5", "method=dual")
+    assert fill(config, Manufactured(dim=5))["trainer"]["steps"] == 1000
 
 
 @pytest.mark.nightly
