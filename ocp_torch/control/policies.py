@@ -1,5 +1,6 @@
 """Controllers as functions of the state: from `V` alone, from `w / mu`, or zero; and the densities `mu` they need."""
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -37,7 +38,28 @@ class ValuePolicy:
 
     def control(self, B: Tensor, V: Jet) -> Tensor:
         """The control where the jet of `V` is known already."""
-        return self.problem.control_cost.argmax(-pull_back(B, V.gradient) / self.problem.discount)
+        return self.problem.control_cost.argmax(self._price(B, V))
+
+    def _price(self, B: Tensor, V: Jet) -> Tensor:
+        return -pull_back(B, V.gradient) / self.problem.discount
+
+    @torch.no_grad()
+    def flux_divergence(self, x: Tensor, B: Tensor, div_B: Tensor) -> tuple[Tensor, Tensor]:
+        r"""The control ``(N, m)`` and `div(B u)` ``(N,)`` at states ``(N, d)``, as data.
+
+        Where `B` is the same at all of them that is `(div B) . u - tr(B J B^T hess V) / rho` with the derivative `J` of `grad
+        R*`: one sweep along the columns of `B J^{1/2}` in place of a reverse pass for each control."""
+        if not is_even(B):
+            return jets.control_flux_divergence(self, x, B, div_B)
+        V, rho = jets.jet(self.value, x), self.problem.discount
+        root = self.problem.control_cost.argmax_root(self._price(B, V), B.mT).mT
+        u, bent = self.control(B, V), jets.curvature(self.value, x, math.sqrt(2.0 / rho) * root)
+        return u, (div_B * u).sum(dim=-1) - bent
+
+
+def is_even(B: Tensor) -> bool:
+    """Whether the matrices ``B`` ``(N, d, m)`` are the same at all states."""
+    return bool((B == B[:1]).all())
 
 
 def admissible_density(kind: str | None, problem: Problem, fields: Fields, constants: Constants) -> Field:

@@ -66,6 +66,13 @@ def reverse_jet(field: Field, x: Tensor, sigma: Tensor | None = None) -> Jet:
     return Jet(value, gradient, curvature) if again else Jet(value, gradient, curvature).map(Tensor.detach)
 
 
+def curvature(field: Field, x: Tensor, sigma: Tensor) -> Tensor:
+    """`sigma sigma^T / 2 : hess` ``(N,)`` of a scalar ``field`` at states ``(N, d)``, for columns ``sigma`` ``(N, d, k)``: by
+    its own method ``curvature`` if it has one."""
+    own = getattr(field, "curvature", None)
+    return reverse_jet(field, x, sigma).curvature if own is None else own(x, sigma)
+
+
 def _curvature(gradient: Tensor, at: Tensor, sigma: Tensor, again: bool) -> Tensor:
     """`D : hess` ``(N,)`` of the field whose ``gradient`` at the states ``at`` has a graph."""
     if not gradient.requires_grad:

@@ -47,7 +47,8 @@ class ClosedLoop(Problem):
         none, no_control = self.control_matrix(x), self.control_divergence(x)
         if div_a is None or div_B is None:
             return self.drift(x), none, None, no_control
-        u, flux = jets.control_flux_divergence(self.policy, x, B, div_B)
+        own = getattr(self.policy, "flux_divergence", None) if jets.is_data(x) else None
+        u, flux = jets.control_flux_divergence(self.policy, x, B, div_B) if own is None else own(x, B, div_B)
         return a + torch.einsum("ndm,nm->nd", B, u), none, div_a + flux, no_control
 
     def control_matrix(self, x: Tensor) -> Tensor:

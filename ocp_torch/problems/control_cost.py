@@ -87,6 +87,14 @@ class PowerCost:
             return moved
         return norm_power(p, power)[:, None, None] * (moved + power * radial_part(p, moved))
 
+    def argmax_root(self, p: Tensor, moved: Tensor) -> Tensor:
+        r"""The symmetric root of the derivative that `argmax_along` multiplies by, times ``moved`` ``(N, m, k)``."""
+        power = self.conjugate_exponent - 2.0
+        if power == 0.0:
+            return moved
+        radial = math.sqrt(1.0 + power) - 1.0
+        return norm_power(p, 0.5 * power)[:, None, None] * (moved + radial * radial_part(p, moved))
+
     def perspective(self, w: Tensor, mu: Tensor) -> Tensor:
         """`mu R(w / mu)`, with its closure at `mu = 0`: 0 if `w = 0`, infinity otherwise; ``(N, m), (N,) -> (N,)``."""
         positive = mu > 0

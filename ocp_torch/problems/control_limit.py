@@ -112,10 +112,18 @@ class LimitedCost(ConstrainedCost):
 
     def argmax_along(self, p: Tensor, moved: Tensor) -> Tensor:
         """At the limit `(c / |p|) (I - n n^T)`: only its direction changes."""
+        at_limit, factor = self._turning(p)
+        return torch.where(at_limit, factor * (moved - radial_part(p, moved)), super().argmax_along(p, moved))
+
+    def argmax_root(self, p: Tensor, moved: Tensor) -> Tensor:
+        at_limit, factor = self._turning(p)
+        return torch.where(at_limit, factor.sqrt() * (moved - radial_part(p, moved)), super().argmax_root(p, moved))
+
+    def _turning(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        """Whether `argmax` is at the limit, and `c / |p|` there; ``(N, 1, 1)``."""
         size = norm_power(p, 1.0)[:, None, None]
         at_limit = size > self.knee
-        turned = self.limit / torch.where(at_limit, size, 1.0) * (moved - radial_part(p, moved))
-        return torch.where(at_limit, turned, super().argmax_along(p, moved))
+        return at_limit, self.limit / torch.where(at_limit, size, 1.0)
 
     def _at_limit(self, w: Tensor) -> Tensor:
         return self.gauge(w) * self.largest
@@ -154,6 +162,8 @@ class BoxLimitedCost(ConstrainedCost, Placed):
     def argmax_along(self, p: Tensor, moved: Tensor) -> Tensor:
         """An entry at its limit stays there."""
         return torch.where((p.abs() > self._like(p, "sides", self._sides)).unsqueeze(-1), 0.0, moved)
+
+    argmax_root = argmax_along  # a matrix of ones and zeros
 
 
 def _size(name: str, limit: object) -> float:

@@ -53,6 +53,11 @@ class Evaluator:
             self.seconds = time.perf_counter() - started
         return self.latest[2]
 
+    def reaches(self, gap: float, run: Run) -> bool:
+        """Whether a quick certificate finds the averaged fields within ``gap``."""
+        found = self.evaluate(run).plain_gap
+        return found is not None and found <= gap
+
     def choose(self, run: Run) -> tuple[Fields, str | None]:
         """The fields to hand out: the averaged ones, or those of the best evaluation where they are clearly worse than that;
         and a sentence that says so."""

@@ -31,6 +31,9 @@ class TrainerSettings:
     figures: bool  # draw figures at the end and in TensorBoard
     progress: bool  # a progress bar, where the output is a terminal
     newton_steps: int = 0  # Gauss-Newton steps on V at the end of a round; runs from before there were any do not say
+    newton_after: int = (
+        0  # steps of the first round after which they are tried already, and may end training; 0 for never
+    )
     graphs: bool = True  # on a GPU, steps are replayed from CUDA graphs; runs from before there were any do not say
 
     def __post_init__(self) -> None:
@@ -41,7 +44,7 @@ class TrainerSettings:
         require_integer("trainer.threads", self.threads, 1, maximum=MOST_THREADS)
         for name in ("graphs", "figures", "progress"):
             require_flag(f"trainer.{name}", getattr(self, name))
-        for name in ("newton_steps", "evaluate_every", "checkpoint_every"):
+        for name in ("newton_steps", "newton_after", "evaluate_every", "checkpoint_every"):
             require_integer(f"trainer.{name}", getattr(self, name), 0)
         require_integer("trainer.keep", self.keep, 1, maximum=1000)
         for name in ("target_gap", "max_seconds"):

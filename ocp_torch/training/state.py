@@ -23,7 +23,7 @@ from ocp_torch.training.warm_start.iteration import ValueIteration
 # What decides the learning rates: where one of these differs at a resume, they are those of the new configuration.
 rates_of = lambda config: (config["optimizer"], config["schedule"], config["trainer"]["steps"])
 # What is saved just as it is.
-PLAIN = ("config", "step", "round", "samples", "seconds", "elapsed", "pending", "retry", "ended", "refined")
+PLAIN = ("config", "step", "round", "samples", "seconds", "elapsed", "pending", "retry", "ended", "refined", "solved")
 
 
 @dataclass
@@ -46,7 +46,8 @@ class TrainState:
     pending: bool = False  # a full certificate may reach the target gap, and is to be made
     retry: int = 0  # none is made before this step
     ended: bool = False  # nothing was left to do when it was saved
-    refined: bool = False  # the Gauss-Newton steps at the end of the round are done
+    refined: bool = False  # the Gauss-Newton steps that are due at this step are done
+    solved: bool = False  # they found the solution before the end of the round
     warm: ValueIteration | None = None  # the warm start, where there is one
 
     def state_dict(self) -> dict:
@@ -84,6 +85,7 @@ class TrainState:
         self.elapsed = require_number("elapsed of the checkpoint", saved["elapsed"], at_least=0.0)
         self.pending, self.retry = bool(saved["pending"]), int(saved["retry"])
         self.refined = bool(saved.get("refined", True))  # runs from before there were such steps have none
+        self.solved = bool(saved.get("solved", False))
         constants = saved["bounds"]
         warnings, unbounded = notes(constants["warnings"]), bool(constants["unbounded"])
         self.constants = replace(self.constants, M=constants["M"], warnings=warnings, unbounded=unbounded)

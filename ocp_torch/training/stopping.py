@@ -11,6 +11,7 @@ from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.state import TrainState
 
 STEPS, TARGET_GAP, MAX_SECONDS = "steps", "target_gap", "max_seconds"
+SOLVED = "solved"  # Gauss-Newton steps found the solution before all others were made
 NOT_FINITE, FAILED = "not_finite", "failed"
 ASKED = "callback"  # whoever watches asked for it
 # After a certificate that did not reach the target gap, the next is tried at so many times the step: there are then few of
@@ -19,12 +20,18 @@ RETRY = 1.25
 CAUGHT = (signal.SIGTERM, signal.SIGINT)
 
 
-def reason_to_stop(settings: TrainerSettings, state: TrainState) -> str | None:
-    """The reason to stop before the next step, or `None`."""
+def late(settings: TrainerSettings, state: TrainState) -> bool:
+    """Whether no seconds are left."""
+    return settings.max_seconds is not None and state.elapsed >= settings.max_seconds
+
+
+def reason_to_stop(settings: TrainerSettings, state: TrainState, over: bool) -> str | None:
+    """The reason to stop before the next step, or `None`; ``over`` says whether it is `late`, here or elsewhere."""
     if state.pending:
         return TARGET_GAP
-    limit = settings.max_seconds
-    return MAX_SECONDS if limit is not None and state.elapsed >= limit else None
+    if state.solved and settings.newton_after:  # else more steps were asked for since
+        return SOLVED
+    return MAX_SECONDS if over else None
 
 
 def in_words(reason: str, settings: TrainerSettings, state: TrainState) -> str:
@@ -34,6 +41,10 @@ def in_words(reason: str, settings: TrainerSettings, state: TrainState) -> str:
         return f"trainer.max_seconds = {settings.max_seconds:g} are over, at {at} of {settings.end(state.round):,}"
     if reason == ASKED:
         return f"the callback asked for it, at {at} of {settings.end(state.round):,}"
+    if reason == SOLVED:
+        return (
+            f"Gauss-Newton steps after {at} solve the Hamilton-Jacobi-Bellman equation, and a quick evaluation agrees"
+        )
     if reason == TARGET_GAP:
         return f"a quick evaluation at {at} finds trainer.target_gap = {settings.target_gap:g} reached"
     met = f", and trainer.good_gap = {settings.good_gap:g} is met" if state.round + 1 < settings.rounds else ""

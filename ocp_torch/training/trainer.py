@@ -25,7 +25,7 @@ from ocp_torch.training.refinement import refine
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.slack_waves import seek_waves
 from ocp_torch.training.state import TrainState
-from ocp_torch.training.stopping import ASKED, MAX_SECONDS, STEPS, TARGET_GAP, Signals, in_words, reason_to_stop
+from ocp_torch.training.stopping import ASKED, STEPS, Signals, in_words, late, reason_to_stop
 from ocp_torch.training.whole_step import whole_step
 
 
@@ -93,10 +93,10 @@ class Trainer:
     def fit(self, monitor: Silent, checkpoint: Path | None = None, signals: Signals | None = None) -> str:
         """Train until there is a reason to stop, and return it; save to ``checkpoint`` on the way and at the end.
 
-        The reasons: `steps` (all rounds that `settings` allow), `max_seconds`, `callback` (it was ``asked`` to), and
-        `target_gap`, when a quick certificate is good enough that a full one should decide: where it decides against,
-        `postpone` and call again. A signal that ``signals`` caught raises `Preempted` after the step in hand, with the state
-        saved. Raises `NonFiniteError` before an update that is not finite.
+        The reasons: `steps` (all rounds that `settings` allow), `solved` (see `refine`), `max_seconds`, `callback` (it was
+        ``asked`` to), and `target_gap`, when a quick certificate is good enough that a full one should decide: where it
+        decides against, `postpone` and call again. A signal that ``signals`` caught raises `Preempted` after the step in
+        hand, with the state saved. Raises `NonFiniteError` before an update that is not finite.
 
         Of several processes each calls this; the first saves, and makes warm starts and looks while the others wait. Raises
         `LostError`, with the state saved as it was after the last whole step, where one of them ends without a word.
@@ -122,23 +122,20 @@ class Trainer:
             module.load_state_dict(self.ranks.from_first(module.state_dict))
         reason = self.ranks.from_first(self._reason)
         while reason is None:
-            if self.step < self.end:
+            if not self.state.refined and self.step in (self.settings.newton_after or self.end, self.end):
+                refine(self, monitor, checkpoint, lambda: self.asked or signals.received is not None)
+            elif self.step < self.end:
                 self._advance(monitor, checkpoint)
-            elif not self.state.refined:
-                refine(self, monitor, lambda: self.asked or signals.received is not None)
-                more = self.state.round + 1 < self.settings.rounds and self._due(self.settings.evaluate_every)
-                if self.state.refined and more:
-                    self.state.pending = self.ranks.from_first(lambda: self._evaluate(monitor, checkpoint))
             elif self.ranks.from_first(self._wants_another_round):
                 self.state.round += 1
                 monitor.extended(self)
             else:
                 return STEPS
-            asked, over, *came = self.ranks.agree([self.asked, self._reason() == MAX_SECONDS, *signals.came()])
+            asked, over, *came = self.ranks.agree([self.asked, late(self.settings, self.state), *signals.came()])
             if any(came):
                 self.ranks.from_first(lambda: self.save(checkpoint))
                 signals.raise_first(came)
-            reason = ASKED if asked else TARGET_GAP if self.state.pending else MAX_SECONDS if over else None
+            reason = ASKED if asked else reason_to_stop(self.settings, self.state, over)
         return reason
 
     @property
@@ -147,7 +144,7 @@ class Trainer:
         return in_words(self.stopped, self.settings, self.state)
 
     def _reason(self) -> str | None:
-        return ASKED if self.asked else reason_to_stop(self.settings, self.state)
+        return ASKED if self.asked else reason_to_stop(self.settings, self.state, late(self.settings, self.state))
 
     def _warm_up(self, monitor: Silent, checkpoint: Path | None, signals: Signals) -> None:
         """What is left of the warm start; `V` then begins as its best one, which itself stays a candidate."""
@@ -179,7 +176,7 @@ class Trainer:
                 monitor.noticed(sentence)
         monitor.stepped(self, report, log)
         if self._due(settings.evaluate_every) and not last:
-            state.pending = self.ranks.from_first(lambda: self._evaluate(monitor, checkpoint))
+            state.pending = self.ranks.from_first(lambda: self.look(monitor, checkpoint))
         state.elapsed += time.perf_counter() - started
         if self._due(settings.checkpoint_every) or state.pending:
             self.save(checkpoint)
@@ -187,7 +184,7 @@ class Trainer:
     def _due(self, every: int) -> bool:
         return every > 0 and self.step % every == 0
 
-    def _evaluate(self, monitor: Silent, checkpoint: Path | None) -> bool:
+    def look(self, monitor: Silent, checkpoint: Path | None) -> bool:
         """A quick certificate: keep the state if it is the best so far, and see whether it may be good enough to end."""
         self.state.require_finite()
         certificate = self.evaluator.evaluate(self.run)
@@ -209,8 +206,7 @@ class Trainer:
         more = self.state.round + 1 < self.settings.rounds
         if not more or self.fields.value is None or not self.problem.has_simulator:
             return False
-        gap = self.evaluator.evaluate(self.run).plain_gap
-        return gap is None or gap > self.settings.good_gap
+        return not self.evaluator.reaches(self.settings.good_gap, self.run)
 
     def certify(self, settings: CertificateSettings, fields: Fields | None = None) -> Certificate:
         """The full certificate of ``fields``, or of the averaged ones as they stand."""

@@ -72,10 +72,11 @@ def test_a_smooth_solution_is_found_to_many_digits(seed):
     start, draw = fitted(problem), draw_of(problem)
     found = refined(start, slack_of(problem), draw, steps=40)
     assert found is not None
-    assert next(found.parameters()).dtype == torch.float32
+    assert next(found.network.parameters()).dtype == torch.float32
+    assert found.residual < 1e-3
     y = torch.rand(4096, 1, dtype=torch.float64)
     error = lambda of: float((of.double()(y) - problem.exact_value(y)).abs().max())
-    assert error(found) < 0.1 * error(start)
+    assert error(found.network) < 0.1 * error(start)
 
 
 @pytest.mark.parametrize("case", ["a kink", "not at all", "told to stop"])
@@ -85,9 +86,23 @@ def test_where_steps_do_not_help_there_are_none(case):
     kept = [p.clone() for p in start.parameters()]
     stop = lambda: told.append(0) is not None or (case == "told to stop" and len(told) > 2)
     steps = {"a kink": 20, "not at all": 0, "told to stop": 20}[case]
-    assert refined(start, slack_of(problem), draw_of(problem), steps, stop) is None
+    assert refined(start, slack_of(problem), draw_of(problem), steps, stop=stop) is None
     assert all(torch.equal(p, k) for p, k in zip(start.parameters(), kept, strict=True))
     assert len(told) == 3 or case != "told to stop"
+
+
+def test_steps_end_where_the_residual_is_small_enough_and_where_it_stays_as_it_is(monkeypatch):
+    problem, sizes = Manufactured(dim=1), []
+    start, draw = fitted(problem), draw_of(problem)
+    step = GaussNewton.step
+    monkeypatch.setattr(GaussNewton, "step", lambda self, samples: sizes.append(step(self, samples)) or sizes[-1])
+    assert refined(start, slack_of(problem), draw, steps=40, enough=1e-3) is not None
+    assert sizes[-1] < 1e-3 <= min(sizes[:-1])
+    monkeypatch.setattr(GaussNewton, "step", lambda self, samples: sizes.append(1.0) or 1.0)
+    monkeypatch.setattr(gauss_newton, "GROWTH", torch.inf)
+    sizes.clear()
+    assert refined(start, lambda samples, V: torch.ones_like(V.value), draw, steps=40) is None
+    assert len(sizes) == gauss_newton.LOOKED_AT + 1
 
 
 def test_states_that_are_all_alike_and_numbers_that_are_none_end_the_steps(monkeypatch):

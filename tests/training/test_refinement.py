@@ -1,16 +1,18 @@
 """Gauss-Newton steps at the end of a round: where there are any, what takes them, and exact repetition."""
 
 import copy
+import math
 
 import pytest
 import torch
 
 from ocp_torch.problems import Manufactured
 from ocp_torch.runs.build import build_trainer
+from ocp_torch.steppers.gauss_newton import Refined
 from ocp_torch.training import refinement
 from ocp_torch.training.budgets import fill
 from ocp_torch.training.observer import Silent
-from ocp_torch.training.stopping import Preempted, Signals
+from ocp_torch.training.stopping import SOLVED, Preempted, Signals
 from support.bits import differences
 from support.small import configured, small, state_of
 
@@ -28,7 +30,7 @@ def halved(monkeypatch):
     """In place of the steps weights are halved. Gives the states drawn each time, and a list of what comes meanwhile."""
     drawn, stopping = [], []
 
-    def refined(network, residual, draw, steps, stop):
+    def refined(network, residual, draw, steps, enough, stop):
         assert steps == 3
         drawn.append(draw(4).x)
         if stopping and stopping[0]():
@@ -38,7 +40,7 @@ def halved(monkeypatch):
         with torch.no_grad():
             for parameter in own.parameters():
                 parameter.mul_(0.5)
-        return own
+        return Refined(own, residual=math.inf)
 
     monkeypatch.setattr(refinement, "bound", lambda *_: 0.0)
     monkeypatch.setattr(refinement, "refined", refined)
@@ -128,7 +130,7 @@ def test_they_end_where_a_run_has_no_seconds_left():
     trainer = small(*LITTLE, "trainer.max_seconds=1000")
     trainer.state.step, trainer.state.elapsed = 20, 999.999
     before = weights(trainer.averaged_fields)
-    refinement.refine(trainer, Silent(), lambda: False)
+    refinement.refine(trainer, Silent(), None, lambda: False)
     assert not trainer.state.refined
     assert torch.equal(weights(trainer.averaged_fields), before)
 
@@ -146,7 +148,8 @@ def test_a_checkpoint_from_before_there_were_any_goes_on(tmp_path):
     [
         (("problem=manufactured",), True),
         (("problem=manufactured", "method=pd"), True),
-        (("problem=manufactured", "problem.dim=4"), False),
+        (("problem=manufactured", "problem.dim=4"), True),
+        (("problem=manufactured", "problem.dim=6"), True),
         (("problem=manufactured", "problem.noise=0.1"), False),
         (("problem=manufactured", "optimizer=sgd"), False),
         (("problem=manufactured", "trainer.steps=20"), False),
@@ -157,19 +160,124 @@ def test_there_are_some_by_default_where_they_were_found_to_help(overrides, some
     assert (build_trainer(configured("trainer.device=cpu", *overrides)).settings.newton_steps > 0) == some
 
 
-@pytest.mark.parametrize(
-    ("override", "steps"),
-    [("method.residual=0.3", 350), ("trainer.newton_steps=0", 1000), ("model=sobolev", 1000), ("optimizer=adam", 1000)],
-)
-def test_rounds_are_short_only_where_such_steps_end_them(override, steps):
-    config = configured("problem=manufactured", "problem.dim=5", "method=dual", override)
-    assert fill(config, Manufactured(dim=5))["trainer"]["steps"] == steps
+def test_they_are_tried_early_where_nobody_asked_for_so_many_steps_and_only_v_is_trained():
+    after = lambda *more: fill(configured("problem=manufactured", *more), Manufactured(dim=1))["trainer"][
+        "newton_after"
+    ]
+    assert after("method=dual") > 0
+    for more in (("method=pd",), ("method=primal",), ("method=dual", "trainer.steps=500")):
+        assert after(*more) == 0
+    assert after("method=dual", "trainer.steps=500", "trainer.newton_after=60") == 60
 
 
-def test_rounds_on_recordings_are_not_short(monkeypatch):
-    monkeypatch.setattr(Manufactured, "has_simulator", False)
-    config = configured("problem=manufactured", "problem.dim=5", "method=dual")
-    assert fill(config, Manufactured(dim=5))["trainer"]["steps"] == 1000
+EARLY = ("method=dual", "trainer.newton_steps=3", "trainer.newton_after=7")
+
+
+@pytest.fixture
+def solved(monkeypatch):
+    """In place of the steps the last layer becomes 0. Gives the states drawn each time."""
+    found = []
+
+    def refined(network, residual, draw, steps, enough, stop):
+        own = copy.deepcopy(network)
+        own.head.weight.data.zero_()
+        found.append(draw(4).x)
+        return Refined(own, residual=0.0)
+
+    monkeypatch.setattr(refinement, "bound", lambda *_: 0.0)
+    monkeypatch.setattr(refinement, "refined", refined)
+    return found
+
+
+def agreeing(trainer, does):
+    """Whether the looks of ``trainer`` find a good gap."""
+    trainer.evaluator.reaches = lambda gap, run: does
+    return trainer
+
+
+def test_training_ends_once_the_equation_is_solved(solved, tmp_path):
+    trainer = agreeing(small(*EARLY), True)
+    assert trainer.fit(Silent(), tmp_path / "last.pt") == SOLVED
+    assert trainer.step == 7
+    assert not trainer.averaged_fields.value.head.weight.any()
+    assert not trainer.fields.value.head.weight.any()
+    assert "solve the Hamilton-Jacobi-Bellman equation" in trainer.why_stopped
+    resumed = small(*EARLY)
+    resumed.resume(tmp_path / "last.pt")
+    assert resumed.fit(Silent()) == SOLVED
+    assert resumed.step == 7
+
+
+def test_a_resume_that_asks_for_all_steps_makes_them(solved, tmp_path):
+    agreeing(small(*EARLY), True).fit(Silent(), tmp_path / "last.pt")
+    resumed = small("method=dual", "trainer.newton_steps=0", "trainer.newton_after=0")
+    resumed.resume(tmp_path / "last.pt")
+    assert resumed.fit(Silent()) == "steps"
+    assert resumed.step > 7
+
+
+@pytest.mark.parametrize("why", ["a look disagrees", "the slack is not small", "the gap is not that asked for"])
+def test_else_training_goes_on_as_if_nothing_had_been_tried(solved, monkeypatch, why):
+    trainer, plain = small(*EARLY), small("method=dual", "trainer.newton_steps=0")
+    if why == "a look disagrees":
+        agreeing(trainer, False)
+    elif why == "the slack is not small":
+        agreeing(trainer, True)
+        monkeypatch.setattr(refinement, "SOLVED", -1.0)
+    else:
+        trainer = small(*EARLY, "trainer.target_gap=1e-9", "trainer.evaluate_every=100")
+        trainer.evaluator.reaches = lambda gap, run: gap > 1e-9
+    seen = {trainer: {}, plain: {}}
+
+    class Seeing(Silent):
+        def stepped(self, trainer, report, log):
+            seen[trainer][trainer.step] = torch.cat([weights(trainer.fields), weights(trainer.averaged_fields)])
+
+    for run in (trainer, plain):
+        run.fit(Seeing())
+    assert len(solved) == 2  # early, and at the end
+    assert not trainer.state.solved
+    assert list(seen[trainer]) == list(seen[plain]) == list(range(1, 21))
+    assert all(torch.equal(seen[trainer][k], seen[plain][k]) for k in seen[plain])
+
+
+@pytest.mark.parametrize("how", ["a signal", "asked to stop"])
+def test_early_steps_that_are_cut_off_are_made_anew(solved, monkeypatch, how, tmp_path):
+    whole = agreeing(small(*EARLY), True)
+    whole.fit(Silent())
+    trainer, signals, exact = agreeing(small(*EARLY), True), Signals(), refinement.refined
+
+    def cut(network, residual, draw, steps, enough, stop):
+        if how == "a signal":
+            signals.received = 15
+        else:
+            trainer.asked = True
+        return None if stop() else exact(network, residual, draw, steps, enough, stop)
+
+    monkeypatch.setattr(refinement, "refined", cut)
+    if how == "asked to stop":
+        trainer.fit(Silent(), tmp_path / "last.pt")
+    else:
+        with pytest.raises(Preempted):
+            trainer.fit(Silent(), tmp_path / "last.pt", signals)
+    assert (trainer.step, trainer.state.refined) == (7, False)
+    monkeypatch.setattr(refinement, "refined", exact)
+    resumed = agreeing(small(*EARLY), True)
+    resumed.resume(tmp_path / "last.pt")
+    resumed.fit(Silent())
+    assert differences(state_of(resumed), state_of(whole)) == []
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(("dim", "more"), [(1, ()), (2, ()), (3, ("problem.exponent=1.5",)), (5, ())])
+def test_smooth_problems_are_solved_early_and_well(dim, more):
+    overrides = ("problem=manufactured", f"problem.dim={dim}", f"problem.seed={dim}", "method=dual", *more)
+    trainer = build_trainer(configured("trainer.device=cpu", *overrides))
+    assert trainer.fit(Silent()) == SOLVED
+    x = torch.rand(4096, dim, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    exact = trainer.problem.exact_value(x)
+    error = (trainer.averaged_fields.value.double()(x) - exact).abs().mean() / exact.std()
+    assert float(error) < 1e-3
 
 
 @pytest.mark.nightly

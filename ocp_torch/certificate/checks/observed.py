@@ -4,10 +4,8 @@ Jumps and layers are found by halving segments until only they are left to see.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import cast
 
 import torch
 from torch import Tensor
@@ -75,10 +73,11 @@ def observe(
     sets: list[Samples],
     occupation_states: int,
     together: bool = False,
+    jumps: bool = True,
 ) -> Observed:
     """Look at the controller ``policy`` at the states of ``sets``, and where the trajectories of ``simulated`` end; its
     occupation density is computed at so many ``occupation_states``, 0 for not at all, on all cores ``together`` if both are
-    pure functions."""
+    pure functions; without ``jumps`` none are looked for."""
     with torch.no_grad():
         sup_control = max(float(policy(samples.x[:CONTROLLED]).norm(dim=-1).max()) for samples in sets)
     near = torch.cat([samples.x[:CROSSED] for samples in sets])
@@ -91,7 +90,7 @@ def observe(
         if occupation_states and followed and problem.occupation_bound != math.inf:
             occupation = estimated_sup_occupation(problem, policy, simulated.end_states, occupation_states, together)
             a_priori = a_priori_sup_occupation(problem, policy, sets[0].x[:CONTROLLED])
-    jump = largest_jump(policy, problem.dim, problem=problem, near=near)
+    jump = largest_jump(policy, problem.dim, problem=problem, near=near) if jumps else None
     return Observed(occupation, a_priori, sup_control, largest_value, jump)
 
 
@@ -104,21 +103,24 @@ def largest_jump(policy: Policy, dim: int, problem: Problem | None = None, near:
     change most and most unlike their neighbours are followed. For a Lipschitz function the change halves with the length; a
     jump that is followed stays. One much smaller than what changes nearby anyway, or on a tiny set, can be missed.
     """
-    functions: dict[str, Callable[[Tensor], Tensor]] = {CONTROLLER: policy}
-    if problem is not None:
-        functions[LOOP] = lambda x: problem.velocity(x, policy(x))
-        functions[MATRIX] = lambda x: problem.control_matrix(x).flatten(1)
-        if not problem.driftless:
-            functions[DRIFT] = problem.drift
-        if problem.noisy:
-            functions[NOISE] = lambda x: cast(Tensor, problem.noise(x)).flatten(1)
+
+    def parts(x: Tensor) -> dict[str, Tensor]:
+        """What may jump, each ``(N, k)``; the data come first, as what jumps in them jumps in the closed loop too."""
+        if problem is None:
+            return {CONTROLLER: policy(x)}
+        a, B, _, _ = problem.vector_fields(x, divergences=False)
+        u, noise = policy(x), problem.noise(x) if problem.noisy else None
+        found = {} if problem.driftless else {DRIFT: a}
+        found |= {MATRIX: B.flatten(1)} | ({} if noise is None else {NOISE: noise.flatten(1)})
+        return found | {CONTROLLER: u, LOOP: a + torch.einsum("ndm,nm->nd", B, u)}
+
     generator = fixed_generator()
     draw = partial(torch.rand, dtype=torch.float64, generator=generator)
     left = draw(SEGMENTS, dim)
     direction = normalize(torch.randn(SEGMENTS, dim, dtype=torch.float64, generator=generator))
     right = left + direction * 10.0 ** (-3.0 * draw(SEGMENTS, 1)) * 0.5
-    sizes = {name: max(float(batched(f, left).norm(dim=-1).max()), 1e-300) for name, f in functions.items()}
-    together = lambda x: torch.cat([f(x) / sizes[name] for name, f in functions.items()], dim=-1)
+    sizes = {name: max(float(part.norm(dim=-1).max()), 1e-300) for name, part in parts(left).items()}
+    together = lambda x: torch.cat([part / sizes[name] for name, part in parts(x).items()], dim=-1)
     first, last = _pieces(together, dim, generator, near)
     left, right = torch.cat([left, first]), torch.cat([right, last])
     steepest, steep_at = 0.0, left[0]
@@ -136,19 +138,18 @@ def largest_jump(policy: Policy, dim: int, problem: Problem | None = None, near:
         if k == FIRST_HALVINGS:
             top = change.topk(min(KEPT, len(change))).indices
             left, right, value_left, value_right = (part[top] for part in (left, right, value_left, value_right))
-    jump = _largest(functions, sizes, left, right, NOTICEABLE)
+    jump = _largest(parts, sizes, left, right, NOTICEABLE)
     if jump.size > 0.0 or problem is None or steepest < STEEP:
         return jump
     away = 0.5 * LAYER * normalize(torch.ones(1, dim, dtype=torch.float64))
-    return _largest(functions, sizes, steep_at - away, steep_at + away, 0.5 * STEEP, LAYER)
+    return _largest(parts, sizes, steep_at - away, steep_at + away, 0.5 * STEEP, LAYER)
 
 
-def _largest(functions, sizes: dict[str, float], left: Tensor, right: Tensor, least: float, width: float = 0.0) -> Jump:
-    """Of which function the change from ``left`` to ``right`` is largest for its size, if above ``least`` of it."""
-    best, relative = Jump(0.0, left[0].remainder(1.0)), least
-    # The data come first: what jumps in them jumps in the closed loop too.
-    for name in (n for n in (DRIFT, MATRIX, NOISE, CONTROLLER, LOOP) if n in functions):
-        change = (functions[name](right) - functions[name](left)).norm(dim=-1).nan_to_num(nan=0.0)
+def _largest(parts, sizes: dict[str, float], left: Tensor, right: Tensor, least: float, width: float = 0.0) -> Jump:
+    """Of which of the ``parts`` the change from ``left`` to ``right`` is largest for its size, if above ``least`` of it."""
+    best, relative, before = Jump(0.0, left[0].remainder(1.0)), least, parts(left)
+    for name, after in parts(right).items():
+        change = (after - before[name]).norm(dim=-1).nan_to_num(nan=0.0)
         worst = int(change.argmax())
         if float(change[worst]) > relative * sizes[name]:
             relative = 2.0 * float(change[worst]) / sizes[name]

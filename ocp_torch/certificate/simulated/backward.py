@@ -6,7 +6,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from ocp_torch.control.policies import Policy
+from ocp_torch.control.policies import Policy, ValuePolicy, is_even
 from ocp_torch.maths.brownian import Grid, discounted, increments, path_integral
 from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.runge_kutta import Dynamics, discounted_integral
@@ -27,8 +27,8 @@ LARGEST_GROWTH = 60.0
 # Evaluations of the closed loop at each state and time where there is noise, at first and from the highest, shared by the
 # paths and the `d + 1` differences on each; and paths at least. More show a density that is too large for M more surely.
 FEW_EVALUATIONS, EVALUATIONS, FEWEST_PATHS = 48, 192, 4
-# Of the states looked at, the highest are looked at again from close by.
-TOP, NEARBY = 6, 48
+# Of the states looked at, the highest are looked at again from close by: at one for so many of the states.
+TOP, NEARBY = 6, 3
 # Ascents to the suprema of the a-priori bound, which is shown beside the density itself and decides nothing.
 ASCENTS, ASCENT_STEPS = 16, 20
 # Step of a difference quotient of the velocity: truncation is then about 1e-7 of its second derivatives, rounding 1e-9.
@@ -40,7 +40,8 @@ def backward_flow(problem: Problem, policy: Policy, together: bool = False) -> D
 
     Its discounted integral is `mu^u(x) = rho int e^{-rho t} mu0(y_t) exp(-int_0^t div g(y_s) ds) dt`, `y_0 = x`: the density
     of a flow changes by its divergence (the representation behind Proposition 8 of the paper). Valid for a Lipschitz loop.
-    Differences of `g`, all in one call, are cheaper than derivatives of a controller that is a derivative itself.
+    Differences of `g`, all in one call, are cheaper than derivatives of a controller that is a derivative itself, unless that
+    knows its own and `B` is the same everywhere (`ValuePolicy.flux_divergence`).
 
     It is evaluated on all cores ``together`` if ``problem`` and ``policy`` are pure functions.
 
@@ -48,13 +49,19 @@ def backward_flow(problem: Problem, policy: Policy, together: bool = False) -> D
     g`, and `mu^u(x)` is the mean over paths (Feynman and Kac, for the adjoint equation written out).
     """
 
+    loop, known = ClosedLoop(problem, policy), isinstance(policy, ValuePolicy) and problem.gives_divergences
+
     def backward(state: Tensor) -> tuple[Tensor, Tensor]:
         y, log_factor = state[:, :-1], state[:, -1]
-        moves = DIFFERENCE * torch.eye(y.shape[1], dtype=y.dtype)
-        around = torch.cat([y, *(y + move for move in moves)])
-        (velocity,) = in_pieces(lambda at: (problem.velocity(at, policy(at)),), around, together)
-        here, *moved = velocity.chunk(len(moves) + 1)
-        divergence = summed((g[:, i] - here[:, i]) / DIFFERENCE for i, g in enumerate(moved))
+        if known and is_even(problem.control_matrix(y)):
+            exact = lambda at: cast(tuple[Tensor, Tensor], loop.vector_fields(at)[::2])
+            here, divergence = in_pieces(exact, y, together)
+        else:
+            moves = DIFFERENCE * torch.eye(y.shape[1], dtype=y.dtype)
+            around = torch.cat([y, *(y + move for move in moves)])
+            (velocity,) = in_pieces(lambda at: (problem.velocity(at, policy(at)),), around, together)
+            here, *moved = velocity.chunk(len(moves) + 1)
+            divergence = summed((g[:, i] - here[:, i]) / DIFFERENCE for i, g in enumerate(moved))
         motion = torch.cat([-here, -divergence.unsqueeze(-1)], dim=-1)
         if problem.noisy:
             div_D, div_div_D = cast(tuple[Tensor, Tensor], problem.noise_divergences(y))
@@ -127,9 +134,10 @@ def estimated_sup_occupation(
     if not bool(torch.isfinite(density).all()):
         return math.inf
     top = x[density.topk(min(TOP, len(x))).indices]
-    around = top[torch.arange(NEARBY) % len(top)]
+    count = states // NEARBY
+    around = top[torch.arange(count) % len(top)]
     steps = torch.randn(around.shape, dtype=x.dtype, generator=generator) / math.sqrt(problem.dim)
-    sizes = 10.0 ** (-1.0 - 2.0 * torch.rand(NEARBY, 1, dtype=x.dtype, generator=generator))
+    sizes = 10.0 ** (-1.0 - 2.0 * torch.rand(count, 1, dtype=x.dtype, generator=generator))
     near = torch.cat([top, (around + sizes * steps).remainder(1.0)])
     return max(float(density.max()), float(met(near, EVALUATIONS).max()))
 

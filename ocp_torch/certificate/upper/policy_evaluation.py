@@ -41,8 +41,8 @@ EXCESS_STATES = 4096
 class StageSettings:
     """Budget of policy evaluation, `certificate.stage` of a configuration. Raises `InputError` on a wrong value."""
 
-    steps: int = 600  # least-squares steps in the first round; 0 for none at all
-    rounds: int = 2  # at most, each twice as long as the one before
+    steps: int = 300  # least-squares steps in the first round; 0 for none at all
+    rounds: int = 3  # at most, each twice as long as the one before
     good_excess: float = 1e-4  # part of the Lagrangian bound that comes from the residual, below which rounds end
     batch: int = 256  # states per step
     lr: float = 1.0e-2  # learning rate, with cosine decay in each round
