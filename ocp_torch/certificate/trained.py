@@ -210,7 +210,8 @@ class TrainedContext(FieldsContext):
         usable = found if found is not None and found.perf.finite else None
         states, together = self.settings.occupation_states, self.problem.concurrent  # networks of ours are pure
         upper = self.has_densities or self.settings.stage.steps > 0  # bounds that a jump would spoil
-        return observe(self.problem, self.policies[self.followed], usable, self.few, states, together, upper)
+        rounded = self.policies_of(self.fields.rounded)[self.followed]
+        return observe(self.problem, self.policies[self.followed], usable, self.few, states, together, upper, rounded)
 
     @property
     def notes(self) -> list[str]:

@@ -22,3 +22,7 @@ class Rounded(nn.Module):
         """The jet of a scalar network at states ``(N, d)``, as `jets.jet` has it."""
         here = (x - x.floor()).float()
         return jets.jet(self.network, here, None if sigma is None else sigma.float()).map(Tensor.double)
+
+    def curvature(self, x: Tensor, sigma: Tensor) -> Tensor:
+        """As `jets.curvature` has it."""
+        return jets.curvature(self.network, (x - x.floor()).float(), sigma.float()).double()

@@ -8,6 +8,7 @@ import torch
 
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.upper import policy_evaluation
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.certificate.upper.multiples import Terms, best_multiples, terms_on
 from ocp_torch.certificate.upper.policy_evaluation import (
@@ -24,6 +25,7 @@ from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from support import zoo
+from support.formulas import Field
 
 
 def optimal_loop_samples(problem, count=2**13):
@@ -111,6 +113,19 @@ def test_the_stage_takes_another_round_only_while_the_residual_costs_too_much():
     once = weights(fit(rounds=1))
     assert torch.equal(weights(fit(good_excess=1e3)), once)
     assert not torch.equal(weights(fit(good_excess=1e-12)), once)
+
+
+@pytest.mark.parametrize("solved", [False, True])
+def test_the_first_round_ends_early_where_v_is_solved_so_well_that_any_density_will_do(solved, monkeypatch):
+    problem, steps = zoo.build("manufactured 2-d q=2"), []
+    network = partial(PeriodicMLP, modes=1, width=16, depth=2)
+    value = Field(problem.exact_value) if solved else network(problem.dim)
+    fields = Fields({"value": value})
+    policy, settings = ValuePolicy(problem, problem.exact_value), StageSettings(steps=250, rounds=1, batch=16)
+    counted = policy_evaluation.advance
+    monkeypatch.setattr(policy_evaluation, "advance", lambda *a: steps.append(0) or counted(*a))
+    fit_closed_loop(problem, policy, fields, network, resolve_constants(problem), settings, seed=0)
+    assert len(steps) == (100 if solved else 250)
 
 
 def test_a_fit_whose_first_steps_lose_all_mass_is_begun_anew_more_slowly(monkeypatch):

@@ -10,7 +10,7 @@ import torch
 
 from ocp_torch.certificate.simulated.backward import backward_flow, settled_occupation
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
-from ocp_torch.control.policies import zero_policy
+from ocp_torch.control.policies import ValuePolicy, zero_policy
 from ocp_torch.maths import cores
 from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.runge_kutta import discounted_integral, refined
@@ -339,6 +339,14 @@ def test_trajectories_are_the_same_on_one_core_and_on_several(monkeypatch):
         assert (len(threads) > 1) == (count > 1)
     assert found[0].perf == found[1].perf
     assert torch.equal(found[0].end_states, found[1].end_states)
+
+
+@pytest.mark.parametrize("name", ["manufactured 2-d q=2", "circle rho=2"])
+def test_the_density_is_the_same_with_differences_and_with_derivatives_of_a_controller_that_knows_its_own(name):
+    problem = zoo.build(name)
+    policy, x = ValuePolicy(problem, zoo.rough_network(problem.dim, 3, size=0.05)), zoo.states(problem, 40)
+    known, differences = (settled_occupation(problem, p, x) for p in (policy, lambda at: policy(at)))
+    torch.testing.assert_close(known, differences, rtol=1e-5, atol=1e-7)
 
 
 def test_with_noise_the_estimated_density_is_a_number_where_paths_scatter_widely():

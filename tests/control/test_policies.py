@@ -14,6 +14,8 @@ from ocp_torch.control.policies import (
     zero_policy,
 )
 from ocp_torch.fields import Fields
+from ocp_torch.maths.jets import control_flux_divergence
+from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import resolve_constants
 from support import zoo
 from support.exact import ROUNDING
@@ -38,6 +40,20 @@ def mu_of(problem):
 def test_the_controller_of_the_exact_value_is_the_exact_one(problem):
     x = zoo.states(problem, 500, off_kinks=True)
     torch.testing.assert_close(ValuePolicy(problem, problem.exact_value)(x), problem.exact_control(x), **ROUNDING)
+
+
+@zoo.on((*zoo.SMOOTH, *zoo.LIMITED))
+def test_its_own_divergence_is_that_of_reverse_passes(problem):
+    x, value = zoo.states(problem, 300), zoo.rough_network(problem.dim, 1)
+    _, B, _, div_B = problem.vector_fields(x)
+    policy = ValuePolicy(problem, value)
+    u, flux = policy.flux_divergence(x, B, div_B)
+    expected_u, expected = control_flux_divergence(policy, x, B, div_B)
+    torch.testing.assert_close(u, expected_u)
+    torch.testing.assert_close(flux, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
+    loop = ClosedLoop(problem, policy)
+    _, _, divergence, _ = loop.vector_fields(x)
+    torch.testing.assert_close(divergence, problem.drift_divergence(x) + expected, rtol=1e-8, atol=1e-8)
 
 
 KINDS = [(CLOSED, n) for n in zoo.KINKED] + [(k, n) for n in (*zoo.SMOOTH, *zoo.LIMITED) for k in (SADDLE, NETWORK)]

@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from ocp_torch.fields import PeriodicMLP, SobolevField
+from ocp_torch.fields import PeriodicMLP, SobolevField, mlp
 from ocp_torch.fields.activations import ACTIVATIONS
 from ocp_torch.fields.forward_sweep import Along
 from ocp_torch.maths import cores
 from ocp_torch.maths.batch_jet import PIECE, batch_jet
-from ocp_torch.maths.jets import chunked_jet, jet, reverse_jet
+from ocp_torch.maths.jets import chunked_jet, curvature, jet, reverse_jet
 
 # Columns of noise: none but one, fewer than coordinates, as many, more.
 SHAPES = ((1, 1), (2, 1), (3, 2), (2, 2), (3, 3), (2, 4))
@@ -51,6 +51,17 @@ def test_a_sweep_gives_what_nested_reverse_passes_give(dim, columns, activation,
         torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
     with torch.no_grad():
         assert_same(jet(network, x, sigma), swept)
+
+
+@pytest.mark.parametrize("gated", [False, True])
+@pytest.mark.parametrize(("dim", "columns"), SHAPES)
+def test_curvature_alone_is_the_same_also_from_many_pieces(dim, columns, gated, monkeypatch):
+    network, (x, sigma) = made(dim, dim, gated=gated).requires_grad_(False), drawn(dim, columns, count=70)
+    expected = reverse_jet(network, x, sigma).curvature
+    torch.testing.assert_close(curvature(network, x, sigma), expected, **EXACT)
+    monkeypatch.setattr(mlp, "SWEPT", 1)
+    torch.testing.assert_close(curvature(network, x, sigma), expected, **EXACT)
+    torch.testing.assert_close(curvature(lambda at: network(at), x, sigma), expected, **EXACT)
 
 
 @pytest.mark.parametrize("gated", [False, True])

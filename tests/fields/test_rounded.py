@@ -5,7 +5,7 @@ import torch
 
 from ocp_torch.fields import PeriodicMLP, SobolevField
 from ocp_torch.fields.rounded import Rounded
-from ocp_torch.maths.jets import jet
+from ocp_torch.maths.jets import curvature, jet
 
 
 def made(kind):
@@ -32,4 +32,7 @@ def test_it_is_off_by_rounding_alone_far_from_the_unit_cell_too(kind, noisy):
     for name in ("value", "gradient") + noisy * ("curvature",):
         size = float(getattr(exact, name).detach().abs().max())
         torch.testing.assert_close(getattr(found, name), getattr(exact, name), rtol=0.0, atol=1e-5 * size)
+    if sigma is not None:
+        bent, size = curvature(Rounded(network), away, sigma), float(exact.curvature.detach().abs().max())
+        torch.testing.assert_close(bent, exact.curvature, rtol=0.0, atol=1e-5 * size)
     assert next(iter(network.state_dict().values())).dtype == torch.float64  # its own weights are left alone

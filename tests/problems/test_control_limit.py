@@ -184,6 +184,16 @@ def test_how_the_argmax_changes_is_what_autograd_finds(cost):
 
 
 @each_cost
+def test_the_root_of_that_change_taken_twice_is_the_change(cost):
+    draw = lambda *shape: torch.randn(*shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    p, moved = 0.5 * draw(300, 2), draw(300, 2, 4)
+    root = lambda columns: cost.argmax_root(p, columns)
+    torch.testing.assert_close(root(root(moved)), cost.argmax_along(p, moved))
+    square = root(torch.eye(2, dtype=torch.float64).expand(300, 2, 2))
+    torch.testing.assert_close(square, square.mT)
+
+
+@each_cost
 def test_the_gradient_of_the_conjugate_is_the_argmax_also_far_beyond_the_limit_in_single_precision(cost):
     p = (column([0.0, 1e-20, 0.1, 1.0, 1e3, 1e6]).unsqueeze(-1) * column([0.6, -0.8])).float()
     _, slope = value_and_gradients(cost.conjugate, p)

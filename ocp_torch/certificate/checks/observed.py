@@ -74,10 +74,11 @@ def observe(
     occupation_states: int,
     together: bool = False,
     jumps: bool = True,
+    rounded: Policy | None = None,
 ) -> Observed:
     """Look at the controller ``policy`` at the states of ``sets``, and where the trajectories of ``simulated`` end; its
     occupation density is computed at so many ``occupation_states``, 0 for not at all, on all cores ``together`` if both are
-    pure functions; without ``jumps`` none are looked for."""
+    pure functions; without ``jumps`` none are looked for. ``rounded`` is the policy in single precision, if there is one."""
     with torch.no_grad():
         sup_control = max(float(policy(samples.x[:CONTROLLED]).norm(dim=-1).max()) for samples in sets)
     near = torch.cat([samples.x[:CROSSED] for samples in sets])
@@ -88,7 +89,8 @@ def observe(
         # With noise the density is followed back in time by its divergences.
         followed = problem.gives_divergences or not problem.noisy
         if occupation_states and followed and problem.occupation_bound != math.inf:
-            occupation = estimated_sup_occupation(problem, policy, simulated.end_states, occupation_states, together)
+            how = occupation_states, together, rounded
+            occupation = estimated_sup_occupation(problem, policy, simulated.end_states, *how)
             a_priori = a_priori_sup_occupation(problem, policy, sets[0].x[:CONTROLLED])
     jump = largest_jump(policy, problem.dim, problem=problem, near=near) if jumps else None
     return Observed(occupation, a_priori, sup_control, largest_value, jump)

@@ -49,7 +49,7 @@ def backward_flow(problem: Problem, policy: Policy, together: bool = False) -> D
     g`, and `mu^u(x)` is the mean over paths (Feynman and Kac, for the adjoint equation written out).
     """
 
-    loop, known = ClosedLoop(problem, policy), isinstance(policy, ValuePolicy) and problem.gives_divergences
+    loop, known = ClosedLoop(problem, policy), differentiable(problem, policy)
 
     def backward(state: Tensor) -> tuple[Tensor, Tensor]:
         y, log_factor = state[:, :-1], state[:, -1]
@@ -69,6 +69,11 @@ def backward_flow(problem: Problem, policy: Policy, together: bool = False) -> D
         return motion, problem.initial_density(y) * log_factor.clamp_max(LARGEST_GROWTH).exp()
 
     return backward
+
+
+def differentiable(problem: Problem, policy: Policy) -> bool:
+    """Whether the divergence of the closed loop is had without differences, and for less where `B` is the same everywhere."""
+    return isinstance(policy, ValuePolicy) and problem.gives_divergences
 
 
 def settled_occupation(
@@ -119,10 +124,19 @@ def _noisy_piece(
 
 
 def estimated_sup_occupation(
-    problem: Problem, policy: Policy, end_states: Tensor, states: int, together: bool = False
+    problem: Problem,
+    policy: Policy,
+    end_states: Tensor,
+    states: int,
+    together: bool = False,
+    rounded: Policy | None = None,
 ) -> float:
     """The largest `mu^u` met: at the ends of trajectories, where mass accumulates, at uniform states, and then near the
-    highest of them; ``together`` as in `backward_flow`."""
+    highest of them; ``together`` as in `backward_flow`. ``rounded``, the policy in single precision, takes its place where no
+    differences are taken."""
+    even = is_even(problem.control_matrix(end_states))
+    if rounded is not None and even and differentiable(problem, rounded):
+        policy = rounded
     count = max(1, 2 * states // 3)
     picked = end_states[:: max(1, len(end_states) // count)][:count]
     generator = fixed_generator()

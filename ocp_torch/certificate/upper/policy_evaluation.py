@@ -33,8 +33,10 @@ MOST_LOPSIDED = 16.0
 # of three, one for good). A fit is begun anew at so many times its rate, no slower than the last number, if after so many
 # steps `mu` has less mass than this.
 LOOKED_AT, LEAST_MASS, SLOWER, SLOWEST = 40, 0.01, 0.3, 1e-3
-# States at which the excess is computed after a round: what decides on a next one need not be exact.
-EXCESS_STATES = 4096
+# States at which the excess is computed after a round: what decides on a next one need not be exact. It is also looked at
+# after each so many steps of the first one, which ends where it is that part of what is good enough: where `V` solves its
+# equation to 1e-5, any `mu` will do.
+EXCESS_STATES, EXCESS_EVERY, EXCELLENT = 4096, 100, 0.02
 
 
 @dataclass(frozen=True)
@@ -86,18 +88,28 @@ def fit_closed_loop(
     weight = 1.0 if trained is None else positive_weight(loop, trained, pool.samples.take(slice(EXCESS_STATES)))
     objective, phase = PolicyEvaluation(loop, trained is None, weight), Phase(constants)
     stepper, average = short_fit(fitted, objective, settings.lr, settings.steps)
+    # Below 0 it is where another multiple of `mu` serves a `V` that is far off.
+    excess = lambda: abs(
+        relative_excess(
+            loop,
+            average.module.value if trained is None else trained,
+            average.module.log_occupation,
+            pool.samples.take(slice(EXCESS_STATES)),
+        )
+    )
     for k in range(settings.rounds):
         steps = settings.steps * 2**k
         pool.grow(min(POOL, steps * settings.batch))
         for step in range(steps):
             advance(stepper, average, draw, phase)
+            early = k == 0 and (step + 1) % EXCESS_EVERY == 0
+            if early and excess() <= EXCELLENT * settings.good_excess:
+                return average.module
             looked_at = k == 0 and step == LOOKED_AT and settings.lr > SLOWEST
             if looked_at and vanished(fitted.log_occupation, pool.samples.take(slice(EXCESS_STATES))):
                 slower = replace(settings, lr=SLOWER * settings.lr)
                 return fit_closed_loop(problem, policy, fields, network, constants, slower, seed, pool)
-        value = average.module.value if trained is None else trained
-        excess = relative_excess(loop, value, average.module.log_occupation, pool.samples.take(slice(EXCESS_STATES)))
-        if excess <= settings.good_excess:
+        if excess() <= settings.good_excess:
             break
     return average.module
 
