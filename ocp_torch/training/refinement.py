@@ -8,11 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
+from torch import Tensor
 
+from ocp_torch.certificate.lower.shifted import slack_function
 from ocp_torch.certificate.trained import in_float64
 from ocp_torch.fields import Fields, PeriodicMLP
+from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import SobolSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
+from ocp_torch.maths.supremum import batched, climb
 from ocp_torch.problems import Problem
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
@@ -24,6 +28,8 @@ if TYPE_CHECKING:
 
 # States on which `F_M` is compared: the same for both, so that it differs by what the steps do.
 JUDGED = 8192
+# States among which the largest slacks are sought, and how many steps are climbed from how many of either sign.
+SOUGHT, PEAKS, CLIMBED = 4096, 16, 20
 # A slack whose root mean square is so small a part of the state cost's standard deviation is small enough for the steps to
 # end, and for training: `F_M` is then about .0002 and .003 % below OPT.
 ENOUGH, SOLVED = 1e-5, 2e-4
@@ -95,14 +101,32 @@ def refined_value(
     if not steps or problem.noisy or not problem.has_simulator or not ours:
         return None
     states = SobolSampler(problem.dim, seed, torch.float64)
-    draw = lambda count: Samples.of(problem, states.draw(count))
+
+    def draw(count: int, also: Tensor | None = None) -> Samples:
+        x = states.draw(count if also is None else count - len(also))
+        return Samples.of(problem, x if also is None else torch.cat([also, x]))
+
     slack = lambda samples, V: Generator.of(problem, samples).hjb_slack(V)
     judged = draw(JUDGED)
     unit = float(judged.f.std())
-    found = refined(network, slack, draw, steps, ENOUGH * unit, stop)
+    worst = lambda own: worst_states(problem, own, states.draw(SOUGHT))
+    found = refined(network, slack, draw, steps, ENOUGH * unit, stop, worst)
     if found is None or bound(problem, found.network, judged, M) < bound(problem, network, judged, M):
         return None
     return Found(found.network.state_dict(), found.residual <= SOLVED * unit)
+
+
+def worst_states(problem: Problem, value: Field, x: Tensor) -> tuple[Tensor, float]:
+    """Where ascents from the states ``x`` ``(N, d)`` with the largest and the smallest slack of ``value`` end, ``(K, d)``,
+    and the largest slack there, whatever its sign."""
+    slack = slack_function(problem, value)
+    met, ends, largest = batched(slack, x), [], 0.0
+    for function, found in ((slack, met), (lambda at: -slack(at), -met)):
+        start, index = found.topk(PEAKS)
+        at, reached = climb(function, x[index], start, CLIMBED)
+        ends.append(at.remainder(1.0))
+        largest = max(largest, float(reached.max()))
+    return torch.cat(ends), largest
 
 
 def bound(problem: Problem, network: torch.nn.Module, samples: Samples, M: float) -> float:

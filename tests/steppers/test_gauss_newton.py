@@ -18,7 +18,12 @@ def slack_of(problem):
 
 def draw_of(problem, seed=0):
     generator = torch.Generator().manual_seed(seed)
-    return lambda count: Samples.of(problem, torch.rand(count, problem.dim, generator=generator, dtype=torch.float64))
+
+    def draw(count, also=None):
+        x = torch.rand(count, problem.dim, generator=generator, dtype=torch.float64)
+        return Samples.of(problem, x if also is None else torch.cat([also, x])[:count])
+
+    return draw
 
 
 def network(dim, **form):
@@ -112,3 +117,38 @@ def test_states_that_are_all_alike_and_numbers_that_are_none_end_the_steps(monke
         GaussNewton(network(1).double().requires_grad_(False), slack_of(problem)).step(draw_of(problem)(8)) == torch.inf
     )
     assert refined(network(1), slack_of(problem), draw_of(problem), steps=4) is None
+
+
+@pytest.mark.parametrize("small", [False, True])
+def test_the_worst_states_are_among_those_of_the_last_steps_until_none_is_bad(small, monkeypatch):
+    problem, stepped, asked = Manufactured(dim=1), [], []
+    start, draw, bad = fitted(problem), draw_of(problem), torch.tensor([[0.25], [0.75]], dtype=torch.float64)
+    step = GaussNewton.step
+    monkeypatch.setattr(GaussNewton, "step", lambda self, samples: stepped.append(samples.x) or step(self, samples))
+
+    def worst(network):
+        assert next(network.parameters()).dtype == torch.float64
+        asked.append(len(stepped))
+        return bad, 0.0 if small else 1.0
+
+    found = refined(start, slack_of(problem), draw, 20, enough=1e-9, worst=worst)
+    assert found is not None
+    rounds = 0 if small else gauss_newton.ROUNDS
+    assert asked == [20 + k * gauss_newton.ROUND_STEPS for k in range(max(rounds, 1))]
+    assert len(stepped) == 20 + rounds * gauss_newton.ROUND_STEPS
+    assert all(torch.equal(x[:2], bad) for x in stepped[20:])
+    assert not any(torch.equal(x[:2], bad) for x in stepped[:20])
+
+
+def test_steps_on_worst_states_that_give_no_number_or_are_told_to_stop_leave_all_as_it_was(monkeypatch):
+    problem = Manufactured(dim=1)
+    start, draw = fitted(problem), draw_of(problem)
+    worst = lambda network: (torch.full((2, 1), 0.25, dtype=torch.float64), 1.0)
+    count = []
+    stop = lambda: count.append(0) is not None or len(count) > 5
+    assert refined(start, slack_of(problem), draw, 4, stop=stop, worst=worst) is None
+    assert len(count) == 6
+    step = GaussNewton.step
+    odd = lambda self, samples: torch.inf if float(samples.x[0]) == 0.25 else step(self, samples)
+    monkeypatch.setattr(GaussNewton, "step", odd)
+    assert refined(start, slack_of(problem), draw, 4, worst=worst) is None

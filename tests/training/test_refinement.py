@@ -30,7 +30,7 @@ def halved(monkeypatch):
     """In place of the steps weights are halved. Gives the states drawn each time, and a list of what comes meanwhile."""
     drawn, stopping = [], []
 
-    def refined(network, residual, draw, steps, enough, stop):
+    def refined(network, residual, draw, steps, enough, stop, worst):
         assert steps == 3
         drawn.append(draw(4).x)
         if stopping and stopping[0]():
@@ -178,7 +178,7 @@ def solved(monkeypatch):
     """In place of the steps the last layer becomes 0. Gives the states drawn each time."""
     found = []
 
-    def refined(network, residual, draw, steps, enough, stop):
+    def refined(network, residual, draw, steps, enough, stop, worst):
         own = copy.deepcopy(network)
         own.head.weight.data.zero_()
         found.append(draw(4).x)
@@ -247,12 +247,12 @@ def test_early_steps_that_are_cut_off_are_made_anew(solved, monkeypatch, how, tm
     whole.fit(Silent())
     trainer, signals, exact = agreeing(small(*EARLY), True), Signals(), refinement.refined
 
-    def cut(network, residual, draw, steps, enough, stop):
+    def cut(network, residual, draw, steps, enough, stop, worst):
         if how == "a signal":
             signals.received = 15
         else:
             trainer.asked = True
-        return None if stop() else exact(network, residual, draw, steps, enough, stop)
+        return None if stop() else exact(network, residual, draw, steps, enough, stop, worst)
 
     monkeypatch.setattr(refinement, "refined", cut)
     if how == "asked to stop":
@@ -268,6 +268,18 @@ def test_early_steps_that_are_cut_off_are_made_anew(solved, monkeypatch, how, tm
     assert differences(state_of(resumed), state_of(whole)) == []
 
 
+def test_the_worst_states_have_the_largest_slack_of_both_signs():
+    problem = Manufactured(dim=2)
+    value = lambda x: problem.exact_value(x) + 0.01 * torch.sin(2.0 * math.pi * x[:, 0])
+    x = torch.rand(2048, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    found, largest = refinement.worst_states(problem, value, x)
+    slack = lambda at: refinement.slack_function(problem, value)(at).detach()
+    assert found.shape == (2 * refinement.PEAKS, 2)
+    assert bool((slack(found[: refinement.PEAKS]) >= slack(x).topk(refinement.PEAKS).values - 1e-12).all())
+    assert bool((slack(found[refinement.PEAKS :]) <= -(-slack(x)).topk(refinement.PEAKS).values + 1e-12).all())
+    assert largest == pytest.approx(float(slack(found).abs().max()), rel=1e-9)
+
+
 @pytest.mark.nightly
 @pytest.mark.parametrize(("dim", "more"), [(1, ()), (2, ()), (3, ("problem.exponent=1.5",)), (5, ())])
 def test_smooth_problems_are_solved_early_and_well(dim, more):
@@ -278,6 +290,9 @@ def test_smooth_problems_are_solved_early_and_well(dim, more):
     exact = trainer.problem.exact_value(x)
     error = (trainer.averaged_fields.value.double()(x) - exact).abs().mean() / exact.std()
     assert float(error) < 1e-3
+    states = torch.rand(2**15, dim, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    _, largest = refinement.worst_states(trainer.problem, trainer.averaged_fields.value.double(), states)
+    assert largest < 3e-3 * float(exact.std())  # no spikes: bounds that need no M are narrow too
 
 
 @pytest.mark.nightly
