@@ -37,6 +37,8 @@ GROWTH = 10.0
 # After so many steps those of smooth solutions had fallen to between .08 and .5 of what they were, in 1 to 64 coordinates;
 # with kinks in 5 and 6, where none grows as much, they stayed at .8 to 1.1 for as long as there were steps.
 LOOKED_AT, FALLEN = 12, 0.6
+# Later on steps end where so many in a row have not made the residual smaller than that part of the smallest so far.
+PATIENCE, SMALLER = 6, 0.9
 
 # A residual that is small in the mean is large at a few states, where weights that were moved far bend the network over a
 # short way: then come so many rounds of so many steps on batches with the worst states that are found, until these are no
@@ -121,11 +123,13 @@ def refined(
     judged = draw(STATES, None)
     size = lambda: float(residual(judged, own.jet(judged.x)).square().mean().sqrt())
     before, stepper = size(), GaussNewton(own, residual)
+    least, since = math.inf, 0
     for k in range(steps):
         seen = math.inf if stop() else stepper.step(draw(STATES, None))
         if not seen < before * (FALLEN if k == LOOKED_AT else GROWTH):
             return None
-        if seen < enough:
+        least, since = (seen, 0) if seen < SMALLER * least else (least, since + 1)
+        if seen < enough or (since >= PATIENCE and k > LOOKED_AT):
             break
     stepper.momentum = None
     for k in range(ROUNDS * ROUND_STEPS if worst is not None else 0):

@@ -108,6 +108,10 @@ def test_steps_end_where_the_residual_is_small_enough_and_where_it_stays_as_it_i
     sizes.clear()
     assert refined(start, lambda samples, V: torch.ones_like(V.value), draw, steps=40) is None
     assert len(sizes) == gauss_newton.LOOKED_AT + 1
+    monkeypatch.setattr(gauss_newton, "FALLEN", torch.inf)
+    sizes.clear()
+    assert refined(start, lambda samples, V: torch.ones_like(V.value), draw, steps=40) is None
+    assert len(sizes) == gauss_newton.LOOKED_AT + 2
 
 
 def test_states_that_are_all_alike_and_numbers_that_are_none_end_the_steps(monkeypatch):
