@@ -43,7 +43,7 @@ PATIENCE, SMALLER = 6, 0.9
 # A residual that is small in the mean is large at a few states, where weights that were moved far bend the network over a
 # short way: then come so many rounds of so many steps on batches with the worst states that are found, until these are no
 # more than so many times what is enough in the mean. Of 16 coordinates the largest slack was 7e-3 before, and 1e-5 after.
-ROUNDS, ROUND_STEPS, PEAK = 8, 2, 50.0
+ROUNDS, ROUND_STEPS, PEAK = 8, 2, 20.0
 
 Residual = Callable[[Samples, Jet], Tensor]
 

@@ -32,7 +32,7 @@ JUDGED = 8192
 SOUGHT, PEAKS, CLIMBED = 4096, 16, 20
 # A slack whose root mean square is so small a part of the mean state cost is small enough for the steps to end, and for
 # training: `F_M` is then about .0001 and .002 % below OPT.
-ENOUGH, SOLVED = 2e-6, 4e-5
+ENOUGH, SOLVED = 5e-6, 4e-5
 
 
 class Found(NamedTuple):
@@ -68,9 +68,9 @@ def refine(trainer: "Trainer", monitor: Silent, checkpoint: Path | None, stop: C
     state.refined = trainer.ranks.from_first(lambda: not told)
     state.elapsed += spent()
     every, another = settings.evaluate_every, state.round + 1 < settings.rounds
-    if state.refined and (found is not None if early else another and every and trainer.step % every == 0):
+    if state.refined and not early and another and every and trainer.step % every == 0:
         state.pending = trainer.ranks.from_first(lambda: trainer.look(monitor, checkpoint))
-    if found is not None and early:
+    if found is not None and early:  # no look to be shown: the certificate comes next
         goal = min(settings.good_gap, settings.target_gap or math.inf)
         state.solved = trainer.ranks.from_first(lambda: trainer.evaluator.reaches(goal, trainer.run))
         if not state.solved:
