@@ -22,6 +22,9 @@ from ocp_torch.problems.samples import Samples
 # under held controls were fitted to; and from `w` and the `mu` of Lemma 2 where training takes another: `G` bounds its cost.
 VALUE, DENSITY, TRAJECTORIES, MINIMISED = "value", "density", "trajectories", "minimised"
 
+# Multiples of it are spread evenly, and no grid or symmetric state has them as coordinates.
+GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+
 # A policy maps states (N, d) to controls (N, m); a density maps them to (N,).
 Policy = Callable[[Tensor], Tensor]
 Density = Callable[[Tensor], Tensor]
@@ -47,9 +50,9 @@ class ValuePolicy:
     def flux_divergence(self, x: Tensor, B: Tensor, div_B: Tensor) -> tuple[Tensor, Tensor]:
         r"""The control ``(N, m)`` and `div(B u)` ``(N,)`` at states ``(N, d)``, as data.
 
-        Where `B` is the same at all of them that is `(div B) . u - tr(B J B^T hess V) / rho` with the derivative `J` of `grad
+        Where `B` does not vary that is `(div B) . u - tr(B J B^T hess V) / rho` with the derivative `J` of `grad
         R*`: one sweep along the columns of `B J^{1/2}` in place of a reverse pass for each control."""
-        if not is_even(B):
+        if not is_even(self.problem, B):
             return jets.control_flux_divergence(self, x, B, div_B)
         V, rho = jets.jet(self.value, x), self.problem.discount
         root = self.problem.control_cost.argmax_root(self._price(B, V), B.mT).mT
@@ -57,9 +60,11 @@ class ValuePolicy:
         return u, (div_B * u).sum(dim=-1) - bent
 
 
-def is_even(B: Tensor) -> bool:
-    """Whether the matrices ``B`` ``(N, d, m)`` are the same at all states."""
-    return bool((B == B[:1]).all())
+def is_even(problem: Problem, B: Tensor) -> bool:
+    """Whether the control matrices ``B`` ``(N, d, m)`` of ``problem`` are the same at all of `N` states, and as at one that
+    is like no other: then they do not vary around these states either."""
+    generic = (GOLDEN * torch.arange(1, problem.dim + 1, dtype=B.dtype, device=B.device)).remainder(1.0)
+    return bool((B == problem.control_matrix(generic.unsqueeze(0))).all())
 
 
 def admissible_density(kind: str | None, problem: Problem, fields: Fields, constants: Constants) -> Field:

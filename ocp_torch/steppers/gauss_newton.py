@@ -132,9 +132,11 @@ def refined(
         if seen < enough or (since >= PATIENCE and k > LOOKED_AT):
             break
     stepper.momentum = None
-    for k in range(ROUNDS * ROUND_STEPS if worst is not None else 0):
+    for k in range(ROUNDS * ROUND_STEPS):
+        if worst is None:
+            break
         if k % ROUND_STEPS == 0:
-            states, largest = worst(own)  # type: ignore[misc]  # there is one: see above
+            states, largest = worst(own)
             if largest <= PEAK * enough:
                 break
         if stop() or not math.isfinite(stepper.step(draw(STATES, states))):

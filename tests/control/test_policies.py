@@ -56,6 +56,15 @@ def test_its_own_divergence_is_that_of_reverse_passes(problem):
     torch.testing.assert_close(divergence, problem.drift_divergence(x) + expected, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.parametrize("name", ["manufactured 2-d B(x)", "manufactured 2-d q=2"])
+def test_and_so_it_is_at_one_state_alone(name):
+    problem = zoo.build(name)
+    policy, x = ValuePolicy(problem, zoo.rough_network(problem.dim, 1)), zoo.states(problem, 5)
+    _, B, _, div_B = problem.vector_fields(x)
+    alone = [policy.flux_divergence(x[k : k + 1], B[k : k + 1], div_B[k : k + 1])[1] for k in range(len(x))]
+    torch.testing.assert_close(torch.cat(alone), control_flux_divergence(policy, x, B, div_B)[1])
+
+
 KINDS = [(CLOSED, n) for n in zoo.KINKED] + [(k, n) for n in (*zoo.SMOOTH, *zoo.LIMITED) for k in (SADDLE, NETWORK)]
 
 

@@ -53,7 +53,7 @@ def backward_flow(problem: Problem, policy: Policy, together: bool = False) -> D
 
     def backward(state: Tensor) -> tuple[Tensor, Tensor]:
         y, log_factor = state[:, :-1], state[:, -1]
-        if known and is_even(problem.control_matrix(y)):
+        if known and is_even(problem, problem.control_matrix(y)):
             exact = lambda at: cast(tuple[Tensor, Tensor], loop.vector_fields(at)[::2])
             here, divergence = in_pieces(exact, y, together)
         else:
@@ -134,7 +134,7 @@ def estimated_sup_occupation(
     """The largest `mu^u` met: at the ends of trajectories, where mass accumulates, at uniform states, and then near the
     highest of them; ``together`` as in `backward_flow`. ``rounded``, the policy in single precision, takes its place where no
     differences are taken."""
-    even = is_even(problem.control_matrix(end_states))
+    even = is_even(problem, problem.control_matrix(end_states))
     if rounded is not None and even and differentiable(problem, rounded):
         policy = rounded
     count = max(1, 2 * states // 3)
