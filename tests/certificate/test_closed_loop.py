@@ -16,6 +16,7 @@ from ocp_torch.certificate.upper.policy_evaluation import (
     fit_closed_loop,
     positive_weight,
     relative_excess,
+    relative_slack,
 )
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields import Fields, PeriodicMLP
@@ -100,7 +101,8 @@ def test_the_bounds_of_a_poor_controller_are_above_its_own_performance(problem):
         assert bound.value >= perf.value - perf.bias - 4.0 * (perf.se + bound.se)
 
 
-def test_the_stage_takes_another_round_only_while_the_residual_costs_too_much():
+def test_the_stage_takes_another_round_only_while_the_residual_costs_too_much(monkeypatch):
+    monkeypatch.setattr(policy_evaluation, "STEEP", torch.inf)
     problem = zoo.build("manufactured 2-d q=2")
     network = partial(PeriodicMLP, modes=1, width=16, depth=2)
     fields = Fields.build(problem, ("value",), network, 0)
@@ -113,6 +115,19 @@ def test_the_stage_takes_another_round_only_while_the_residual_costs_too_much():
     once = weights(fit(rounds=1))
     assert torch.equal(weights(fit(good_excess=1e3)), once)
     assert not torch.equal(weights(fit(good_excess=1e-12)), once)
+
+
+@pytest.mark.parametrize(("rounds", "steps"), [(1, 30), (2, 60), (3, 180)])
+def test_a_short_round_is_left_out_where_the_slack_is_so_large_that_others_will_follow(rounds, steps, monkeypatch):
+    problem, made = zoo.build("manufactured 2-d q=2"), []
+    network = partial(PeriodicMLP, modes=1, width=16, depth=2)
+    fields = Fields({"value": network(problem.dim)})
+    settings = StageSettings(steps=30, rounds=rounds, batch=16, good_excess=1e-12)
+    counted = policy_evaluation.advance
+    monkeypatch.setattr(policy_evaluation, "advance", lambda *a: made.append(0) or counted(*a))
+    policy = ValuePolicy(problem, problem.exact_value)
+    fit_closed_loop(problem, policy, fields, network, resolve_constants(problem), settings, seed=0)
+    assert len(made) == steps
 
 
 @pytest.mark.parametrize("solved", [False, True])
@@ -201,5 +216,6 @@ def test_the_weight_of_missing_mass_follows_the_slack():
     loop = ClosedLoop(problem, problem.exact_control)
     samples = Samples.of(loop, zoo.states(problem, 4000))
     low, high = ((lambda x, c=c: problem.exact_value(x) + c) for c in (-0.1, 0.1))
-    assert positive_weight(loop, low, samples) == pytest.approx(4.0)
-    assert positive_weight(loop, high, samples) == pytest.approx(0.25)
+    assert positive_weight(*relative_slack(loop, low, samples)) == pytest.approx(4.0)
+    assert positive_weight(*relative_slack(loop, high, samples)) == pytest.approx(0.25)
+    assert positive_weight(0.0, 0.0) == 1.0
