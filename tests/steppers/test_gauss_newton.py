@@ -156,3 +156,21 @@ def test_steps_on_worst_states_that_give_no_number_or_are_told_to_stop_leave_all
     odd = lambda self, samples: torch.inf if float(samples.x[0]) == 0.25 else step(self, samples)
     monkeypatch.setattr(GaussNewton, "step", odd)
     assert refined(start, slack_of(problem), draw, 4, worst=worst) is None
+
+
+def test_steps_on_worst_states_that_spoil_the_rest_are_taken_back(monkeypatch):
+    problem = Manufactured(dim=1)
+    start, step = fitted(problem), GaussNewton.step
+    worst = lambda network: (torch.full((2, 1), 0.25, dtype=torch.float64), 1.0)
+
+    def spoiling(self, samples):
+        if float(samples.x[0]) == 0.25:
+            self.network.head.weight.mul_(1.5)
+            return 1.0
+        return step(self, samples)
+
+    monkeypatch.setattr(GaussNewton, "step", spoiling)
+    plain, found = (refined(start, slack_of(problem), draw_of(problem), 20, worst=w) for w in (None, worst))
+    assert found.residual == plain.residual
+    for one, other in zip(found.network.parameters(), plain.network.parameters(), strict=True):
+        assert torch.equal(one, other)
