@@ -23,8 +23,8 @@ SIZES = {
     8: dict(modes=1, waves=64, width=128, gated=True),
     inf: dict(modes=1, waves=128, width=128, gated=True),
 }
-# In three and four where the worst state counts, or with noise. Elsewhere the larger one serves Gauss-Newton steps, which
-# converge on it in 20 to 30 and on this one or with half of its waves not at all, and a torus as well in the same time.
+# In three and four coordinates where the worst state counts, or with noise: where there are no Gauss-Newton steps. These
+# converge in 20 to 30 on the network above, on this one or with half of those waves not at all; a torus has the same gap.
 PLAIN = dict(modes=3, waves=32, width=128, gated=False)
 # Where the worst state counts: waves at least, for an error that is small everywhere and not on average. And gelu leaves
 # fewer steep spots than tanh.

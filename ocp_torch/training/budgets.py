@@ -69,7 +69,7 @@ DENSITY_BATCH = 256
 SAMPLER, WORST_STATE_SAMPLER = "sobol", "uniform"
 # States at which a certificate computes the occupation density, and at most so many differences at them, `d + 1` for each:
 # with 64 coordinates 144 states took eight of a certificate's twelve minutes, with 16 a third of a minute and a half.
-OCCUPATION_STATES, OCCUPATION_DIFFERENCES = 144, 144 * 6
+OCCUPATION_STATES, OCCUPATION_DIFFERENCES = 144, 144 * 9
 # Steps between looks at most, and where one of them may end the run. A look with noise takes as long as 100 to 200 steps;
 # every 600 steps they were a third of the training of a pendulum.
 LOOKS_APART, TARGET_APART = 1200, 600

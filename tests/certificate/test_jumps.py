@@ -8,7 +8,9 @@ import torch
 from ocp_torch.certificate.checks.observed import largest_jump
 from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.problems import Circle, Problem
+from ocp_torch.runs.build import build_certificate_settings
 from support import zoo
+from support.small import small
 from support.switching import cost_of_switching
 
 
@@ -93,3 +95,17 @@ def test_jumps_are_found_with_their_size(name, dim):
 @pytest.mark.parametrize("name", REGULAR)
 def test_what_is_steep_or_bent_is_no_jump(name):
     assert largest_jump(REGULAR[name], 2).size == 0.0
+
+
+def test_jumps_are_looked_for_where_a_bound_needs_that_there_are_none():
+    trainer = small("method=dual")
+    jump = lambda steps: (
+        trainer.certify(
+            build_certificate_settings(small(f"certificate.stage.steps={steps}").config)
+        ).assumptions.largest_jump
+    )
+    assert trainer.evaluator.evaluate(trainer.run).assumptions.largest_jump is None
+    assert jump(0) is None
+    assert jump(5) == 0.0
+    both = small("method=pd")
+    assert both.evaluator.evaluate(both.run).assumptions.largest_jump == 0.0

@@ -1,4 +1,4 @@
-"""Gauss-Newton steps at the end of a round: where there are any, what takes them, and exact repetition."""
+"""Gauss-Newton steps early in training and at the end of a round: where there are any, what takes them, exact repetition."""
 
 import copy
 import math

@@ -27,7 +27,7 @@ LARGEST_GROWTH = 60.0
 # Evaluations of the closed loop at each state and time where there is noise, at first and from the highest, shared by the
 # paths and the `d + 1` differences on each; and paths at least. More show a density that is too large for M more surely.
 FEW_EVALUATIONS, EVALUATIONS, FEWEST_PATHS = 48, 192, 4
-# Of the states looked at, the highest are looked at again from close by: at one for so many of the states.
+# The highest of the states looked at are looked at again from close by, at one state for so many of all.
 TOP, NEARBY = 6, 3
 # Ascents to the suprema of the a-priori bound, which is shown beside the density itself and decides nothing.
 ASCENTS, ASCENT_STEPS = 16, 20
@@ -134,9 +134,8 @@ def estimated_sup_occupation(
     """The largest `mu^u` met: at the ends of trajectories, where mass accumulates, at uniform states, and then near the
     highest of them; ``together`` as in `backward_flow`. ``rounded``, the policy in single precision, takes its place where no
     differences are taken."""
-    even = is_even(problem, problem.control_matrix(end_states))
-    if rounded is not None and even and differentiable(problem, rounded):
-        policy = rounded
+    if rounded is not None and differentiable(problem, rounded):
+        policy = rounded if is_even(problem, problem.control_matrix(end_states)) else policy
     count = max(1, 2 * states // 3)
     picked = end_states[:: max(1, len(end_states) // count)][:count]
     generator = fixed_generator()
