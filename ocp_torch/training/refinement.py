@@ -59,13 +59,14 @@ def refine(trainer: "Trainer", monitor: Silent, checkpoint: Path | None, stop: C
     seed, early = derive_seed(trainer.seed, Branch.REFINEMENT, state.round, trainer.step), trainer.step < trainer.end
     how = trainer.constants.M, settings.newton_steps, seed, stopping
     monitor.refined(trainer, None)
-    found = trainer.ranks.from_first(lambda: refined_value(trainer.problem, trainer.averaged_fields, *how))
+    found, drawn = trainer.ranks.from_first(lambda: refined_value(trainer.problem, trainer.averaged_fields, *how))
     if found is not None and early and not found.solved:
         found = None
     kept = _values(trainer)
     if found is not None:
         _put(trainer, [found.weights for _ in kept])
     state.refined = trainer.ranks.from_first(lambda: not told)
+    state.samples += drawn if state.refined else 0
     state.elapsed += spent()
     every, another = settings.evaluate_every, state.round + 1 < settings.rounds
     if state.refined and not early and another and every and trainer.step % every == 0:
@@ -93,13 +94,14 @@ def _put(trainer: "Trainer", weights: list[dict]) -> None:
 
 def refined_value(
     problem: Problem, fields: Fields, M: float, steps: int, seed: int, stop: Callable[[], bool]
-) -> Found | None:
+) -> tuple[Found | None, int]:
     """What so many ``steps`` on the slack of the `V` of ``fields`` find, at evenly spread states of ``seed``; `None` where
-    they do not help, as beside kinks or with noise, or make `F_M` worse, and where told to ``stop``."""
+    they do not help, as beside kinks or with noise, or make `F_M` worse, and where told to ``stop``. And how many states
+    were drawn."""
     network = fields.value
     ours = isinstance(network, PeriodicMLP) and network.can_be_swept
     if not steps or problem.noisy or not problem.has_simulator or not ours:
-        return None
+        return None, 0
     states = SobolSampler(problem.dim, seed, torch.float64)
 
     def draw(count: int, also: Tensor | None = None) -> Samples:
@@ -112,8 +114,8 @@ def refined_value(
     worst = lambda own: worst_states(problem, own, states.draw(SOUGHT))
     found = refined(network, slack, draw, steps, ENOUGH * unit, stop, worst)
     if found is None or bound(problem, found.network, judged, M) < bound(problem, network, judged, M):
-        return None
-    return Found(found.network.state_dict(), found.residual <= SOLVED * unit)
+        return None, states.count
+    return Found(found.network.state_dict(), found.residual <= SOLVED * unit), states.count
 
 
 def worst_states(problem: Problem, value: Field, x: Tensor) -> tuple[Tensor, float]:

@@ -40,7 +40,7 @@ class TrainState:
     constants: Constants  # in force
     step: int = 0
     round: int = 0
-    samples: int = 0  # states drawn so far
+    samples: int = 0  # states drawn for steps so far
     seconds: float = 0.0  # spent in steps alone
     elapsed: float = 0.0  # with evaluations and checkpoints
     pending: bool = False  # a full certificate may reach the target gap, and is to be made

@@ -12,7 +12,15 @@ from ocp_torch.cli.launch import CHECKOUT
 from support.forked import TINY, train
 
 # What a short run has no use for, each with a tenth of a second of CPU or more to import.
-UNUSED = ("matplotlib", "scipy.stats", "sympy", "torch._dynamo", "torch.distributed.tensor", "gymnasium", "onnxruntime")
+UNUSED = (
+    "scipy.linalg",
+    "matplotlib",
+    "sympy",
+    "torch._dynamo",
+    "torch.distributed.tensor",
+    "gymnasium",
+    "onnxruntime",
+)
 
 
 def telling():

@@ -16,7 +16,7 @@ from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.studies.benchmark import measure
-from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender, RLContender, require_rl
+from ocp_torch.studies.benchmark.contenders import KernelContender, NetworkContender, Recorder, RLContender, require_rl
 from ocp_torch.studies.benchmark.contest import Contest
 from ocp_torch.studies.benchmark.families import Family, by_dimension, exponent, joined, seconds_until, titles
 from ocp_torch.studies.benchmark.measure import Curve, Judge, Point, due, median_and_spread, relative, tabulated
@@ -25,6 +25,7 @@ from ocp_torch.studies.paper import figures
 from ocp_torch.studies.paper.reproduce import check, report, reproduce
 from ocp_torch.studies.paper.runs import RECIPES, carry_out, circle, compare_with_exact
 from support import zoo
+from support.small import small as small_trainer
 
 TINY = (
     "trainer.steps=6",
@@ -276,6 +277,20 @@ def test_a_whole_contest_in_small(tmp_path, quick):
     assert curves[0].points[-1].numbers != curves[1].points[-1].numbers
     assert (tmp_path / "benchmark.png").stat().st_size > 1000
     assert (tmp_path / "benchmark.md").read_text().count("\n| ") == 3
+
+
+def test_a_curve_ends_with_what_the_gauss_newton_steps_made():
+    trainer, recorder = small_trainer("method=dual"), Recorder()
+    trainer.fit(recorder)
+    trainer.averaged_fields.value.head.weight.data.zero_()
+    trainer.state.samples += 1000
+    recorder.refined(trainer, None)
+    recorder.refined(trainer, False)
+    assert len({samples for samples, _, _ in recorder.kept}) == len(recorder.kept)
+    assert recorder.kept[-1][0] == trainer.samples - 1000
+    recorder.refined(trainer, True)
+    assert recorder.kept[-1][0] == trainer.samples
+    assert not recorder.kept[-1][2].value.head.weight.any()
 
 
 def test_a_problem_with_drift_loses_the_kernel_primal_alone():

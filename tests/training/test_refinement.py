@@ -199,6 +199,7 @@ def test_training_ends_once_the_equation_is_solved(solved, tmp_path):
     trainer = agreeing(small(*EARLY), True)
     assert trainer.fit(Silent(), tmp_path / "last.pt") == SOLVED
     assert trainer.step == 7
+    assert trainer.samples == 7 * trainer.settings.batch + refinement.JUDGED + 4
     assert not trainer.averaged_fields.value.head.weight.any()
     assert not trainer.fields.value.head.weight.any()
     assert "solve the Hamilton-Jacobi-Bellman equation" in trainer.why_stopped

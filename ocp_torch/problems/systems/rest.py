@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 
 import torch
-from scipy.linalg import solve_continuous_are
 from torch import Tensor
 
 from ocp_torch.problems.physical.system import System
@@ -16,6 +15,8 @@ ROUNDING = 1e-9
 def riccati(A: Tensor, B: Tensor, Q: Tensor, rho: float = 0.0) -> Tensor:
     r"""The stabilising `P` ``(d, d)`` of `F'P + PF - PBB'P + Q = 0`, `F = A - rho/2`: from `x` the least of
     `int e^{-rho t} (x'Qx + |u|^2) / 2 dt` is `x'Px / 2`, by `u = -B'Px`. ``A`` and ``Q`` are ``(d, d)``, ``B`` ``(d, m)``."""
+    from scipy.linalg import solve_continuous_are  # takes a while to import, and few problems need it
+
     F = A - 0.5 * rho * torch.eye(len(A), dtype=A.dtype)
     P = solve_continuous_are(F.numpy(), B.numpy(), Q.numpy(), torch.eye(B.shape[1]).numpy())
     return torch.from_numpy(P).to(A)

@@ -93,8 +93,14 @@ class Recorder(Silent):
         self.started = time.process_time()
 
     def stepped(self, trainer, report, log: bool) -> None:
-        if trainer.samples < self.next and trainer.step != trainer.end:
-            return
+        if trainer.samples >= self.next or trainer.step == trainer.end:
+            self._keep(trainer)
+
+    def refined(self, trainer, helped: bool | None) -> None:
+        if helped:
+            self._keep(trainer)
+
+    def _keep(self, trainer) -> None:
         now = time.process_time()
         self.kept.append((trainer.samples, now - self.started, copy.deepcopy(trainer.averaged_fields)))
         while self.next <= trainer.samples:
