@@ -117,17 +117,17 @@ def test_the_stage_takes_another_round_only_while_the_residual_costs_too_much(mo
     assert not torch.equal(weights(fit(good_excess=1e-12)), once)
 
 
-@pytest.mark.parametrize(("rounds", "steps"), [(1, 30), (2, 60), (3, 180)])
-def test_a_short_round_is_left_out_where_the_slack_is_so_large_that_others_will_follow(rounds, steps, monkeypatch):
+@pytest.mark.parametrize(("rounds", "good", "steps"), [(1, 1e-12, 30), (2, 1e-12, 60), (3, 1e-12, 120), (3, 1e12, 100)])
+def test_where_the_slack_is_steep_one_long_round_is_made_until_the_excess_is_good(rounds, good, steps, monkeypatch):
     problem, made = zoo.build("manufactured 2-d q=2"), []
     network = partial(PeriodicMLP, modes=1, width=16, depth=2)
     fields = Fields({"value": network(problem.dim)})
-    settings = StageSettings(steps=30, rounds=rounds, batch=16, good_excess=1e-12)
+    settings = StageSettings(steps=30, rounds=rounds, batch=16, good_excess=good)
     counted = policy_evaluation.advance
-    monkeypatch.setattr(policy_evaluation, "advance", lambda *a: made.append(0) or counted(*a))
+    monkeypatch.setattr(policy_evaluation, "advance", lambda *a: made.append(len(a[2](a[3]))) or counted(*a))
     policy = ValuePolicy(problem, problem.exact_value)
     fit_closed_loop(problem, policy, fields, network, resolve_constants(problem), settings, seed=0)
-    assert len(made) == steps
+    assert made == [32] * steps
 
 
 @pytest.mark.parametrize("solved", [False, True])
