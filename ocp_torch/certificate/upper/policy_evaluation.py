@@ -27,10 +27,10 @@ from ocp_torch.steppers.fitting import LARGEST_RATE
 
 # The closed loop's data are computed once on so many states at most: their divergences cost more than a step.
 POOL = 2**15
-# Where the slack is more than that part of `|E[V mu0]|`, as beside kinks (1.1 on the circle), only the last and longest round is
-# made, on batches so many times as large, which ends as soon as the excess is good: of a torus in two dimensions the Lagrangian
-# bound was .04 % above its optimum after 800 steps of 512 states, .06 % after rounds of 400 and 800 of 256 that took longer; in
-# three .08 and .12 %.
+# Where the slack is more than that part of `|E[V mu0]|`, as beside kinks (1.1 on the circle), only the last and longest round
+# is made, on batches so many times as large, and ends as soon as the excess is good: of a torus in two dimensions the
+# Lagrangian bound was .04 % above the optimum after 800 steps of 512 states, .06 % after rounds of 400 and 800 of 256 that took
+# longer; in three .08 and .12 %.
 STEEP, LARGER = 0.1, 2
 # Beyond that ratio of the two suprema of the slack the residual is not weighed any more lopsidedly.
 MOST_LOPSIDED = 16.0
@@ -39,7 +39,7 @@ MOST_LOPSIDED = 16.0
 # steps `mu` has less mass than this.
 LOOKED_AT, LEAST_MASS, SLOWER, SLOWEST = 40, 0.01, 0.3, 1e-3
 # States at which the excess is computed after a round: what decides on a next one need not be exact. It is also looked at
-# after each so many steps of the first one that is made. That ends, where the slack is not steep, only once the excess is that
+# after each so many steps of the first one that is made. Where the slack is not steep that ends only once the excess is that
 # part of what is good enough: where `V` solves its equation to 1e-5, any `mu` will do.
 EXCESS_STATES, EXCESS_EVERY, EXCELLENT = 4096, 100, 0.02
 
