@@ -32,8 +32,8 @@ class Budget:
 # at 5e-3 does not (.05). In two a second round starts at .3 %: a noisy pendulum had .53 % after one, .28 % after two. In
 # eight one run of twelve at 1e-2 lost what it had learnt once hardly a slack was above 0 and gradients were small: F_M ended
 # .044 % below OPT, at 5e-3 .0014 %. Where nothing is lost 5e-3 costs little: .0013 for .0009, .0014 for .0008 %.
-# On a torus in two dimensions F_M ends .047, .025 and .019 % below OPT with batches of 256, 512 and 1,024, which take 7, 9 and
-# 12 ms a step; on the circle only the number of steps counts.
+# On a torus in two dimensions F_M ends .047, .025 and .019 % below OPT with batches of 256, 512 and 1,024, steps of 7, 9 and
+# 12 ms; on the circle only the number of steps counts.
 # Gauss-Newton steps on V end a round, and are tried just after waves of V were sought for the first time or the second: where
 # V is smooth they then find it to 1e-5 of the cost (seed 3202: 1-d 7 steps, 2-d 10, 8-d 17, 16-d 18, 32-d 17; 2-d after 100
 # steps 18; in 64-d, after 100, slacks of 1 are left at a few states), and beside kinks one or a dozen show that it is not.

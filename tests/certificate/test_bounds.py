@@ -87,6 +87,7 @@ def row(found, words: str) -> str:
     return next(line for line in table(found.to_dict()).splitlines() if words in line)
 
 
+@pytest.mark.nightly
 def test_a_lower_bound_that_is_listed_is_shown_saved_and_used(listed):
     plain = certificate()
     listed(Toy(LOWER, 0.9999))

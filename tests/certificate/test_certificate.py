@@ -141,6 +141,7 @@ def test_another_round_twice_as_long_starts_only_while_the_gap_is_not_good():
     assert (longer.step, longer.state.round) == (24, 1)
 
 
+@pytest.mark.nightly
 def test_a_run_in_its_second_round_resumes_bitwise(tmp_path):
     overrides = ("trainer.rounds=2", "trainer.good_gap=1e-9", "trainer.checkpoint_every=13")
     whole = rounds_of(*overrides)

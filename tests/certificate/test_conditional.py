@@ -86,6 +86,7 @@ def certificate_of(values: torch.Tensor):
     return certify_fields(problem, trained, resolve_constants(problem), SETTINGS, Run("circle", "dual"))
 
 
+@pytest.mark.nightly
 def test_the_density_of_the_controller_gives_a_conditional_bound_near_the_optimum(solved):
     V, *_ = solved
     wave = (2.0 * torch.pi * 3.0 * torch.arange(NODES, dtype=torch.float64) / NODES).cos()
@@ -104,6 +105,7 @@ def test_the_density_of_the_controller_gives_a_conditional_bound_near_the_optimu
     assert found.hold
 
 
+@pytest.mark.nightly
 def test_a_density_that_is_far_too_small_enters_nothing_that_counts(solved, monkeypatch):
     """`E[Z mu0] = E[q mu*]`: with `q` where `mu*` is above an `M` that is too small, `V* + t Z` has its `F_M` above `OPT`."""
     V, mu, inverse = solved

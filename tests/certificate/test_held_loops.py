@@ -94,6 +94,7 @@ class Stream(Problem):
         return 1.0 + (2.0 * math.pi * x[:, 0]).cos()
 
 
+@pytest.mark.nightly
 def test_steps_within_a_hold_are_halved_where_they_are_too_long():
     problem = Stream(dim=1, discount=2.0)
     policies = [Held(problem, 0.2, lambda x: (2.0 * math.pi * x).cos(), substeps) for substeps in (1, 16)]

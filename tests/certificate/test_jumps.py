@@ -97,6 +97,7 @@ def test_what_is_steep_or_bent_is_no_jump(name):
     assert largest_jump(REGULAR[name], 2).size == 0.0
 
 
+@pytest.mark.nightly
 def test_jumps_are_looked_for_where_a_bound_needs_that_there_are_none():
     trainer = small("method=dual")
     jump = lambda steps: (

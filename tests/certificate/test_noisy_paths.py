@@ -66,6 +66,7 @@ def test_paths_spread_as_their_noise_says_and_differently_in_each_piece(nu):
     assert abs(float(torch.corrcoef(torch.stack([end[:, 0] for end in ends]))[0, 1])) < 0.08
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("any_variate")
 def test_what_is_simulated_beside_a_control_variate_has_its_curvature():
     """With `V* + s mu*` the curvature is `s E[mu* D : hess mu*] / rho` of the answer, far more than simulation is off."""

@@ -15,7 +15,13 @@ from support.systems import Conveyor, Swing
 SETTINGS = CertificateSettings(trajectories=64, replicates=8)
 
 
-@pytest.mark.parametrize(("speed", "start"), [(1.0, (0.0, 1.0)), (-2.0, (-0.9, 2.0)), (1.0, (2.8, 2.9))])
+@pytest.mark.parametrize(
+    ("speed", "start"),
+    [
+        (1.0, (0.0, 1.0)),
+        *(pytest.param(*p, marks=pytest.mark.nightly) for p in ((-2.0, (-0.9, 2.0)), (1.0, (2.8, 2.9)))),
+    ],
+)
 def test_on_a_conveyor_it_is_the_discount_at_the_time_of_leaving(speed, start):
     """`s' = speed` leaves at `t = (end - s) / speed` and never comes back: the part is `E[e^{-rho t}]`."""
     system = Conveyor(speed=speed, start={"place": start})

@@ -224,7 +224,7 @@ def low_problem(name: str):
 
 
 @pytest.mark.parametrize("name", [*LOW, *ODD])
-@pytest.mark.parametrize("level", [1, 8])
+@pytest.mark.parametrize("level", [1, pytest.param(8, marks=pytest.mark.nightly)])
 def test_the_data_lie_in_their_enclosures(name, level):
     problem = low_problem(name)
     for degree in (1, 4):
@@ -404,6 +404,7 @@ def test_what_is_not_overridden_needs_no_lipschitz_constant():
     assert "lipschitz" in obstacle(problem, V)
 
 
+@pytest.mark.nightly
 def test_the_proof_is_loaded_only_where_one_is_asked_for():
     script = "import sys, ocp_torch; assert not [m for m in sys.modules if m.startswith('ocp_torch.certificate.proof')]"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

@@ -155,6 +155,7 @@ def test_any_control_variate_gives_the_performance_with_noise(problem, horizon):
     assert missed <= 2
 
 
+@pytest.mark.nightly
 @zoo.on(zoo.QUIET[:2])
 def test_what_the_truncation_leaves_out_is_within_the_bias(problem):
     """From the very starts the exact controller costs what `V*` says; steps so fine that only the tail is missing."""

@@ -56,6 +56,7 @@ def finished(tmp_path_factory):
     return folder
 
 
+@pytest.mark.nightly
 def test_a_resume_reads_its_checkpoint_once(finished, tmp_path):
     assert counted(f"resume={finished}", cwd=tmp_path) == {"composed": 1, "built": 1, "read": 1}
     run = shutil.copytree(finished, tmp_path / "run")

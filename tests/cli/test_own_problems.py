@@ -55,7 +55,7 @@ NEEDS = {
 
 
 @pytest.mark.parametrize("script", NEEDS)
-@pytest.mark.parametrize("mark", ["", "+", "++"])
+@pytest.mark.parametrize("mark", ["", *(pytest.param(m, marks=pytest.mark.nightly) for m in ("+", "++"))])
 def test_in_every_script_it_starts_from_its_own_defaults(script, mark, module):
     target = f"{module[1]}.Pendula"
     for more, own in (((), {}), (("+problem.coupling=0.2", "problem.discount=2"), {"coupling": 0.2, "discount": 2})):

@@ -74,6 +74,7 @@ def test_a_run_is_that_of_the_script_to_the_bit(here, script):
     assert differences(weights(here), dict(scripted)) == []
 
 
+@pytest.mark.nightly
 def test_without_a_folder_and_of_an_object_it_is_the_same_again(here):
     for _ in range(2):
         again = train(Circle(), seed=4, settings=SETTINGS, callback=lambda moment: torch.rand(3).sort())
@@ -107,6 +108,7 @@ def test_the_process_is_left_as_it_was_within_an_application_of_hydra_too():
         assert GlobalHydra.instance().hydra is mine
 
 
+@pytest.mark.nightly
 def test_a_callback_hears_of_steps_and_looks_as_the_history_keeps_them():
     heard = []
     looking = SHORT | {"trainer.evaluate_every": 5}

@@ -110,6 +110,7 @@ def through_c(folder, name, wanted, states, precision=None, speed="-O1"):
     return got, json.loads(metadata)
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no C compiler here")
 @EACH
 def test_c(variant, tmp_path):
@@ -213,6 +214,7 @@ class Numbers(Cart):
         return a, B * torch.from_numpy(1.5 + np.sin(s.detach().numpy()[:, :1, None]))
 
 
+@pytest.mark.nightly
 def test_what_cannot_be_exported_is_told_in_a_sentence(tmp_path):
     controller = controllers("dual")[0]
     for arguments, reason in [

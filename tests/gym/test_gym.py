@@ -51,7 +51,9 @@ def test_a_state_is_drawn_as_clocks():
 SIMULABLE = sorted(name for name, c in PROBLEMS.items() if c.has_simulator)
 
 
-@pytest.mark.parametrize("name", SIMULABLE)
+@pytest.mark.parametrize(
+    "name", [n if k % 4 == 0 else pytest.param(n, marks=pytest.mark.nightly) for k, n in enumerate(SIMULABLE)]
+)
 def test_every_problem_is_an_environment_that_passes_the_checker(gymnasium, name):
     from gymnasium.utils.env_checker import check_env
 
@@ -134,6 +136,7 @@ def asked(run, **changes):
     return RolloutJob({"run": str(run), "problem": {}, "episodes": 8, "seed": 0, "video": None, **changes})
 
 
+@pytest.mark.nightly
 def test_a_controller_acts_in_an_environment_of_ours(gymnasium, run, tmp_path):
     video = tmp_path / "out.gif"
     found = asked(run, env="ocp_torch/Circle-v0", video=str(video)).run()

@@ -73,7 +73,7 @@ def test_the_formula_is_that_of_the_circle():
     assert float((reference.value - torus_value(tight, reference.solution.grid.nodes())).abs().max()) < 1e-4
 
 
-@pytest.mark.parametrize(("shear", "limit"), [("none", BOTH), ("chain", ONE)])
+@pytest.mark.parametrize(("shear", "limit"), [("none", BOTH), pytest.param("chain", ONE, marks=pytest.mark.nightly)])
 def test_the_optima_on_the_grid_add_up(shear, limit):
     problem = Torus(shear=shear, control_limit=limit)
     reference = solve_reference(problem, side=48)
@@ -88,6 +88,7 @@ def test_the_optima_on_the_grid_add_up(shear, limit):
     assert around.optimum - around.error <= torus_optimum(problem) <= inside.optimum + inside.error
 
 
+@pytest.mark.nightly
 @settings(max_examples=6)
 @given(
     limit=st.sampled_from([BOTH, ONE, [0.01, 0.02]]),

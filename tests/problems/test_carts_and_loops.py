@@ -244,6 +244,7 @@ def test_the_density_has_no_bound_where_the_flow_contracts_faster_than_the_disco
     assert math.isfinite(DoubleIntegrator(position_weight=weight, starts=[0.4, 0.2]).occupation_bound) == bounded
 
 
+@pytest.mark.nightly
 def test_the_grid_knows_nothing_of_riccati_and_finds_the_same_optimum():
     """In the box, with its cut-off and its failures."""
     system = DoubleIntegrator()

@@ -37,6 +37,7 @@ def test_the_goal_ends_motion_and_cost_and_is_no_failure_but_the_sides_are():
     assert CAR.outside(x).tolist() == [False, False, True, True, False]
 
 
+@pytest.mark.nightly
 def test_the_classical_car_arrives_from_the_valley_and_one_without_force_stays():
     start = on_torus(*[[p, 0.001] for p in (-0.6, -0.5, -0.4)])
     path = simulate(CAR, classical_policy(CAR), start, 400.0, 800)

@@ -353,6 +353,7 @@ def test_the_lower_bound_at_the_exact_value_covers_the_optimum_as_often_as_it_sa
     assert 51 <= hits <= 60  # outside with probability below 1e-3 for a binomial of 0.95
 
 
+@pytest.mark.nightly
 @settings(max_examples=5)
 @given(seed=st.integers(0, 10**6), size=st.sampled_from([0.03, 0.3, 1.0]))
 def test_no_value_gives_bounds_that_contradict_the_optimum(datasets, seed, size):

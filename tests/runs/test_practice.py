@@ -65,6 +65,7 @@ def test_the_classical_controller_does_what_no_control_does_not(request, problem
     assert metrics_table(found).count("\n") == 4
 
 
+@pytest.mark.nightly
 def test_numbers_repeat_with_a_seed_and_change_with_another():
     arm = zoo.build("arm n=2")
     found = [metrics(arm, zero_policy(arm), seed=seed, starts=16) for seed in (3, 3, 4)]

@@ -71,7 +71,7 @@ def fitted(problem):
     return made
 
 
-@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.nightly)])
 def test_a_smooth_solution_is_found_to_many_digits(seed):
     problem = Manufactured(dim=1, seed=seed)
     start, draw = fitted(problem), draw_of(problem)
@@ -158,6 +158,7 @@ def test_steps_on_worst_states_that_give_no_number_or_are_told_to_stop_leave_all
     assert refined(start, slack_of(problem), draw, 4, worst=worst) is None
 
 
+@pytest.mark.nightly
 def test_steps_on_worst_states_that_spoil_the_rest_are_taken_back(monkeypatch):
     problem = Manufactured(dim=1)
     start, step = fitted(problem), GaussNewton.step

@@ -48,7 +48,7 @@ TINY = (
 @pytest.fixture
 def quick(monkeypatch):
     """Few states and trajectories for each measurement."""
-    for name, count in dict(POINTS=128, TRAJECTORIES=16, ON_THE_CIRCLE=16, TABLE=2**10, TOLERANCE=1e-2).items():
+    for name, count in dict(POINTS=128, TRAJECTORIES=16, ALONE=16, TABLE=2**10, TOLERANCE=1e-2).items():
         monkeypatch.setattr(measure, name, count)
 
 
@@ -64,6 +64,7 @@ def learned(problem, seed=0) -> Fields:
     return fields.requires_grad_(False)
 
 
+@pytest.mark.nightly
 def test_the_judge_agrees_with_quadrature_on_a_dense_grid():
     problem, constants = circle()
     fields, n = learned(problem), 200_000
@@ -244,6 +245,7 @@ def test_certified_gaps_are_held_against_the_paper_s_primal_dual():
     assert "nan" not in contest_table([curve("a", 0, [1.1], 0.004), curve("b", 0, [1.1])], 1.0)
 
 
+@pytest.mark.nightly
 def test_a_kernel_method_without_a_time_of_its_own_gets_that_of_the_longest_run_before_it(tmp_path, monkeypatch):
     given = []
 

@@ -88,6 +88,7 @@ def asked(path, **changes):
     } | changes
 
 
+@pytest.mark.nightly
 def test_the_comparison_of_a_run(tmp_path, caplog):
     file = tmp_path / "controller.safetensors"
     controllers("dual")[0].save(file)

@@ -203,6 +203,7 @@ def test_a_space_without_second_derivatives_is_refused():
             Iteration(problem, "dual", constants_of(problem), (0,), **form)
 
 
+@pytest.mark.nightly
 def test_the_dual_approaches_the_optimum_of_the_grid():
     """Three quarters of the gap are gone from 1,000 steps to 16,000; always from below."""
     problem, constants = circle(1e-2)

@@ -52,7 +52,8 @@ def test_the_fixed_point_is_that_of_plain_value_iteration():
 LIMITED = dict(dim=2, control_dim=1, control_limit=0.6, discount=1.5, seed=3)
 
 
-@pytest.mark.parametrize("noise", [pytest.param(0.0, marks=pytest.mark.nightly), 0.01])
+@pytest.mark.nightly
+@pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_it_is_near_the_exact_value_where_that_is_known(noise):
     problem = PROBLEMS["manufactured"](**LIMITED, noise=noise)
     assert GridValues.suits(problem)
@@ -77,6 +78,7 @@ def test_it_is_for_two_coordinates_and_one_limited_control():
     assert not GridValues.suits(fresh("circle rho=2"))
 
 
+@pytest.mark.nightly
 def test_states_are_counted_once():
     source = GridValues(PROBLEMS["manufactured"](**LIMITED), Pace(0.02, 1), torch.zeros(1))
     found = source.targets(lambda x: x)

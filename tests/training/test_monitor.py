@@ -105,11 +105,12 @@ def test_the_liouville_residual_is_that_of_finite_differences(way):
     assert float(got) == pytest.approx(float(wanted.mean()), rel=1e-4)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("override", "why"),
     [
         ("trainer.steps=8", "all 8 steps are done"),
-        pytest.param("trainer.max_seconds=1e-9", "trainer.max_seconds", marks=pytest.mark.nightly),
+        ("trainer.max_seconds=1e-9", "trainer.max_seconds"),
     ],
     ids=["steps", "seconds"],
 )

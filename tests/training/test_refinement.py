@@ -71,6 +71,7 @@ def test_both_the_average_and_the_next_round_take_them(halved):
     assert trainer.step == 60
 
 
+@pytest.mark.nightly
 def test_a_run_goes_on_to_the_same_bits_from_anywhere(halved, tmp_path):
     class Saving(Silent):
         def stepped(self, trainer, report, log):
@@ -97,7 +98,14 @@ def test_those_that_make_the_bound_worse_are_not_taken(halved, monkeypatch):
     assert torch.equal(weights(trainer.averaged_fields), weights(plain.averaged_fields))
 
 
-@pytest.mark.parametrize("how", ["a signal", "asked to stop", "late"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        "a signal",
+        pytest.param("asked to stop", marks=pytest.mark.nightly),
+        pytest.param("late", marks=pytest.mark.nightly),
+    ],
+)
 def test_what_ends_them_ends_them_soon_and_they_are_made_anew(halved, how, tmp_path):
     _, stopping = halved
     whole = small(*LITTLE)
@@ -148,7 +156,7 @@ def test_a_checkpoint_from_before_there_were_any_goes_on(tmp_path):
     [
         (("problem=manufactured",), True),
         (("problem=manufactured", "method=pd"), True),
-        (("problem=manufactured", "problem.dim=4"), True),
+        pytest.param(("problem=manufactured", "problem.dim=4"), True, marks=pytest.mark.nightly),
         (("problem=manufactured", "problem.dim=6"), True),
         (("problem=manufactured", "problem.noise=0.1"), False),
         (("problem=manufactured", "optimizer=sgd"), False),

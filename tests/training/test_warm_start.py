@@ -105,6 +105,7 @@ NOISY = pytest.param(
 ON_A_GRID = pytest.param((*SWING, "method=dual", "warm_start.rounds=42"), marks=pytest.mark.nightly)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("way", [PLAIN, NOISY, ON_A_GRID])
 def test_a_run_that_is_killed_in_its_warm_start_goes_on_to_the_same_bits(way, tmp_path):
     way = (*WARM, *way, "trainer.steps=3")
@@ -199,6 +200,7 @@ def test_no_bound_with_a_divergence_speaks_of_a_controller_that_holds_its_contro
         assert bound is None or not bound["counts"], name
 
 
+@pytest.mark.nightly
 def test_auto_stays_out_where_mass_cannot_gather_and_changes_no_bit_there():
     runs = [small(f"warm_start.mode={mode}") for mode in ("off", "auto")]
     before = copy.deepcopy(configured(*SMALL))

@@ -29,8 +29,8 @@ from ocp_torch.steppers.fitting import LARGEST_RATE
 POOL = 2**15
 # Where the slack is more than that part of `|E[V mu0]|`, as beside kinks (1.1 on the circle), only the last and longest round
 # is made, on batches so many times as large, and ends as soon as the excess is good: of a torus in two dimensions the
-# Lagrangian bound was .04 % above the optimum after 800 steps of 512 states, .06 % after rounds of 400 and 800 of 256 that took
-# longer; in three .08 and .12 %.
+# Lagrangian bound was .04 % above the optimum after 800 steps of 512 states, .06 % after rounds of 400 and 800 of 256, which
+# took longer; in three .08 and .12 %.
 STEEP, LARGER = 0.1, 2
 # Beyond that ratio of the two suprema of the slack the residual is not weighed any more lopsidedly.
 MOST_LOPSIDED = 16.0
