@@ -176,7 +176,8 @@ def test_names_are_the_keys_of_the_schema_and_each_says_what_it_rests_on():
     assert list(bounds.on(LOWER)) == ["F_M", "shifted", "rigorous"]
     assert list(bounds.on(UPPER)) == ["J", "G", "lagrangian", "evaluation"]
     assert list(bounds.on(PERFORMANCE)) == ["evaluation", "lagrangian"]
-    needs = {name: [n.name for n in certificate().needs(name)] for side in (LOWER, UPPER) for name in bounds.on(side)}
+    made = certificate()
+    needs = {name: [n.name for n in made.needs(name)] for side in (LOWER, UPPER) for name in bounds.on(side)}
     assert needs == {
         "F_M": ["M"],
         "shifted": ["sup Q"],

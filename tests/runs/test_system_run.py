@@ -22,7 +22,7 @@ def run(tmp_path_factory):
     cheap = ("certificate.mollify=false", "certificate.occupation_states=0", "certificate.stage.steps=0")
     own = (
         "certificate.trajectories=32",
-        "certificate.tolerance=0.01",
+        "certificate.tolerance=0.1",
         "certificate.replicates=2",
         "warm_start.mode=off",
         "problem._target_=support.systems.Swing",
