@@ -12,7 +12,7 @@ from ocp_torch.maths.seeds import fixed_generator
 # shrinks them: an ascent that has come near a maximum goes on in smaller steps.
 FIRST_STEP, GROWTH, SHRINKAGE = 1e-2, 1.5, 0.4
 # Ascents whose steps are all below this, in turns, have arrived: in one dimension after 30 of 60 to 100 steps, in two after
-# 40 to 90. The maximum of a smooth function is then the same to 15 digits.
+# 40 to 90. The maximum is then the same to 15 digits where the function is smooth, to 9 or more for slacks beside kinks.
 ARRIVED = 1e-7
 # How often `minimiser` narrows its interval: (2/3)^30 of it is left.
 NARROWINGS = 30

@@ -99,10 +99,8 @@ class Stop(Silent):
 
 
 PLAIN = ("problem=circle", "method=dual")
-NOISY = pytest.param(
-    ("problem=cart_pole", "method=pd", "problem.noise=1e-3", "warm_start.rounds=24"), marks=pytest.mark.nightly
-)
-ON_A_GRID = pytest.param((*SWING, "method=dual", "warm_start.rounds=42"), marks=pytest.mark.nightly)
+NOISY = ("problem=cart_pole", "method=pd", "problem.noise=1e-3", "warm_start.rounds=24")
+ON_A_GRID = (*SWING, "method=dual", "warm_start.rounds=42")
 
 
 @pytest.mark.nightly

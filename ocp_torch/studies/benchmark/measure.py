@@ -28,7 +28,7 @@ from ocp_torch.problems.samples import Samples
 POINTS, TRAJECTORIES, REPLICATES, TOLERANCE = 2048, 256, 2, 2e-4
 ASCENTS = 8  # from the worst states, in search of a supremum: a quarter of what a certificate takes
 # In one dimension a policy is simulated from a table of so many states, with straight lines between them. There, and where no
-# V takes the noise of the starts off, it needs so many trajectories: from 256 SAC seemed .07 % better than the optimum.
+# V takes the noise of the starts off, it needs so many trajectories: from 256 SAC seemed .07 % better than a torus allows.
 TABLE, ALONE = 2**14, 2048
 # The keys of a `Judge` that are performances of controllers.
 PERFORMANCES = ("value", "density", "policy")

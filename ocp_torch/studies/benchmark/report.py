@@ -38,7 +38,8 @@ def contest_table(curves: list[Curve], exact: float | None) -> str:
     heads = ["contender", "samples", "seconds", *names, "Perf", "gap, certified", "times smaller"]
     heads += ["1 % on Perf after samples", "seconds"]
     lines = [
-        f"Per cent are relative to {what} = {optimum:.8g}; the gap is that of the full certificate at the end, relative "
+        f"Per cent are relative to {what} = {optimum:.8g}; bounds and Perf are means over few states, the same for all, "
+        "good to some .02 %; the gap is that of the full certificate at the end, relative "
         f"to the lower bound, and `times smaller` holds its median against that of {BASELINE}; where a certificate uses no "
         "upper bound (a controller that jumps), the gap between the columns stands in for it, marked *; seconds are CPU "
         "seconds of training, those of the certificate after the sign +.",
