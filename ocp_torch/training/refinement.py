@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.lower.shifted import slack_function
+from ocp_torch.certificate.lower.slack import slack_peaks
 from ocp_torch.certificate.trained import in_float64
 from ocp_torch.fields import Fields, PeriodicMLP
-from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import SobolSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
-from ocp_torch.maths.supremum import batched, climb
 from ocp_torch.problems import Problem
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
@@ -111,24 +109,11 @@ def refined_value(
     slack = lambda samples, V: Generator.of(problem, samples).hjb_slack(V)
     judged = draw(JUDGED)
     unit = float(judged.mean(judged.f))
-    worst = lambda own: worst_states(problem, own, states.draw(SOUGHT))
+    worst = lambda own: slack_peaks(problem, own, states.draw(SOUGHT), PEAKS, CLIMBED)
     found = refined(network, slack, draw, steps, ENOUGH * unit, stop, worst)
     if found is None or bound(problem, found.network, judged, M) < bound(problem, network, judged, M):
         return None, states.count
     return Found(found.network.state_dict(), found.residual <= SOLVED * unit), states.count
-
-
-def worst_states(problem: Problem, value: Field, x: Tensor) -> tuple[Tensor, float]:
-    """Where ascents from the states ``x`` ``(N, d)`` with the largest and the smallest slack of ``value`` end, ``(K, d)``,
-    and the largest slack there, whatever its sign."""
-    slack = slack_function(problem, value)
-    met, ends, largest = batched(slack, x), [], 0.0
-    for function, found in ((slack, met), (lambda at: -slack(at), -met)):
-        start, index = found.topk(PEAKS)
-        at, reached = climb(function, x[index], start, CLIMBED)
-        ends.append(at.remainder(1.0))
-        largest = max(largest, float(reached.max()))
-    return torch.cat(ends), largest
 
 
 def bound(problem: Problem, network: torch.nn.Module, samples: Samples, M: float) -> float:

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp_torch.certificate import CertificateSettings, Run, Trained, certify_fields, table
-from ocp_torch.certificate.lower.shifted import slack_function
+from ocp_torch.certificate.lower.slack import slack_function
 from ocp_torch.certificate.proof.activated import activate
 from ocp_torch.certificate.proof.activations import SERIES
 from ocp_torch.certificate.proof.cover import cell_models

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp_torch.certificate import Run, Trained, certify_fields
-from ocp_torch.certificate.lower.shifted import slack_function
+from ocp_torch.certificate.lower.slack import slack_function
 from ocp_torch.certificate.proof.cover import cell_models
 from ocp_torch.certificate.proof.enclosures import Enclosure, constant_noise, enclosure
 from ocp_torch.certificate.proof.models import Box

@@ -15,7 +15,8 @@ from ocp_torch.certificate import Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lower.mollified import DIRECTIONS, EVALUATIONS, Mollified
 from ocp_torch.certificate.lower.sampled import SampledValue, to_gain
-from ocp_torch.certificate.lower.shifted import TOP, SlackParts, climbed, scaled_by, slack_function
+from ocp_torch.certificate.lower.shifted import climbed, scaled_by
+from ocp_torch.certificate.lower.slack import TOP, SlackParts, slack_function
 from ocp_torch.certificate.lower.tightened import tightened
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.fields import Fields, PeriodicMLP

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.lower.shifted import SlackParts, slack_function
+from ocp_torch.certificate.lower.slack import SlackParts, slack_function
 from ocp_torch.certificate.proof.cover import cell_models
 from ocp_torch.certificate.proof.models import Box
 from ocp_torch.errors import InputError

@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from ocp_torch.certificate.lower.shifted import TOP, SlackParts
+from ocp_torch.certificate.lower.slack import TOP, SlackParts
 from ocp_torch.maths.quantiles import upper_quantile
 from ocp_torch.maths.supremum import minimiser
 

@@ -12,7 +12,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.lower.shifted import Shift, SlackParts
+from ocp_torch.certificate.lower.shifted import Shift
+from ocp_torch.certificate.lower.slack import SlackParts
 from ocp_torch.maths.jets import Field, Jet, jet
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.samples import Samples

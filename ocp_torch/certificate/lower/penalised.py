@@ -17,7 +17,8 @@ from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.lower.levels import best_level
 from ocp_torch.certificate.lower.sampled import SampledValue
-from ocp_torch.certificate.lower.shifted import Shift, SlackParts
+from ocp_torch.certificate.lower.shifted import Shift
+from ocp_torch.certificate.lower.slack import SlackParts
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.needs import Need
 from ocp_torch.problems.samples import Samples

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from ocp_torch.certificate.lower.levels import best_level
 from ocp_torch.certificate.lower.mollified import mollified_shift
-from ocp_torch.certificate.lower.shifted import Shift, SlackParts
+from ocp_torch.certificate.lower.shifted import Shift
+from ocp_torch.certificate.lower.slack import SlackParts
 from ocp_torch.certificate.lower.tightened import ROUNDS, tightened
 from ocp_torch.maths.ahead import Ahead
 from ocp_torch.maths.jets import Field

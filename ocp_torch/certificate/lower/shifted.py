@@ -6,55 +6,23 @@ every state, so the bound is concave in `theta`: its maximum is found by a searc
 changes nothing.) Where `V` has large slack, at kinks for instance, a `theta` below 1 trades a little of `E[V mu0]` for it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
-
-import torch
-from torch import Tensor
 
 from ocp_torch.certificate.bound import LOWER, Bound, sentence_on
 from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
 from ocp_torch.certificate.estimate import Estimate, integrals
-from ocp_torch.maths.jets import Field, Jet, jet
-from ocp_torch.maths.supremum import Extremum, minimiser, supremum
-from ocp_torch.problems.control_cost import PowerCost
-from ocp_torch.problems.generator import Generator, hjb_slack
+from ocp_torch.certificate.lower.slack import TOP, Scaled, SlackParts, climbed_from, slack_function
+from ocp_torch.maths.jets import Field
+from ocp_torch.maths.supremum import Extremum, minimiser
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.needs import Need
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
 if TYPE_CHECKING:
     from ocp_torch.certificate.context import Context
-
-# The largest theta that is tried.
-TOP = 1.5
-
-
-@dataclass(frozen=True)
-class SlackParts:
-    """What the slack of every `theta V` at sampled states is made of."""
-
-    cost: PowerCost
-    x: Tensor  # (N, d)
-    initial: Tensor  # (N,) V mu0
-    value: Tensor  # (N,) V - L^0 V / rho
-    f: Tensor  # (N,)
-    push: Tensor  # (N, m) -B^T grad V / rho
-
-    @classmethod
-    def of(cls, generator: Generator, V: Jet) -> "SlackParts":
-        samples, value = generator.data, V.value - generator.transport(V)
-        return cls(generator.cost, samples.x, V.value * samples.mu0, value, samples.f, generator.push(V))
-
-    @staticmethod
-    def join(parts: "list[SlackParts]") -> "SlackParts":
-        names = ("x", "initial", "value", "f", "push")
-        return SlackParts(parts[0].cost, *(torch.cat([getattr(p, name) for p in parts]) for name in names))
-
-    def slack(self, theta: float) -> Tensor:
-        """`Q_{theta V}`, ``(N,)``."""
-        return hjb_slack(theta * self.value, self.f, None, self.cost.conjugate(theta * self.push))
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,37 +95,6 @@ class Shift:
         """What the slack is of."""
         averaged = f", averaged {self.radius:.2g} around," if self.radius else ""
         return f"sup Q of {self.theta:.4g} {self.name}{averaged}"
-
-
-@dataclass(frozen=True)
-class Scaled:
-    """`theta V`."""
-
-    value: Field
-    theta: float
-
-    def __call__(self, x: Tensor) -> Tensor:
-        return self.theta * self.value(x)
-
-    def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
-        return jet(self.value, x, sigma).map(lambda part: self.theta * part)
-
-
-def slack_function(problem: Problem, value: Field):
-    """`x -> Q(x)` for the whole torus, differentiable in `x` where the problem is."""
-
-    def slack(x: Tensor) -> Tensor:
-        generator = Generator.of(problem, Samples.live(problem, x))
-        return generator.hjb_slack(generator.jet(value))
-
-    return slack
-
-
-def climbed_from(function: Field, values: Tensor, states: Tensor, ascents: int) -> Extremum:
-    """The supremum of a ``function`` whose ``values`` ``(N,)`` at ``states`` are known: the largest of those, then local
-    ascents from the largest; an estimate from below."""
-    start = states[values.topk(min(ascents, len(values))).indices]
-    return replace(supremum(function, start, ascents=ascents), points=len(states))
 
 
 def climbed(problem: Problem, value: Field, parts: SlackParts, theta: float, ascents: int) -> Extremum:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.lower.shifted import slack_function
+from ocp_torch.certificate.lower.slack import slack_function
 from ocp_torch.certificate.proof.cover import Cover, degree
 from ocp_torch.certificate.proof.enclosures import EVALUATION, Enclosure, conjugate_model, enclosure
 from ocp_torch.certificate.proof.models import Box, equal_cells

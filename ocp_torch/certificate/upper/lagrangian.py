@@ -13,7 +13,8 @@ that, and what is said along trajectories holds in the mean over paths (Ito's fo
 3. By parts again `E[(f + R(u)) mu + V r] = E[V mu0 - mu Q_u]`: the same number with far less variance.
 4. `0 <= V^u <= C_V` with `C_V = sup V + eps_hi` gives `J = E[(f + R(u)) mu + C_V max(r, 0)]`, with `w = mu u`, for the
    smallest `C_V` that these facts prove for this very controller.
-5. All this holds for every multiple `s mu` too, with residual `mu0 - s (mu0 - r)`, and each bound is convex in `s`. Where
+5. All this holds for every multiple `theta V` too, and the best one is found with the fit (`Excess`).
+6. And for every multiple `s mu`, with residual `mu0 - s (mu0 - r)`, and each bound is convex in `s`. Where
    `Q_u` is deep on one side only, as at kinks, a little more mass (`s > 1`) makes the dear side of `r` rare. Each half
    of the sets is evaluated with the `s` that is best on the other half: the search does not flatter the bound.
 """
@@ -29,7 +30,7 @@ from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_searc
 from ocp_torch.certificate.checks.hidden import Hidden, hidden_divergence
 from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate, integral
-from ocp_torch.certificate.lower.shifted import climbed_from, slack_function
+from ocp_torch.certificate.lower.slack import Scaled, climbed_from, slack_function
 from ocp_torch.certificate.upper.multiples import Integrand, best_multiples, terms_on
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.supremum import Extremum, batched
@@ -57,6 +58,7 @@ class ClosedLoopBounds:
     contributions: list[list[Tensor]]  # of `lagrangian` and `J`, parts of each
     sup_occupation: float  # the largest `mu` met
     occupation: Field  # `mu` itself
+    multiple: float  # `theta`, where the value is `theta V`
 
 
 def closed_loop_bounds(
@@ -103,9 +105,10 @@ def closed_loop_bounds(
     pairs = (lagrangian, of_lagrangian), (J, of_J)
     contributions = [[v / (abs(estimate.value) or 1.0) for v in weighted] for estimate, weighted in pairs]
     lagrangian = replace(lagrangian, controller=controller)
+    multiple = value.theta if isinstance(value, Scaled) else 1.0
     densest = climbed_from(occupation, mu, states, ascents).value
     return ClosedLoopBounds(
-        lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions, densest, occupation
+        lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions, densest, occupation, multiple
     )
 
 
@@ -141,4 +144,7 @@ class LagrangianBelow(Lagrangian):
 
 def slack_searches(found: ClosedLoopBounds | None) -> list[str]:
     """How the two suprema of the slack behind ``found`` were found."""
-    return [] if found is None else [sentence_on("eps_hi", found.eps_hi), sentence_on("eps_lo", found.eps_lo)]
+    if found is None:
+        return []
+    named = lambda what: f"{what} of {found.multiple:.4g} V"
+    return [sentence_on(named("eps_hi"), found.eps_hi), sentence_on(named("eps_lo"), found.eps_lo)]

@@ -3,11 +3,11 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 
-from ocp_torch.certificate.estimate import integral
-from ocp_torch.certificate.upper.multiples import best_multiple, terms_on
+from ocp_torch.certificate.upper.excess import Excess
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.embedding import FourierEmbedding
@@ -19,7 +19,6 @@ from ocp_torch.objectives.objective import Phase
 from ocp_torch.objectives.policy_evaluation import PolicyEvaluation
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import Constants
-from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import advance, short_fit
@@ -63,6 +62,13 @@ class StageSettings:
         require_number("certificate.stage.lr", self.lr, above=0.0, at_most=LARGEST_RATE)
 
 
+class Evaluated(NamedTuple):
+    """``fields`` with what was fitted, and the ``multiple`` `theta` of `V` for which the Lagrangian bound is lowest."""
+
+    fields: Fields
+    multiple: float
+
+
 def fit_closed_loop(
     problem: Problem,
     policy: Policy,
@@ -72,8 +78,8 @@ def fit_closed_loop(
     settings: StageSettings,
     seed: int,
     pool: "Pool | Drawn | None" = None,
-) -> Fields:
-    """Fields with `log mu^u`, and with `V^u` where ``fields`` hold no `V`, of the closed loop of ``policy``.
+) -> Evaluated:
+    """`log mu^u`, and `V^u` where ``fields`` hold no `V`, of the closed loop of ``policy``.
 
     ``fields`` are the trained ones, ``policy`` one of theirs in their precision; their `log mu`, if any, is the start. With
     no ``fields`` the policy is somebody's own, in float64, and both `mu` and `V` are fitted in float32. ``pool``
@@ -90,37 +96,39 @@ def fit_closed_loop(
         fitted.log_occupation.load_state_dict(fields.log_occupation.state_dict())
     count = min(POOL, settings.steps * settings.batch)
     pool = pool or Pool(loop, derive_seed(seed, Branch.POLICY_EVALUATION, 1), like, count, double=fields is None)
-    hi, lo = (0.0, 0.0) if trained is None else relative_slack(loop, trained, pool.samples.take(slice(EXCESS_STATES)))
-    steep = max(hi, lo) > STEEP
+    judged = pool.samples.take(slice(EXCESS_STATES))
+    fixed = None if trained is None else Excess(loop, trained, judged, problem.has_simulator)
+    hi, lo = (0.0, 0.0) if fixed is None else fixed.suprema()
+    steep = fixed is not None and max(hi, lo) > STEEP * fixed.unit
     first, batch = (settings.rounds - 1, LARGER * settings.batch) if steep else (0, settings.batch)
     enough = settings.good_excess * (GOOD if steep else EXCELLENT)
     draw = lambda phase: pool.draw(batch)
     objective, phase = PolicyEvaluation(loop, trained is None, positive_weight(hi, lo)), Phase(constants)
     stepper, average = short_fit(fitted, objective, settings.lr, settings.steps * 2**first)
-    # Below 0 it is where another multiple of `mu` serves a `V` that is far off.
-    excess = lambda: abs(
-        relative_excess(
-            loop,
-            average.module.value if trained is None else trained,
-            average.module.log_occupation,
-            pool.samples.take(slice(EXCESS_STATES)),
-        )
-    )
+
+    def excess() -> tuple[float, float]:
+        """How large it is, below 0 where another multiple of `mu` serves a `V` that is far off, and the best `theta`."""
+        own = average.module
+        added, theta = (fixed or Excess(loop, own.value, judged)).of(own.log_occupation)
+        return abs(added), theta
+
     for k in range(first, settings.rounds):
         steps = settings.steps * 2**k
         pool.grow(min(POOL, steps * batch))
         for step in range(steps):
             advance(stepper, average, draw, phase)
-            early = k == first and (step + 1) % EXCESS_EVERY == 0
-            if early and excess() <= enough:
-                return average.module
+            if k == first and (step + 1) % EXCESS_EVERY == 0:
+                added, theta = excess()
+                if added <= enough:
+                    return Evaluated(average.module, theta)
             looked_at = k == first and step == LOOKED_AT and settings.lr > SLOWEST
-            if looked_at and vanished(fitted.log_occupation, pool.samples.take(slice(EXCESS_STATES))):
+            if looked_at and vanished(fitted.log_occupation, judged):
                 slower = replace(settings, lr=SLOWER * settings.lr)
                 return fit_closed_loop(problem, policy, fields, network, constants, slower, seed, pool)
-        if excess() <= settings.good_excess:
+        added, theta = excess()
+        if added <= settings.good_excess:
             break
-    return average.module
+    return Evaluated(average.module, theta)
 
 
 @torch.no_grad()
@@ -172,28 +180,7 @@ class Drawn:
         return self.samples.take(index.to(self.samples.x.device))
 
 
-@torch.no_grad()
-def relative_slack(loop: ClosedLoop, value: Field, samples: Samples) -> tuple[float, float]:
-    """`eps_hi` and `eps_lo` on ``samples``, relative to `|E[V mu0]|`."""
-    generator = Generator.of(loop, samples)
-    V = generator.jet(value)
-    slack, unit = generator.hjb_slack(V), abs(float(samples.mean(V.value * samples.mu0)))
-    largest = lambda side: float(side.max().clamp_min(0.0)) / max(unit, 1e-30)
-    return largest(-slack), largest(slack)
-
-
 def positive_weight(hi: float, lo: float) -> float:
     """What a positive residual should weigh where a negative one weighs 1: the root of `eps_hi / eps_lo`, within limits."""
     ratio = max(hi, 1e-30) / max(lo, 1e-30)
     return math.sqrt(min(max(ratio, 1.0 / MOST_LOPSIDED), MOST_LOPSIDED))
-
-
-@torch.no_grad()
-def relative_excess(loop: ClosedLoop, value: Field, log_occupation: Field, samples: Samples) -> float:
-    """What the residual costs the Lagrangian bound on ``samples``, relative to `|E[V mu0]|`: the bound's part above
-    `E[V mu0 - mu Q_u]`, for the best multiple of `mu`."""
-    terms, slack, *_ = terms_on(Generator.of(loop, samples), value, log_occupation)
-    hi, lo = float((-slack).max().clamp_min(0.0)), float(slack.max().clamp_min(0.0))
-    added = lambda t, scale: t.lagrangian(scale, hi, lo)
-    least = integral(samples, added(terms, best_multiple(terms, added)))
-    return (least + integral(samples, terms.spent)) / max(abs(integral(samples, terms.v * samples.mu0)), 1e-30)

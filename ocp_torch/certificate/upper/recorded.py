@@ -93,11 +93,12 @@ def fit_recorded(context: "RecordedContext", kind: str) -> RecordedFit:
     like = next(trained.fields.parameters())
     training = closed_loop_samples(problem.training.to(like), rough, cost)
     pool = Drawn(training, derive_seed(seed, Branch.POLICY_EVALUATION, 2))
-    fitted = in_float64(fit_closed_loop(problem, rough, trained.fields, trained.network, constants, stage, seed, pool))
+    found = fit_closed_loop(problem, rough, trained.fields, trained.network, constants, stage, seed, pool)
+    fitted = in_float64(found.fields)
     value = context.value if context.value is not None else fitted.value
     loops = [closed_loop_samples(samples, policy, cost) for samples in context.sets]
-    found = [terms_on(Generator(loop, rho, cost), value, fitted.log_occupation) for loop in loops]
-    terms, slacks, densities, fluxes = zip(*found, strict=True)
+    columns = [terms_on(Generator(loop, rho, cost), value, fitted.log_occupation) for loop in loops]
+    terms, slacks, densities, fluxes = zip(*columns, strict=True)
     seen = training.to(torch.zeros((), dtype=torch.float64))
     with torch.no_grad():
         generator = Generator(seen, rho, cost)
