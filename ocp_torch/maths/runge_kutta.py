@@ -22,6 +22,9 @@ SLOWEST = 0.8
 # The mean change, as a part of the tolerance for one trajectory or of the answer's standard error, at which nothing needs
 # to be refined; never more than the tolerance itself, as the standard error of a few trajectories means little.
 GOOD_PART = 0.1
+# Halving ends too where those that would be halved make less than that part of the mean change: one trajectory of 2,048 on
+# the circle was halved up to 480 steps, half of a simulation's time, and the error was 5.5e-7 for 5.8e-7.
+RELEVANT = 0.2
 # The trajectories looked at again, blindly, with steps at least so many times finer than at first.
 AUDITED, AUDIT_FACTOR = 64, 4
 
@@ -129,12 +132,12 @@ def refined(
     r"""Results and end states of all trajectories, and a bound on the error of the results' mean by ``weights`` ``(N,)``.
 
     While the mean change is above ``tolerance``, or a tenth of it and of the ``standard_error`` of the results, those that
-    still change by more than ``tolerance`` on halving the step are halved again, ``doublings`` times at most: those that
-    cross a jump or a kink of the controller, or slide along one. The error has three parts: the last change of each
-    trajectory; what its slow decay leaves to come (`r/(1-r)` of it, at ratio `r`: a jump makes the order 1, not 4); and,
-    because a trajectory may agree with itself by missing a feature twice, what a random few of all of them change on far
-    finer steps. Where ``integrate`` rounds these few are all integrated by ``audit``, which does not, on steps that are no
-    coarser.
+    still change by more than ``tolerance`` on halving the step are halved again, ``doublings`` times at most, and while they
+    make a part of the mean that matters: those that cross a jump or a kink of the controller, or slide along one. The error
+    has three parts: the last change of each trajectory; what its slow decay leaves to come (`r/(1-r)` of it, at ratio `r`: a
+    jump makes the order 1, not 4); and, because a trajectory may agree with itself by missing a feature twice, what a random
+    few of all of them change on far finer steps. Where ``integrate`` rounds these few are all integrated by ``audit``, which
+    does not, on steps that are no coarser.
     """
     everything = torch.arange(len(weights))
     coarse, _ = integrate(everything, steps // 2)
@@ -144,7 +147,9 @@ def refined(
     for _ in range(doublings):
         active = (change > tolerance).nonzero().squeeze(-1)
         good = min(tolerance, GOOD_PART * max(tolerance, standard_error(result)))
-        if not len(active) or float((weights * change * factor).mean()) <= good:
+        changed = weights * change * factor
+        mean = float(changed.mean())
+        if mean <= good or float(changed[active].sum()) <= RELEVANT * len(weights) * mean:
             break
         steps *= 2
         finer, end[active] = integrate(active, steps)

@@ -269,6 +269,22 @@ def test_a_standard_error_spares_halvings_and_hides_no_error(order):
     assert noisy_work < work if order == 1 else noisy_work <= work
 
 
+@pytest.mark.parametrize(("jump", "finest"), [(10.0, 16), (1000.0, 64)])
+def test_one_trajectory_that_hardly_counts_is_not_halved_any_more(jump, finest):
+    """The others change by nearly the tolerance; it changes by so many times that at each halving, less by a third each."""
+    tolerance, taken, count = 0.1, [], 1000
+
+    def integrate(rows, steps):
+        taken.append(steps)
+        size = torch.where(rows == 0, jump * (2.0 / 3.0) ** math.log2(steps), 0.8 / steps).double()
+        return 3.0 * tolerance * size, torch.zeros(len(rows), 1, dtype=torch.float64)
+
+    found = refined(integrate, torch.ones(count).double(), 4, tolerance, torch.Generator().manual_seed(1))
+    result, _, bias = found
+    assert max(taken) == finest
+    assert abs(float(result.mean())) <= bias
+
+
 def test_what_rounds_is_audited_however_fine_the_steps_of_all_trajectories_are():
     rounding, sizes = 0.01, torch.linspace(1e6, 2e6, 200, dtype=torch.float64)
 

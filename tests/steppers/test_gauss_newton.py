@@ -1,5 +1,7 @@
 """Gauss-Newton steps: each against its formula with a Jacobian that is written down, and where they lead."""
 
+import copy
+
 import pytest
 import torch
 
@@ -138,7 +140,7 @@ def test_the_worst_states_are_among_those_of_the_last_steps_until_none_is_bad(sm
     found = refined(start, slack_of(problem), draw, 20, enough=1e-9, worst=worst)
     assert found is not None
     rounds = 0 if small else gauss_newton.ROUNDS
-    assert asked == [20 + k * gauss_newton.ROUND_STEPS for k in range(max(rounds, 1))]
+    assert asked == [20 + k * gauss_newton.ROUND_STEPS for k in range(rounds + 1)]
     assert len(stepped) == 20 + rounds * gauss_newton.ROUND_STEPS
     assert all(torch.equal(x[:2], bad) for x in stepped[20:])
     assert not any(torch.equal(x[:2], bad) for x in stepped[:20])
@@ -156,6 +158,21 @@ def test_steps_on_worst_states_that_give_no_number_or_are_told_to_stop_leave_all
     odd = lambda self, samples: torch.inf if float(samples.x[0]) == 0.25 else step(self, samples)
     monkeypatch.setattr(GaussNewton, "step", odd)
     assert refined(start, slack_of(problem), draw, 4, worst=worst) is None
+
+
+def test_the_best_of_all_rounds_on_worst_states_is_kept(monkeypatch):
+    """Here the second, after which the mean is no worse than before and the largest slack much smaller."""
+    problem, rounds = Manufactured(dim=1), []
+    largest = iter([1.0, 0.1, 1e-3, 0.2])
+
+    def worst(network):
+        rounds.append(copy.deepcopy(network.state_dict()))
+        return torch.full((2, 1), 0.25, dtype=torch.float64), next(largest)
+
+    monkeypatch.setattr(gauss_newton, "ROUNDS", 3)
+    found = refined(fitted(problem), slack_of(problem), draw_of(problem), 20, worst=worst)
+    assert all(torch.equal(p, rounds[2][name].to(p)) for name, p in found.network.state_dict().items())
+    assert len(rounds) == 4
 
 
 @pytest.mark.nightly
