@@ -15,7 +15,6 @@ from ocp_torch.certificate.checks.tails import sharpened
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.certificate.lower.slack import Scaled
 from ocp_torch.certificate.settings import CERTIFIED
 from ocp_torch.certificate.simulated.candidates import Candidate
 from ocp_torch.certificate.simulated.performance import Simulated
@@ -187,11 +186,11 @@ class TrainedContext(FieldsContext):
         problem, trained, policy = self.problem, self.trained, self.policies_of(self.trained.fields)[kind]
         how = self.constants, self.settings.stage, self.seed
         try:
-            found = fit_closed_loop(problem, policy, trained.fields, trained.network, *how)
+            fitted = in_float64(fit_closed_loop(problem, policy, trained.fields, trained.network, *how))
         except ArithmeticError as error:
             return None, [f"the certification stage failed: {error}"]
-        fitted, V, theta = in_float64(found.fields), self.sampled_value, found.multiple
-        value, initial = (fitted.value, None) if V is None else (Scaled(V.value, theta), [theta * e for e in V.initial])
+        V = self.sampled_value
+        value, initial = (fitted.value, None) if V is None else (V.value, V.initial)
         return self.bounds_of(self.policies[kind], value, fitted.log_occupation, initial), []
 
     @property

@@ -108,7 +108,7 @@ def test_the_stage_takes_another_round_only_while_the_residual_costs_too_much(mo
     fit = lambda **change: fit_closed_loop(
         problem, policy, fields, network, resolve_constants(problem), replace(settings, **change), seed=0
     )
-    weights = lambda fitted: torch.cat([p.flatten() for p in fitted.fields.log_occupation.parameters()])
+    weights = lambda fitted: torch.cat([p.flatten() for p in fitted.log_occupation.parameters()])
     once = weights(fit(rounds=1))
     assert torch.equal(weights(fit(good_excess=1e3)), once)
     assert not torch.equal(weights(fit(good_excess=1e-12)), once)
@@ -149,7 +149,7 @@ def test_a_fit_whose_first_steps_lose_all_mass_is_begun_anew_more_slowly(monkeyp
 
     def mass():
         constants = resolve_constants(problem)
-        fitted = fit_closed_loop(problem, policy, fields, network, constants, settings, seed=0).fields
+        fitted = fit_closed_loop(problem, policy, fields, network, constants, settings, seed=0)
         return float(fitted.log_occupation(x).exp().mean())
 
     assert 0.5 < mass() < 2.0

@@ -54,7 +54,7 @@ class ControllerContext(Context):
         if not self.problem.gives_divergences:
             return None
         how = self.constants, self.settings.stage, self.seed
-        return in_float64(fit_closed_loop(self.problem, self.policy, None, self.network, *how).fields)
+        return in_float64(fit_closed_loop(self.problem, self.policy, None, self.network, *how))
 
     @cached_property
     def _initial(self) -> list[float] | None:

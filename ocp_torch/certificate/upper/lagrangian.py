@@ -13,7 +13,7 @@ that, and what is said along trajectories holds in the mean over paths (Ito's fo
 3. By parts again `E[(f + R(u)) mu + V r] = E[V mu0 - mu Q_u]`: the same number with far less variance.
 4. `0 <= V^u <= C_V` with `C_V = sup V + eps_hi` gives `J = E[(f + R(u)) mu + C_V max(r, 0)]`, with `w = mu u`, for the
    smallest `C_V` that these facts prove for this very controller.
-5. All this holds for every multiple `theta V` too, and the best one is found with the fit (`Excess`).
+5. All this holds for every multiple `theta V` too, and the best one is taken (`ScaledSlack`).
 6. And for every multiple `s mu`, with residual `mu0 - s (mu0 - r)`, and each bound is convex in `s`. Where
    `Q_u` is deep on one side only, as at kinks, a little more mass (`s > 1`) makes the dear side of `r` rare. Each half
    of the sets is evaluated with the `s` that is best on the other half: the search does not flatter the bound.
@@ -30,8 +30,9 @@ from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_searc
 from ocp_torch.certificate.checks.hidden import Hidden, hidden_divergence
 from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate, integral
-from ocp_torch.certificate.lower.slack import Scaled, climbed_from, slack_function
-from ocp_torch.certificate.upper.multiples import Integrand, best_multiples, terms_on
+from ocp_torch.certificate.lower.slack import Scaled, climbed_from
+from ocp_torch.certificate.upper.multiples import Integrand, Terms, best_multiples, terms_on
+from ocp_torch.certificate.upper.scaled import ScaledSlack
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.supremum import Extremum, batched
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -41,6 +42,10 @@ from ocp_torch.problems.samples import Samples
 
 if TYPE_CHECKING:
     from ocp_torch.certificate.context import Context
+
+# How often the best multiple of `V` is sought, and the suprema of its slack are climbed: the first ascents may find a spike
+# that another multiple makes lower.
+CLIMBS = 2
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,7 @@ class ClosedLoopBounds:
     contributions: list[list[Tensor]]  # of `lagrangian` and `J`, parts of each
     sup_occupation: float  # the largest `mu` met
     occupation: Field  # `mu` itself
-    multiple: float  # `theta`, where the value is `theta V`
+    theta: float  # the multiple of `V` that all this is of
 
 
 def closed_loop_bounds(
@@ -74,20 +79,24 @@ def closed_loop_bounds(
     """All bounds on ``sets`` of samples of ``loop``; suprema are climbed from the worst of them and of the states ``odd``
     ``(K, d)``. ``initial``, if given, is `E[V mu0]` per set from more states: it carries nearly all of the variance."""
     found = [terms_on(Generator.of(loop, samples), value, log_occupation) for samples in sets]
-    terms, slacks, densities, fluxes = zip(*found, strict=True)
-    states, slack_of = torch.cat([samples.x for samples in sets]), slack_function(loop, value)
-    values, slack, mu = torch.cat([t.v for t in terms]), torch.cat(slacks), torch.cat(densities)
+    plain, _, densities, fluxes = zip(*found, strict=True)
+    whole, mu = Terms.join(plain), torch.cat(densities)
+    own, theta = ScaledSlack(loop, value, whole.samples, odd), 1.0
+    for _ in range(CLIMBS):  # each finds what the one before it could not know of
+        theta = own.lowest(whole, mu)[1]
+        eps_hi, eps_lo = own.climb(theta, ascents)
+    slacks = own.parts.slack(theta).split([len(samples) for samples in sets])
+    columns = zip(plain, densities, slacks, strict=True)
+    terms = [replace(t, v=theta * t.v, spent=density * slack) for t, density, slack in columns]
+    states, values = whole.samples.x, theta * whole.v
     occupation = lambda x: log_occupation(x).exp()
     if odd is not None and len(odd):
         states = torch.cat([states, odd])
-        values = torch.cat([values, batched(value, odd)])
-        slack = torch.cat([slack, batched(slack_of, odd)])
+        values = torch.cat([values, theta * batched(value, odd)])
         mu = torch.cat([mu, batched(occupation, odd)])
-    suprema = [(value, values), (slack_of, slack), (lambda x: -slack_of(x), -slack)]
-    climbed = (climbed_from(function, met, states, ascents) for function, met in suprema)
-    top, eps_lo, eps_hi = (replace(e, value=max(e.value, 0.0)) for e in climbed)
-    hi, lo, C_V = eps_hi.value, eps_lo.value, top.value + eps_hi.value
-    started = initial or [integral(t.samples, t.v * t.samples.mu0) for t in terms]
+    top = max(climbed_from(Scaled(value, theta), values, states, ascents).value, 0.0)
+    hi, lo, C_V = eps_hi.value, eps_lo.value, top + eps_hi.value
+    started = [theta * e for e in initial] if initial else [integral(t.samples, t.v * t.samples.mu0) for t in terms]
 
     def bound(integrand: Integrand, sign: float = 1.0) -> tuple[Estimate, list[Tensor]]:
         """`E[V mu0]` and ``sign`` times the mean of ``integrand``; and the weighted integrand for `mu` itself."""
@@ -105,10 +114,9 @@ def closed_loop_bounds(
     pairs = (lagrangian, of_lagrangian), (J, of_J)
     contributions = [[v / (abs(estimate.value) or 1.0) for v in weighted] for estimate, weighted in pairs]
     lagrangian = replace(lagrangian, controller=controller)
-    multiple = value.theta if isinstance(value, Scaled) else 1.0
     densest = climbed_from(occupation, mu, states, ascents).value
     return ClosedLoopBounds(
-        lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions, densest, occupation, multiple
+        lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions, densest, occupation, theta
     )
 
 
@@ -146,5 +154,5 @@ def slack_searches(found: ClosedLoopBounds | None) -> list[str]:
     """How the two suprema of the slack behind ``found`` were found."""
     if found is None:
         return []
-    named = lambda what: f"{what} of {found.multiple:.4g} V"
+    named = lambda what: f"{what} of {found.theta:.4g} V"
     return [sentence_on(named("eps_hi"), found.eps_hi), sentence_on(named("eps_lo"), found.eps_lo)]

@@ -93,12 +93,11 @@ def fit_recorded(context: "RecordedContext", kind: str) -> RecordedFit:
     like = next(trained.fields.parameters())
     training = closed_loop_samples(problem.training.to(like), rough, cost)
     pool = Drawn(training, derive_seed(seed, Branch.POLICY_EVALUATION, 2))
-    found = fit_closed_loop(problem, rough, trained.fields, trained.network, constants, stage, seed, pool)
-    fitted = in_float64(found.fields)
+    fitted = in_float64(fit_closed_loop(problem, rough, trained.fields, trained.network, constants, stage, seed, pool))
     value = context.value if context.value is not None else fitted.value
     loops = [closed_loop_samples(samples, policy, cost) for samples in context.sets]
-    columns = [terms_on(Generator(loop, rho, cost), value, fitted.log_occupation) for loop in loops]
-    terms, slacks, densities, fluxes = zip(*columns, strict=True)
+    found = [terms_on(Generator(loop, rho, cost), value, fitted.log_occupation) for loop in loops]
+    terms, slacks, densities, fluxes = zip(*found, strict=True)
     seen = training.to(torch.zeros((), dtype=torch.float64))
     with torch.no_grad():
         generator = Generator(seen, rho, cost)

@@ -1,0 +1,124 @@
+"""The slack of multiples of `V` along a closed loop: the best of them, spikes, and what a fit of a density is judged by."""
+
+import math
+
+import pytest
+import torch
+
+from ocp_torch.certificate.lower.slack import Scaled, slack_function, slack_peaks
+from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
+from ocp_torch.certificate.upper.multiples import terms_on
+from ocp_torch.certificate.upper.policy_evaluation import positive_weight
+from ocp_torch.certificate.upper.scaled import ScaledSlack
+from ocp_torch.problems import Manufactured
+from ocp_torch.problems.closed_loop import ClosedLoop
+from ocp_torch.problems.generator import Generator
+from ocp_torch.problems.samples import Samples
+from support import zoo
+
+PEAKS, CLIMBED = 16, 20
+
+
+@pytest.fixture
+def optimal():
+    """A smooth problem, and the closed loop of its optimal controller with samples of it."""
+    problem = zoo.build("manufactured 2-d q=2")
+    loop = ClosedLoop(problem, problem.exact_control)
+    return problem, loop, Samples.of(loop, zoo.states(problem, 4000))
+
+
+def spike(at: float, width: float, height: float):
+    """A bump of the torus in two dimensions."""
+    distance = lambda x: (torch.sin(math.pi * (x - at)) ** 2).sum(dim=-1) / (math.pi * width) ** 2
+    return lambda x: height * torch.exp(-distance(x))
+
+
+def judged(loop, value, samples, log_mu):
+    """The slack of ``value``, and what it is judged with: the terms and `mu`."""
+    terms, _, mu, _ = terms_on(Generator.of(loop, samples), value, log_mu)
+    return ScaledSlack(loop, value, samples), terms, mu
+
+
+def lagrangian(loop, value, log_mu, samples, ascents=1):
+    return closed_loop_bounds(loop, value, log_mu, [samples, samples], ascents, "value")
+
+
+def test_the_excess_is_what_the_bound_adds_to_its_integral(optimal):
+    _, loop, samples = optimal
+    value, log_mu = (zoo.rough_network(2, seed, size=0.1) for seed in (1, 2))
+    slack, terms, mu = judged(loop, lambda x: 1.0 + value(x), samples, log_mu)
+    bound = lagrangian(loop, slack.value, log_mu, samples).lagrangian.value
+    without = float((terms.v * samples.mu0 - terms.spent).mean())
+    met = without + slack.excess(terms, mu) * float((terms.v * samples.mu0).mean())
+    assert met <= bound + 1e-9  # the bound's suprema are climbed
+    assert met == pytest.approx(bound, rel=2e-2)
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.0, 1.2])
+def test_the_multiple_of_v_is_found_that_makes_it_the_value_of_the_controller(factor, optimal):
+    problem, loop, samples = optimal
+    found = lagrangian(loop, lambda x: problem.exact_value(x) / factor, zoo.rough_network(2, 3, size=0.1), samples)
+    assert found.theta == pytest.approx(factor, abs=1e-4)
+    exact = float((problem.exact_value(samples.x) * samples.mu0).mean())
+    for bound in (found.lagrangian, found.below, *found.sandwich):
+        assert bound.value == pytest.approx(exact, rel=2e-4)
+
+
+def test_the_bounds_of_another_multiple_of_v_and_with_more_states_for_its_mean_are_the_same(optimal):
+    problem, loop, samples = optimal
+    log_mu, rough = zoo.rough_network(2, 3, size=0.1), zoo.rough_network(2, 4, size=0.02)
+    bounds = []
+    for factor in (1.0, 0.8):
+        value = lambda x, factor=factor: factor * (problem.exact_value(x) + rough(x))
+        initial = [float((value(samples.x) * samples.mu0).mean())] * 2
+        bounds.append(closed_loop_bounds(loop, value, log_mu, [samples] * 2, 4, "value", initial))
+    one, other = bounds
+    assert one.theta == pytest.approx(0.8 * other.theta, abs=5e-3)
+    for name in ("lagrangian", "J", "below"):
+        assert getattr(one, name).value == pytest.approx(getattr(other, name).value, rel=1e-3)
+
+
+def test_a_spike_between_the_samples_counts_once_ascents_have_ended_on_it(optimal):
+    problem, loop, samples = optimal
+    narrow = spike(0.5, 0.01, 0.01)
+    value = lambda x: problem.exact_value(x) + narrow(x)
+    off = samples.take((narrow(samples.x) < 1e-3).nonzero().squeeze(-1))
+    slack, terms, mu = judged(loop, value, off, zoo.rough_network(2, 3, size=0.1))
+    sampled, excess = max(slack.suprema()), slack.excess(terms, mu)
+    found = slack.climb(1.0, 32, 40)
+    assert max(e.value for e in found) == max(slack.suprema()) > 3.0 * sampled
+    assert slack.excess(terms, mu) > 3.0 * excess
+
+
+def test_a_spike_is_not_forgotten_where_another_multiple_hides_it(monkeypatch):
+    """Ascents from the states sampled miss it at any multiple; one that stands beside it does not."""
+    problem = zoo.build("manufactured 2-d q=2")
+    loop, narrow = ClosedLoop(problem, problem.exact_control), spike(0.5, 0.003, 0.003)
+    samples = Samples.of(loop, zoo.states(problem, 500))
+    value, log_mu = (lambda x: problem.exact_value(x) + narrow(x)), zoo.rough_network(2, 3, size=0.1)
+    odd = torch.full((1, 2), 0.5003, dtype=torch.float64)
+    found = closed_loop_bounds(loop, value, log_mu, [samples] * 2, 2, "value", odd=odd)
+    slack = slack_function(loop, Scaled(value, found.theta))
+    reached = float(slack(torch.full((1, 2), 0.5, dtype=torch.float64)).detach().abs())
+    assert max(found.eps_hi.value, found.eps_lo.value) >= reached
+
+
+def test_the_weight_of_missing_mass_follows_the_slack(optimal):
+    """Deep slack on one side makes that side of the residual weigh more, within limits; a sign turned turns the ratio."""
+    problem, loop, samples = optimal
+    low, high = ((lambda x, c=c: problem.exact_value(x) + c) for c in (-0.1, 0.1))
+    assert positive_weight(*ScaledSlack(loop, low, samples).suprema()) == pytest.approx(4.0)
+    assert positive_weight(*ScaledSlack(loop, high, samples).suprema()) == pytest.approx(0.25)
+    assert positive_weight(0.0, 0.0) == 1.0
+
+
+def test_peaks_of_the_slack_are_of_both_signs():
+    problem = Manufactured(dim=2)
+    value = lambda x: problem.exact_value(x) + 0.01 * torch.sin(2.0 * math.pi * x[:, 0])
+    x = torch.rand(2048, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    found, largest = slack_peaks(problem, value, x, PEAKS, CLIMBED)
+    slack = lambda at: slack_function(problem, value)(at).detach()
+    assert found.shape == (2 * PEAKS, 2)
+    assert bool((slack(found[:PEAKS]) >= slack(x).topk(PEAKS).values - 1e-12).all())
+    assert bool((slack(found[PEAKS:]) <= -(-slack(x)).topk(PEAKS).values + 1e-12).all())
+    assert largest == pytest.approx(float(slack(found).abs().max()), rel=1e-9)
