@@ -1,5 +1,6 @@
 """What every test shares: one thread, repeatable hypothesis examples, the devices there are, and the zoo as a fixture."""
 
+import copy
 import math
 from collections import Counter
 from dataclasses import replace
@@ -34,6 +35,31 @@ def pytest_collection_modifyitems(items):
 def one_thread():
     """Small networks are faster on one thread, and sums are then added in one order."""
     torch.set_num_threads(1)
+
+
+FOUND = ("V0", "c", "state_cost_bound", "value_bound", "control_bound", "occupation_bound", "exact_optimum")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def searched_once():
+    """A manufactured problem of the same arguments as one before has what was found for that one, by searches that take
+    most of the time of many tests."""
+    from ocp_torch.problems import Manufactured
+
+    derive, found = Manufactured._derive, {}
+
+    def derived(problem):
+        if type(problem) is not Manufactured:  # another class may have another cost
+            return derive(problem)
+        of = repr(sorted(problem.parameters.items()))
+        if of not in found:
+            derive(problem)
+            found[of] = {name: copy.deepcopy(getattr(problem, name)) for name in FOUND}
+        vars(problem).update(copy.deepcopy(found[of]))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Manufactured, "_derive", derived)
+        yield
 
 
 @pytest.fixture(scope="module")

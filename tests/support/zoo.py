@@ -1,5 +1,6 @@
 """The test problems that all tests share, by readable names; each is built once, when first asked for."""
 
+import copy
 import math
 from functools import cache, partial
 
@@ -170,18 +171,27 @@ def build(name: str) -> Problem:
     return fresh(name)
 
 
-def fresh(name: str) -> Problem:
-    """A problem no other test has touched."""
+@cache
+def _untouched(name: str) -> Problem:
     return {**_CASES, **_NATURAL}[name]()
 
 
-def on(names):
-    """Run a test with its argument ``problem`` set to each of the problems ``names``. Of more than `MANY` the quick tests
-    take `MANY` at most, evenly spread and the last one among them, and the nightly tests the others."""
+def fresh(name: str) -> Problem:
+    """A problem no other test has touched: a copy of one that nobody is given, as some take long to make."""
+    return copy.deepcopy(_untouched(name))
+
+
+def spread(names) -> list:
+    """Of more than `MANY` names the quick tests take `MANY` at most, evenly spread and the last one among them, and the
+    nightly tests the others."""
     every = 1 if len(names) <= MANY else math.ceil(len(names) / (MANY - 1))
     rare = [name for k, name in enumerate(names) if k % every and name != names[-1]]
-    cases = [pytest.param(name, marks=pytest.mark.nightly) if name in rare else name for name in names]
-    return pytest.mark.parametrize("problem", cases, indirect=True)
+    return [pytest.param(name, marks=pytest.mark.nightly) if name in rare else name for name in names]
+
+
+def on(names):
+    """Run a test with its argument ``problem`` set to each of the problems ``names``, `spread` over quick and nightly."""
+    return pytest.mark.parametrize("problem", spread(names), indirect=True)
 
 
 def states(problem: Problem, count: int, seed: int = 0, dtype=torch.float64, off_kinks: bool = False) -> torch.Tensor:
