@@ -34,7 +34,7 @@ def paid(problem, V, pace, x, u):
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("problem", [SWING, Pendulum(), Pendulum(exponent=1.5)], ids=["limit", "free", "q = 1.5"])
 def test_it_beats_the_control_for_an_instant_and_comes_near_to_the_best_of_all(problem, seed):
-    V, x, pace = bumpy(problem, seed), states(problem, 256), Pace(0.08, 2)
+    V, x, pace = bumpy(problem, seed), states(problem, 64), Pace(0.08, 2)
     u, pointwise = HeldPolicy(problem, V, pace)(x).detach(), ValuePolicy(problem, V)(x).detach()
     reach = min(problem.control_cost.reach, 3.0 * float(pointwise.abs().max()))
     best = torch.stack(

@@ -209,8 +209,8 @@ def test_starts_in_ranges_have_mass_1_and_none_of_it_outside(parts, named):
 def test_every_kind_of_start_has_mass_1(start):
     chart = Chart(tuple(BOX))
     density = start_density(chart, start)
-    # The rectangle rule on a torus of 128^3 states.
-    axis = (torch.arange(128, dtype=torch.float64) + 0.5) / 128
+    # The rectangle rule on a torus of 96^3 states.
+    axis = (torch.arange(96, dtype=torch.float64) + 0.5) / 96
     x = torch.cartesian_prod(axis, axis, axis)
     s = chart.from_torus(x)
     values = density(s)
