@@ -2,6 +2,7 @@
 
 import ast
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,6 @@ import ocp_torch
 from ocp_torch.maths.seeds import Branch, derive_seed, fixed_generator
 
 ROOT = Path(ocp_torch.__file__).parent
-TREES = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in ROOT.rglob("*.py")}
 # Where seeds come in that are not derived: the library's own, those a caller hands in, and those that define a problem.
 BARE = {
     "maths/seeds.py",  # `fixed_generator`
@@ -28,9 +28,14 @@ BARE = {
 }
 
 
+@cache
+def trees() -> dict[str, ast.Module]:
+    return {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in ROOT.rglob("*.py")}
+
+
 def calls(name: str):
     """Every call of a function or method ``name``: the file it is in, and the call."""
-    for path, tree in TREES.items():
+    for path, tree in trees().items():
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and name == getattr(node.func, "id", getattr(node.func, "attr", None)):
                 yield path, node
