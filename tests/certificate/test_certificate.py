@@ -24,6 +24,8 @@ from support.formulas import Field
 from support.honesty import BARE
 from support.small import configured
 
+pytestmark = pytest.mark.usefixtures("quick_composition")
+
 CHEAP = replace(BARE, replicates=2, ascents=4, occupation_states=36, mollify=False, tolerance=5e-5)
 
 

@@ -13,6 +13,8 @@ from support import zoo
 from support.small import small
 from support.switching import cost_of_switching
 
+pytestmark = pytest.mark.usefixtures("quick_composition")
+
 
 def switched(left: float, right: float):
     """Velocity ``left`` below 1/2 and ``-right`` above: slides at 1/2."""

@@ -39,7 +39,7 @@ def finished(module):
     folder, name = module
     run = folder / "run"
     mine = (f"problem._target_={name}.Pendula", "+problem.coupling=0.2")
-    completed(*SMALL, *mine, "trainer.steps=4", f"hydra.run.dir={run}", cwd=folder)
+    completed(*SMALL, *mine, "trainer.steps=4", "warm_start.mode=off", f"hydra.run.dir={run}", cwd=folder)
     return run
 
 

@@ -12,6 +12,8 @@ from ocp_torch.runs.report.bracket import bracket
 from support.looks import certificate
 from support.small import session, small
 
+pytestmark = pytest.mark.usefixtures("quick_composition")
+
 
 def names(said: dict) -> set[str]:
     return {label.get_text() for label in interval_figure(said).axes[0].get_yticklabels()}

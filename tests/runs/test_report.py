@@ -30,6 +30,8 @@ from ocp_torch.runs.report.report import REPORT, write_report
 from support.looks import certificate
 from support.small import SMALL, configured
 
+pytestmark = pytest.mark.usefixtures("quick_composition")
+
 VOID = {"meta", "img", "br"}
 TAGS = {
     *(

@@ -15,6 +15,8 @@ from ocp_torch.runs.pictures.picture import motion
 from support.small import session, small
 from support.systems import Cart, Conveyor, Swing
 
+pytestmark = pytest.mark.usefixtures("quick_composition")
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):

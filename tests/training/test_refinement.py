@@ -17,6 +17,8 @@ from ocp_torch.training.stopping import SOLVED, Preempted, Signals
 from support.bits import differences
 from support.small import configured, small, state_of
 
+pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
+
 LITTLE = (
     "method=dual",
     "trainer.newton_steps=3",
@@ -158,7 +160,7 @@ def test_a_checkpoint_from_before_there_were_any_goes_on(tmp_path):
         (("problem=manufactured",), True),
         (("problem=manufactured", "method=pd"), True),
         pytest.param(("problem=manufactured", "problem.dim=4"), True, marks=pytest.mark.nightly),
-        (("problem=manufactured", "problem.dim=6"), True),
+        pytest.param(("problem=manufactured", "problem.dim=6"), True, marks=pytest.mark.nightly),
         (("problem=manufactured", "problem.noise=0.1"), False),
         (("problem=manufactured", "optimizer=sgd"), False),
         (("problem=manufactured", "trainer.steps=20"), False),

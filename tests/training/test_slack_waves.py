@@ -11,6 +11,8 @@ from ocp_torch.training.slack_waves import add_waves, missed_waves
 from support.bits import differences
 from support.small import configured, state_of
 
+pytestmark = pytest.mark.usefixtures("quick_composition")
+
 
 def network(dim: int, **options) -> PeriodicMLP:
     with torch.random.fork_rng():
@@ -62,7 +64,7 @@ class Lacking(torch.nn.Module):
         return self.problem.exact_value(x) - missing
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize("noise", [0.0, pytest.param(0.02, marks=pytest.mark.nightly)])
 def test_the_terms_that_are_missing_are_found_and_none_that_is_there(noise):
     problem = Manufactured(dim=5, noise=noise, seed=2)
     left_out = [1, 4, 7]

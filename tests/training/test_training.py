@@ -157,7 +157,8 @@ RUNS = {
 @pytest.fixture(scope="module", params=[1, 2, pytest.param(3, marks=pytest.mark.nightly)], ids=lambda d: f"d={d}")
 def run(request, tmp_path_factory):
     """A finished run in its folder, and its configuration."""
-    trainer = small(*RUNS[request.param], "certificate.points=64", "certificate.ascents=1", "seed=5")
+    few = ("certificate.points=64", "certificate.replicates=2", "certificate.ascents=1", "certificate.stage.steps=10")
+    trainer = small(*RUNS[request.param], *few, "seed=5")
     folder = tmp_path_factory.mktemp("run")
     session(trainer, folder)
     return folder, trainer.config
