@@ -56,7 +56,10 @@ def test_bounds_of_a_closed_loop_know_a_spike_of_the_cost(name):
         assert_covers(estimate, problem.idle)
 
 
-@pytest.mark.parametrize(("name", "speed"), [("1-d needle", 0.0), ("2-d", 0.0), ("2-d", 0.05), ("3-d", 0.0)])
+@pytest.mark.parametrize(
+    ("name", "speed"),
+    [("1-d needle", 0.0), ("2-d", 0.0), pytest.param("2-d", 0.05, marks=pytest.mark.nightly), ("3-d", 0.0)],
+)
 def test_a_simulated_cost_knows_a_spike_where_trajectories_start(name, speed):
     problem = spike(name, speed=speed)
     low, high = simulate_performance(problem, zero_policy(problem), 64, 8, 0).perf.interval(0.999)
@@ -118,7 +121,7 @@ def test_problems_without_spikes_keep_their_states(problem):
     assert density.is_uniform or problem.initial_mixture is not None
 
 
-@pytest.mark.parametrize("name", ["2-d", "2-d on waves"])
+@pytest.mark.parametrize("name", ["2-d", pytest.param("2-d on waves", marks=pytest.mark.nightly)])
 def test_a_certificate_of_doing_nothing_holds_what_it_costs(name):
     problem = spike(name)
     fields = Fields({"control_density": Field(lambda x: 0.0 * x), "log_occupation": Field(lambda x: 0.0 * x[:, 0])})

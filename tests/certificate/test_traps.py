@@ -195,7 +195,7 @@ class Hidden(Circle):
         self.true_sup, self.occupation_bound = self.occupation_bound, None
 
 
-@pytest.mark.parametrize(("discount", "seed"), [(1.05, 0), (1.2, 7), (2.0, 0)])
+@pytest.mark.parametrize(("discount", "seed"), [(1.05, 0), pytest.param(1.2, 7, marks=pytest.mark.nightly), (2.0, 0)])
 def test_half_of_sup_mu_is_caught_on_a_problem_that_does_not_know_it(discount, seed):
     problem = Hidden(discount)
     half = resolve_constants(problem, occupation_bound=0.5 * problem.true_sup)

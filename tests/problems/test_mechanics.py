@@ -53,7 +53,7 @@ def lagrangian(problem, q, w):
     return kinetic - problem.gravity * (m1 * at[1] + m2 * at[3])
 
 
-@pytest.mark.parametrize("cls", [Acrobot, Pendubot])
+@pytest.mark.parametrize("cls", [Acrobot, pytest.param(Pendubot, marks=pytest.mark.nightly)])
 def test_the_links_move_as_lagranges_equations_say(cls):
     problem = cls(damping=[0.02, 0.05])
     states, torques = inside(problem, 40)
@@ -196,7 +196,9 @@ RESTS = {
 }
 
 
-@pytest.mark.parametrize("name", RESTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.nightly) if n in ("acrobot", "pendubot") else n for n in RESTS]
+)
 def test_near_rest_the_regulator_costs_what_the_riccati_equation_says(name):
     """So the linear system, the cost's Hessian and the scale of the controls are those of the problem on the torus."""
     problem, rest = zoo.build(name), torch.tensor(RESTS[name], dtype=torch.float64)

@@ -574,7 +574,11 @@ def test_a_limit_makes_the_optimum_dearer_but_changes_nothing_near_the_state_of_
 
 
 @pytest.mark.parametrize(
-    ("problem", "most"), [(Pendulum(control_limit=0.3), [0.3]), (Unicycle(control_limit=[0.3, 0.1]), [0.3, 0.1])]
+    ("problem", "most"),
+    [
+        pytest.param(Pendulum(control_limit=0.3), [0.3], marks=pytest.mark.nightly),
+        (Unicycle(control_limit=[0.3, 0.1]), [0.3, 0.1]),
+    ],
 )
 def test_the_practitioners_numbers_hold_every_law_to_the_limit(problem, most):
     reckless = lambda x: torch.full_like(x[:, :1], 50.0).expand(-1, len(most))

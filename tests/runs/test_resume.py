@@ -33,6 +33,8 @@ WAYS = [
     (*METHODS[method], f"stepper={stepper}", f"sampler={SAMPLERS[k % 2]}", f"optimizer={OPTIMIZERS[k % 3]}")
     for k, (stepper, method) in enumerate(itertools.product(STEPPERS, METHODS))
 ]
+# Those of the other stepper are nightly, but for one; test_training interrupts every method with each of them once.
+NIGHTLY = WAYS[len(METHODS) + 1 :]
 # Importance sampling, whose density is fitted anew before some of these steps and after others; also with noise.
 IMPORTANCE = ("sampler=importance", "sampler.every=2", "sampler.pool=200")
 WAYS += [(*METHODS[method], *IMPORTANCE) for method in ("dual", "primal, mu a network", "pd")]
@@ -56,7 +58,9 @@ class Recorder(Silent):
             trainer.save(self.folder / f"{trainer.step}.pt")
 
 
-@pytest.mark.parametrize("way", WAYS, ids=" ".join)
+@pytest.mark.parametrize(
+    "way", [pytest.param(w, marks=pytest.mark.nightly) if w in NIGHTLY else w for w in WAYS], ids=" ".join
+)
 def test_from_any_step_a_resumed_run_reaches_the_same_bits(way, tmp_path):
     steps, made = (1, 4, 7), maker(*way, "trainer.steps=10")
     whole = made()

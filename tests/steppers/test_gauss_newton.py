@@ -125,7 +125,7 @@ def test_states_that_are_all_alike_and_numbers_that_are_none_end_the_steps(monke
     assert refined(network(1), slack_of(problem), draw_of(problem), steps=4) is None
 
 
-@pytest.mark.parametrize("small", [False, True])
+@pytest.mark.parametrize("small", [pytest.param(False, marks=pytest.mark.nightly), True])
 def test_the_worst_states_are_among_those_of_the_last_steps_until_none_is_bad(small, monkeypatch):
     problem, stepped, asked = Manufactured(dim=1), [], []
     start, draw, bad = fitted(problem), draw_of(problem), torch.tensor([[0.25], [0.75]], dtype=torch.float64)

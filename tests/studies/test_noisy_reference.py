@@ -26,6 +26,8 @@ EXACT = {
         128,
         1e-3,
     ),
+}
+SLOW = {
     "2-d sigma(x) B(x)": (
         partial(
             Manufactured,
@@ -38,8 +40,6 @@ EXACT = {
         36,
         4e-2,
     ),
-}
-SLOW = {
     "1-d": (partial(Manufactured, dim=1, noise=0.02), 128, 1e-3),
     "2-d": (partial(Manufactured, noise=0.02), 48, 1e-2),
     "2-d degenerate": (partial(Manufactured, noise=[0.0, 0.05], control_limit=0.5), 48, 1e-2),
@@ -79,7 +79,11 @@ def test_costly_noisy_problems_are_solved_within_the_stated_error(name):
 
 @pytest.mark.parametrize(
     ("nu", "optimum", "largest"),
-    [(1e-3, 0.0617187651, 1.562), (1e-2, 0.0668854871, 1.471), (5e-2, 0.0769037272, 1.221)],
+    [
+        pytest.param(1e-3, 0.0617187651, 1.562, marks=pytest.mark.nightly),
+        (1e-2, 0.0668854871, 1.471),
+        pytest.param(5e-2, 0.0769037272, 1.221, marks=pytest.mark.nightly),
+    ],
 )
 def test_the_circle_to_ten_digits(nu, optimum, largest):
     """Beside a solver of its own for this one equation: finite differences, Newton's method, extrapolation."""

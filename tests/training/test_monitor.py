@@ -23,7 +23,9 @@ DRIFTING = ("problem=manufactured", "problem.dim=2")
 WAYS = {**METHODS, "saddle with drift": ("method=pd", "method.augmentation=0", *DRIFTING), "pd with drift": DRIFTING}
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(
+    "way", [pytest.param(w, marks=NIGHTLY) if w in METHODS and k % 2 else w for k, w in enumerate(WAYS)]
+)
 def test_the_game_is_shown_at_every_phase(way, tmp_path, monkeypatch):
     monkeypatch.setattr("ocp_torch.training.running.SECONDS", 1e9)  # the clock is no part of this
     trainer = small(*WAYS[way], "trainer.log_every=5")
