@@ -4,6 +4,7 @@ import ctypes
 import json
 import shutil
 import subprocess
+from functools import cache
 
 import numpy as np
 import pytest
@@ -34,19 +35,22 @@ VARIANTS = {
     "limits": ("dual", "problem=manufactured", "problem.control_limit=[0.05,0.02]"),
     "varying B": ("pd", "problem.exponent=2", "problem.state_dependent_control=true"),
     "noise": ("pd", "problem.noise=0.02", "problem.state_dependent_noise=true"),
+    "pendulum": ("dual", "problem=pendulum", "problem.control_limit=1.0"),
     "system": ("dual", "problem=cart_pole"),
     "walls": ("pd", "problem=dubins", "problem.walls=true"),
     "three joints": ("pd", "problem=arm", "problem.dim=3"),
     "held": ("dual", "problem=cart_pole", "warm_start.mode=on"),
 }
-# Quick is the one that has the most in it.
-QUICK = ("system",)
+# Quick is one that has most in it, units and a limit, and is small.
+QUICK = ("pendulum",)
 EACH = pytest.mark.parametrize(
     "variant", [v if v in QUICK else pytest.param(v, marks=pytest.mark.nightly) for v in VARIANTS]
 )
 
 
+@cache
 def controllers_of(variant):
+    """Made once for all formats: none changes them."""
     method, *rest = VARIANTS[variant]
     small = () if variant == "sobolev" else SMALL  # which name fields of a perceptron
     return controller_of(configured(*small, *METHODS[method], *rest))
