@@ -13,8 +13,8 @@ from support.small import session, small
 pytestmark = pytest.mark.usefixtures("quick_composition", "cheap_looks")
 # Of each script; `OCP_TORCH_EXAMPLES` asks for more, the quick tests try a few.
 MANY = int(os.environ.get("OCP_TORCH_EXAMPLES", "0"))
-EXAMPLES = dict.fromkeys([*CHECKED, "compare"], max(100, MANY)) | {"train": max(500, MANY)}
-FEW = 12
+EXAMPLES = dict.fromkeys([*CHECKED, "compare"], max(100, MANY)) | {"train": max(200, MANY)}
+FEW = 6
 # No field takes any of these.
 NUMBERS = [
     "9" * 400,
