@@ -59,6 +59,12 @@ def hasty(monkeypatch):
     monkeypatch.setattr("ocp_torch.certificate.simulated.candidates.MAX_DOUBLINGS", 1)
 
 
+@pytest.fixture
+def briefly_tightened(monkeypatch):
+    """A value is trained on for its bound, but not for long."""
+    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.ROUNDS", ((100.0, 60), (1000.0, 120)))
+
+
 @pytest.mark.usefixtures("hasty")
 @pytest.mark.parametrize(("name", "value"), [(n, ("sup f", "truth")[k % 2]) for k, n in enumerate(FEW)])
 def test_a_few_values_are_certified_truly(name, value):
@@ -100,6 +106,7 @@ def test_every_density_is_certified_truly(name, density, effort, seed):
 
 
 @pytest.mark.nightly
+@pytest.mark.usefixtures("briefly_tightened")
 @pytest.mark.parametrize(("name", "value"), some(3, FAMILY, (None, "sup f", "truth")))
 def test_doing_nothing_is_certified_truly_as_a_given_controller(name, value):
     problem = FAMILY[name]()
@@ -109,7 +116,7 @@ def test_doing_nothing_is_certified_truly_as_a_given_controller(name, value):
 
 
 @pytest.mark.nightly
-@pytest.mark.usefixtures("hasty")
+@pytest.mark.usefixtures("hasty", "briefly_tightened")
 @pytest.mark.parametrize(("name", "method", "seed"), some(2, FAMILY, ("dual", "primal", "pd"), (0, 1)))
 def test_what_training_ends_with_is_certified_truly(name, method, seed, monkeypatch):
     problem = FAMILY[name]()
@@ -118,7 +125,6 @@ def test_what_training_ends_with_is_certified_truly(name, method, seed, monkeypa
 
 def trained(problem, method, seed, monkeypatch, steps=150):
     monkeypatch.setattr(config, "build_problem", lambda section: problem)
-    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.ROUNDS", ((100.0, 60), (1000.0, 120)))
     drifting = method == "primal" and not problem.driftless
     trainer = build_trainer(
         configured(
