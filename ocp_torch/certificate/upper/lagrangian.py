@@ -30,7 +30,7 @@ from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_searc
 from ocp_torch.certificate.checks.hidden import Hidden, hidden_divergence
 from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate, integral
-from ocp_torch.certificate.lower.slack import Scaled, climbed_from
+from ocp_torch.certificate.lower.slack import climbed_from
 from ocp_torch.certificate.upper.multiples import Integrand, Terms, best_multiples, terms_on
 from ocp_torch.certificate.upper.scaled import ScaledSlack
 from ocp_torch.maths.jets import Field
@@ -80,21 +80,21 @@ def closed_loop_bounds(
     ``(K, d)``. ``initial``, if given, is `E[V mu0]` per set from more states: it carries nearly all of the variance."""
     found = [terms_on(Generator.of(loop, samples), value, log_occupation) for samples in sets]
     plain, _, densities, fluxes = zip(*found, strict=True)
-    whole, mu = Terms.join(plain), torch.cat(densities)
+    whole = Terms.join(plain)
     own, theta = ScaledSlack(loop, value, whole.samples, odd), 1.0
     for _ in range(CLIMBS):  # each finds what the one before it could not know of
-        theta = own.lowest(whole, mu)[1]
+        theta = own.lowest(whole)[1]
         eps_hi, eps_lo = own.climb(theta, ascents)
     slacks = own.parts.slack(theta).split([len(samples) for samples in sets])
     columns = zip(plain, densities, slacks, strict=True)
     terms = [replace(t, v=theta * t.v, spent=density * slack) for t, density, slack in columns]
-    states, values = whole.samples.x, theta * whole.v
+    states, values, mu = whole.samples.x, whole.v, torch.cat(densities)
     occupation = lambda x: log_occupation(x).exp()
     if odd is not None and len(odd):
         states = torch.cat([states, odd])
-        values = torch.cat([values, theta * batched(value, odd)])
+        values = torch.cat([values, batched(value, odd)])
         mu = torch.cat([mu, batched(occupation, odd)])
-    top = max(climbed_from(Scaled(value, theta), values, states, ascents).value, 0.0)
+    top = theta * max(climbed_from(value, values, states, ascents).value, 0.0)
     hi, lo, C_V = eps_hi.value, eps_lo.value, top + eps_hi.value
     started = [theta * e for e in initial] if initial else [integral(t.samples, t.v * t.samples.mu0) for t in terms]
 

@@ -107,8 +107,8 @@ def fit_closed_loop(
     def excess() -> float:
         """Below 0 it is where another multiple of `mu` serves a `V` that is far off."""
         value, log_mu = fixed.value if fixed else average.module.value, average.module.log_occupation
-        terms, _, mu, _ = terms_on(Generator.of(loop, judged), value, log_mu)
-        return abs((fixed or ScaledSlack(loop, value, judged)).excess(terms, mu))
+        terms, *_ = terms_on(Generator.of(loop, judged), value, log_mu)
+        return abs((fixed or ScaledSlack(loop, value, judged)).excess(terms))
 
     for k in range(first, settings.rounds):
         steps = settings.steps * 2**k
