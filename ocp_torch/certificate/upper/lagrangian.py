@@ -43,9 +43,9 @@ from ocp_torch.problems.samples import Samples
 if TYPE_CHECKING:
     from ocp_torch.certificate.context import Context
 
-# How often the best multiple of `V` is sought, and the suprema of its slack are climbed: the first ascents may find a spike
-# that another multiple makes lower.
-CLIMBS = 2
+# The first ascents may find a spike that another multiple of `V` makes lower: the suprema of the slack are climbed once more
+# where the best one has moved by more than that.
+MOVED = 1e-4
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,12 @@ def closed_loop_bounds(
     found = [terms_on(Generator.of(loop, samples), value, log_occupation) for samples in sets]
     plain, _, densities, fluxes = zip(*found, strict=True)
     whole = Terms.join(plain)
-    own, theta = ScaledSlack(loop, value, whole.samples, odd), 1.0
-    for _ in range(CLIMBS):  # each finds what the one before it could not know of
-        theta = own.lowest(whole)[1]
+    own = ScaledSlack(loop, value, whole.samples, odd)
+    theta = own.lowest(whole)[1]
+    eps_hi, eps_lo = own.climb(theta, ascents)
+    better = own.lowest(whole)[1]
+    if abs(better - theta) > MOVED:
+        theta = better
         eps_hi, eps_lo = own.climb(theta, ascents)
     slacks = own.parts.slack(theta).split([len(samples) for samples in sets])
     columns = zip(plain, densities, slacks, strict=True)
