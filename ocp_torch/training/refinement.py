@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.lower.slack import slack_peaks
+from ocp_torch.certificate.lower.slack import slack_function, slack_peaks
 from ocp_torch.certificate.trained import in_float64
 from ocp_torch.fields import Fields, PeriodicMLP
+from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import SobolSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
+from ocp_torch.maths.supremum import batched
 from ocp_torch.problems import Problem
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
@@ -109,11 +111,20 @@ def refined_value(
     slack = lambda samples, V: Generator.of(problem, samples).hjb_slack(V)
     judged = draw(JUDGED)
     unit = float(judged.mean(judged.f))
-    worst = lambda own: slack_peaks(problem, own, states.draw(SOUGHT), PEAKS, CLIMBED)
+    worst = lambda own: worst_states(problem, own, states.draw(SOUGHT))
     found = refined(network, slack, draw, steps, ENOUGH * unit, stop, worst)
     if found is None or bound(problem, found.network, judged, M) < bound(problem, network, judged, M):
         return None, states.count
     return Found(found.network.state_dict(), found.residual <= SOLVED * unit), states.count
+
+
+@torch.no_grad()
+def worst_states(problem: Problem, value: Field, x: Tensor) -> tuple[Tensor, float]:
+    """Where ascents from the states ``x`` ``(N, d)`` with the largest and the smallest slack of ``value`` end, ``(K, d)``,
+    and the largest slack there, whatever its sign."""
+    slack = slack_function(problem, value)
+    ends = slack_peaks(slack, x, batched(slack, x), PEAKS, CLIMBED)
+    return ends, float(slack(ends).abs().max())
 
 
 def bound(problem: Problem, network: torch.nn.Module, samples: Samples, M: float) -> float:

@@ -6,7 +6,6 @@ import math
 import pytest
 import torch
 
-from ocp_torch.certificate.lower.slack import slack_peaks
 from ocp_torch.problems import Manufactured
 from ocp_torch.runs.build import build_trainer
 from ocp_torch.steppers.gauss_newton import Refined
@@ -292,7 +291,7 @@ def test_smooth_problems_are_solved_early_and_well(dim, more):
     assert float(error) < 1e-3
     states = torch.rand(2**15, dim, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     value = trainer.averaged_fields.value.double()
-    _, largest = slack_peaks(trainer.problem, value, states, refinement.PEAKS, refinement.CLIMBED)
+    _, largest = refinement.worst_states(trainer.problem, value, states)
     assert largest < 3e-3 * float(exact.std())  # no spikes: bounds that need no M are narrow too
 
 

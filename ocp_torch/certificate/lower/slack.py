@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.maths.jets import Field, Jet, jet
-from ocp_torch.maths.supremum import Extremum, batched, climb, supremum
+from ocp_torch.maths.supremum import Extremum, climb, supremum
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.generator import Generator, hjb_slack
 from ocp_torch.problems.problem import Problem
@@ -66,18 +66,14 @@ def slack_function(problem: Problem, value: Field):
     return slack
 
 
-@torch.no_grad()
-def slack_peaks(problem: Problem, value: Field, x: Tensor, count: int, steps: int) -> tuple[Tensor, float]:
-    """Where so many ``steps`` of ascents from the ``count`` states of ``x`` ``(N, d)`` with the largest slack of ``value``
-    end, and from those with the smallest, ``(2 count, d)``; and the largest slack there, whatever its sign."""
-    slack = slack_function(problem, value)
-    met, ends, largest = batched(slack, x), [], 0.0
-    for function, found in ((slack, met), (lambda at: -slack(at), -met)):
-        start, index = found.topk(min(count, len(found)))
-        at, reached = climb(function, x[index], start, steps)
-        ends.append(at.remainder(1.0))
-        largest = max(largest, float(reached.max()))
-    return torch.cat(ends), largest
+def slack_peaks(slack: Field, x: Tensor, met: Tensor, count: int, steps: int) -> Tensor:
+    """Where so many ``steps`` of ascents of ``slack`` end, ``(K, d)``, from the ``count`` states of ``x`` ``(N, d)`` with the
+    smallest and from those with the largest of its values ``met`` ``(N,)`` there."""
+    ends, count = [], min(count, len(met))
+    for function, found in ((lambda at: -slack(at), -met), (slack, met)):
+        start, index = found.topk(count)
+        ends.append(climb(function, x[index], start, steps if count else 0)[0].remainder(1.0))
+    return torch.cat(ends)
 
 
 def climbed_from(function: Field, values: Tensor, states: Tensor, ascents: int) -> Extremum:

@@ -4,10 +4,10 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.estimate import integral
-from ocp_torch.certificate.lower.slack import TOP, Scaled, SlackParts, slack_function
+from ocp_torch.certificate.lower.slack import TOP, Scaled, SlackParts, slack_function, slack_peaks
 from ocp_torch.certificate.upper.multiples import Terms, best_multiple
 from ocp_torch.maths.jets import Field
-from ocp_torch.maths.supremum import Extremum, climb, minimiser
+from ocp_torch.maths.supremum import Extremum, minimiser
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
@@ -53,16 +53,12 @@ class ScaledSlack:
     def climb(self, theta: float, ascents: int, steps: int = 60) -> tuple[Extremum, Extremum]:
         """`eps_hi` and `eps_lo` of `theta V` after so many ``steps`` of ``ascents`` from the states with the smallest and the
         largest slack met, whose ends are met too."""
-        slack, function = self.met.slack(theta), slack_function(self.loop, Scaled(self.value, theta))
-        seen, count, ends = len(slack), min(ascents, len(slack)), []
-        for way, met in ((lambda x: -function(x), -slack), (function, slack)):
-            start, index = met.topk(count)
-            ends.append(climb(way, self.met.x[index], start, steps if count else 0)[0].remainder(1.0))
-        self._meet(torch.cat(ends))
+        function, seen = slack_function(self.loop, Scaled(self.value, theta)), len(self.met.x)
+        self._meet(slack_peaks(function, self.met.x, self.met.slack(theta), ascents, steps))
 
         def largest(side: Tensor) -> Extremum:
             top = int(side.argmax())
-            return Extremum(max(float(side[top]), 0.0), self.met.x[top], seen, count)
+            return Extremum(max(float(side[top]), 0.0), self.met.x[top], seen, min(ascents, seen))
 
         slack = self.met.slack(theta)
         return largest(-slack), largest(slack)
