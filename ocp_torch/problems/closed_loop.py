@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.maths import jets
-from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.problem import Problem, VectorFields
 from ocp_torch.problems.samples import Samples
 
 
@@ -31,7 +31,7 @@ class ClosedLoop(Problem):
         return [Samples.concatenate(pieces(samples)) for samples in sets]
 
     def state_cost(self, x: Tensor) -> Tensor:
-        return self.problem.state_cost(x) + self.problem.control_cost.cost(self.policy(x))
+        return self._paid(x, self.policy(x))
 
     def drift(self, x: Tensor) -> Tensor:
         return self.problem.velocity(x, self.policy(x))
@@ -40,16 +40,28 @@ class ClosedLoop(Problem):
         """`div g_u = div a + (div B) . u + sum_k (d u_k along column k of B)`: one reverse pass for each of the controls."""
         return self.vector_fields(x)[2]
 
-    def vector_fields(self, x: Tensor, divergences: bool = True) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
-        if not divergences:
-            return super().vector_fields(x, divergences=False)
-        a, B, div_a, div_B = self.problem.vector_fields(x)
-        none, no_control = self.control_matrix(x), self.control_divergence(x)
+    def vector_fields(self, x: Tensor, divergences: bool = True) -> VectorFields:
+        return self._controlled(x, divergences)[1]
+
+    def cost_and_fields(self, x: Tensor, divergences: bool = True) -> tuple[Tensor, VectorFields]:
+        u, fields = self._controlled(x, divergences)
+        return self._paid(x, u), fields
+
+    def _controlled(self, x: Tensor, divergences: bool) -> tuple[Tensor, VectorFields]:
+        """The control ``(N, m)``, asked for once, and the `vector_fields`."""
+        a, B, div_a, div_B = self.problem.vector_fields(x, divergences)
         if div_a is None or div_B is None:
-            return self.drift(x), none, None, no_control
-        own = getattr(self.policy, "flux_divergence", None) if jets.is_data(x) else None
-        u, flux = jets.control_flux_divergence(self.policy, x, B, div_B) if own is None else own(x, B, div_B)
-        return a + torch.einsum("ndm,nm->nd", B, u), none, div_a + flux, no_control
+            u, divergence = self.policy(x), None
+        else:
+            own = getattr(self.policy, "flux_divergence", None) if jets.is_data(x) else None
+            u, flux = jets.control_flux_divergence(self.policy, x, B, div_B) if own is None else own(x, B, div_B)
+            divergence = div_a + flux
+        velocity = a + torch.einsum("ndm,nm->nd", B, u)
+        return u, (velocity, self.control_matrix(x), divergence, self.control_divergence(x))
+
+    def _paid(self, x: Tensor, u: Tensor) -> Tensor:
+        """`f + R(u)`, ``(N,)``, of controls ``u`` ``(N, m)``."""
+        return self.problem.state_cost(x) + self.problem.control_cost.cost(u)
 
     def control_matrix(self, x: Tensor) -> Tensor:
         return x.new_zeros(len(x), self.dim, 1)

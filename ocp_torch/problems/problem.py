@@ -38,6 +38,10 @@ def shipped(kind: type) -> bool:
     return kind.__module__.startswith("ocp_torch.")
 
 
+# `a` (N, d), `B` (N, d, m), `div a` (N,) and `div B` (N, m).
+VectorFields = tuple[Tensor, Tensor, Tensor | None, Tensor | None]
+
+
 class Problem(Reproducible, Placed, Played):
     """Base class: override `state_cost`, and whatever else differs from `dx/dt = u` with a uniform start.
 
@@ -176,11 +180,15 @@ class Problem(Reproducible, Placed, Played):
         tangents = torch.func.vmap(along)(basis)  # (d, N, d, m): derivative of B along coordinate i
         return torch.einsum("inim->nm", tangents)
 
-    def vector_fields(self, x: Tensor, divergences: bool = True) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+    def vector_fields(self, x: Tensor, divergences: bool = True) -> VectorFields:
         """`a`, `B` and their divergences (`None` where unknown, or where no ``divergences`` are asked for): what `drift`,
         `control_matrix`, `drift_divergence` and `control_divergence` give, for a class that has them from one evaluation."""
         div_a, div_B = (self.drift_divergence(x), self.control_divergence(x)) if divergences else (None, None)
         return self.drift(x), self.control_matrix(x), div_a, div_B
+
+    def cost_and_fields(self, x: Tensor, divergences: bool = True) -> tuple[Tensor, VectorFields]:
+        """`f` and `vector_fields`, for a class that has all of it from one evaluation."""
+        return self.state_cost(x), self.vector_fields(x, divergences)
 
     @property
     def unknown_divergences(self) -> str:

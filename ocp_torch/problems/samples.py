@@ -43,10 +43,10 @@ class Samples:
         noise = problem.noise(x)
         spread = problem.noise_divergences(x) if divergences and noise is not None else None
         div_D, div_div_D = spread or (None, None)
-        a, B, div_a, div_B = problem.vector_fields(x, divergences)
+        f, (a, B, div_a, div_B) = problem.cost_and_fields(x, divergences)
         return cls(
             x=x,
-            f=problem.state_cost(x),
+            f=f,
             a=a,
             B=B,
             mu0=problem.initial_density(x),
@@ -64,8 +64,8 @@ class Samples:
         without start and divergences."""
         one = torch.ones_like(x[:, 0])
         with torch.set_grad_enabled(x.requires_grad and torch.is_grad_enabled()):
-            a, B, _, _ = problem.vector_fields(x, divergences=False)
-            f, noise = problem.state_cost(x), problem.noise(x)
+            f, (a, B, _, _) = problem.cost_and_fields(x, divergences=False)
+            noise = problem.noise(x)
         return cls(x, f, a, B, one, one, noise=noise)
 
     @property

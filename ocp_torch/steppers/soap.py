@@ -70,6 +70,18 @@ class ReplayedSOAP(SOAP):
         back = named.get("project_type") == "backward"
         return left @ grad @ right.T if back else left.T @ grad @ right
 
+    def update_pre_conditioner(self, grad: Tensor, state: Any, step: int, *sizes: Any, **named: Any) -> None:
+        """As `SOAP` has it; of matrices by one product for each side, in half the time."""
+        if grad.dim() != 2 or not all(map(len, state["GG"])) or named.get("merge_dims"):
+            return super().update_pre_conditioner(grad, state, step, *sizes, **named)
+        kept = state["shampoo_beta"]
+        for gram, one in zip(state["GG"], (grad, grad.T), strict=True):
+            gram.addmm_(one, one.T, beta=kept, alpha=1.0 - kept)
+        if state["Q"] is None:
+            state["Q"] = self.get_orthogonal_matrix(state["GG"])
+        elif step % state["precondition_frequency"] == 0:
+            state["Q"] = self.get_orthogonal_matrix_qr(state)
+
     def get_orthogonal_matrix_qr(self, state: dict, *options: Any) -> list:
         """As `SOAP` has it; during a move, the eigenbases there are."""
         return state["Q"] if self._keeps_bases else super().get_orthogonal_matrix_qr(state, *options)

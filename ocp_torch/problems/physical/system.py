@@ -16,6 +16,7 @@ from ocp_torch.problems.physical.disturbed import Disturbed
 from ocp_torch.problems.physical.measures import Measures
 from ocp_torch.problems.physical.prices import positive_each, scaled_limit, weight_roots
 from ocp_torch.problems.physical.start import Density, Start, start_density
+from ocp_torch.problems.problem import VectorFields
 
 # States at which the largest cost in the box is sought.
 COSTED = 2**14
@@ -160,7 +161,7 @@ class System(Disturbed):
         """`from_torus`, but for whole turns where there are only angles: functions of them are periodic."""
         return self.from_torus(x) if self.chart.boxed else x * self.chart.lengths(x)
 
-    def vector_fields(self, x: Tensor, divergences: bool = True) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+    def vector_fields(self, x: Tensor, divergences: bool = True) -> VectorFields:
         """From one evaluation of `dynamics`, and for divergences nobody knows a reverse pass through it for each entry that
         varies: the lengths cancel in `d(chi a_i / length_i) / dx_i = d(chi a_i) / ds_i`, and `grad chi` is known."""
         if not divergences:
