@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from ocp_torch.certificate.estimate import CONFIDENCE
 from ocp_torch.certificate.upper.policy_evaluation import StageSettings
@@ -68,6 +69,9 @@ class CertificateSettings:
     horizon: str = TRUNCATED  # truncated: bounded tail in `bias`; random: an exponential time, no tail and more noise
     prefer: str = SIMULATED  # hand out the controller of the lowest performance, simulated or certified
     stage: StageSettings = field(default_factory=StageSettings)  # the fit to the closed loop
+    # Whether a few trajectories are simulated once more, on far finer steps, for the bias; nothing that makes a claim may do
+    # without, so that it is no field of a configuration.
+    audited: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         least = {"points": 1, "replicates": 2, "trajectories": 0, "ascents": 1, "occupation_states": 0}

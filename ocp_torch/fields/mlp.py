@@ -17,7 +17,7 @@ from ocp_torch.maths.jets import Jet, is_data, reverse_jet
 # Sizes up to so many coordinates. Kinks want Fourier modes, affordable in one and two dimensions; in many dimensions products
 # of tanh learn terms that couple coordinates several times faster.
 SIZES = {
-    1: dict(modes=6, waves=0, width=96, gated=False),
+    1: dict(modes=6, waves=0, width=64, gated=False),
     2: dict(modes=6, waves=16, width=96, gated=False),
     4: dict(modes=3, waves=64, width=96, gated=True),
     8: dict(modes=1, waves=64, width=128, gated=True),

@@ -214,8 +214,9 @@ class _Swept(torch.autograd.Function):
 def swept_jet(network: Any, x: Tensor) -> Jet:
     """The jet of the scalar perceptron ``network`` at the states ``x`` ``(N, d)``, which are data; it can be differentiated
     once, in the weights."""
-    weights = list(network.parameters())
-    if torch.is_grad_enabled() and any(w.requires_grad for w in weights):
-        return Jet(*_Swept.apply(network, x, *weights))
+    if torch.is_grad_enabled():
+        weights = list(network.parameters())
+        if any(w.requires_grad for w in weights):
+            return Jet(*_Swept.apply(network, x, *weights))
     with torch.no_grad():
         return Jet(*ReverseSweep(network, x).jet())

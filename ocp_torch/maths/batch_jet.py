@@ -16,9 +16,11 @@ PIECE, MANY = 512, 3072
 
 def batch_jet(field: Field, x: Tensor, sigma: Tensor | None = None) -> Jet:
     """`jet` at the states of a batch, which are data: where a network learns from many with noise, in pieces on all cores."""
-    weights = [p for p in field.parameters() if p.requires_grad] if isinstance(field, nn.Module) else []
-    small = sigma is None or len(x) * sigma.shape[2] < MANY
-    if small or not weights or not torch.is_grad_enabled() or x.requires_grad or not x.is_cpu:
+    many = sigma is not None and len(x) * sigma.shape[2] >= MANY
+    if not many or not isinstance(field, nn.Module) or not torch.is_grad_enabled() or x.requires_grad or not x.is_cpu:
+        return jet(field, x, sigma)
+    weights = [p for p in field.parameters() if p.requires_grad]
+    if not weights:
         return jet(field, x, sigma)
     return Jet(*_Pieces.apply(field, x, sigma, *weights))
 

@@ -128,6 +128,7 @@ def refined(
     standard_error: Callable[[Tensor], float] = lambda results: 0.0,
     audit: Integrate | None = None,
     doublings: int = MAX_DOUBLINGS,
+    audited: int = AUDITED,
 ) -> tuple[Tensor, Tensor, float]:
     r"""Results and end states of all trajectories, and a bound on the error of the results' mean by ``weights`` ``(N,)``.
 
@@ -136,8 +137,8 @@ def refined(
     make a part of the mean that matters: those that cross a jump or a kink of the controller, or slide along one. The error
     has three parts: the last change of each trajectory; what its slow decay leaves to come (`r/(1-r)` of it, at ratio `r`: a
     jump makes the order 1, not 4); and, because a trajectory may agree with itself by missing a feature twice, what a random
-    few of all of them change on far finer steps. Where ``integrate`` rounds these few are all integrated by ``audit``, which
-    does not, on steps that are no coarser.
+    few of all of them, ``audited``, change on far finer steps. Where ``integrate`` rounds these few are all integrated by
+    ``audit``, which does not, on steps that are no coarser.
     """
     everything = torch.arange(len(weights))
     coarse, _ = integrate(everything, steps // 2)
@@ -158,7 +159,10 @@ def refined(
         change[active], result[active] = (finer - result[active]).abs(), finer
         ratio = min(float((weights[active] * change[active]).sum()) / max(before, 1e-300), SLOWEST)
         factor[active] = max(1.0, ratio / (1.0 - ratio))
-    picked = torch.randperm(len(weights), generator=generator)[:AUDITED]
+    seen = float((weights * change * factor).mean())
+    if not audited:
+        return result, end, seen
+    picked = torch.randperm(len(weights), generator=generator)[:audited]
     missed = torch.zeros_like(weights[picked])
     finest = finest if audit is None else max(finest, int(taken[picked].max()))
     rough = (taken[picked] < finest) if audit is None else torch.ones_like(picked, dtype=torch.bool)
@@ -167,4 +171,4 @@ def refined(
         missed[rough] = weights[rows] * ((audit or integrate)(rows, finest)[0] - result[rows])
     noise = float(missed.std()) / math.sqrt(len(missed)) if len(missed) > 1 else 0.0
     unseen = abs(float(missed.mean())) + 2.0 * noise
-    return result, end, float((weights * change * factor).mean()) + unseen
+    return result, end, seen + unseen

@@ -27,7 +27,7 @@ def batches(problem, count: int) -> list[Samples]:
 @pytest.mark.parametrize("name", ["noisy 2-d sigma(x)", "box-limited 2-d"])
 @pytest.mark.parametrize("M", [3.0, 6.4])
 def test_a_batch_stands_for_all_states_of_the_last_ones(name, M, monkeypatch):
-    """The level and the mean above it are those of all of them, `E[V mu0]` is that of the new ones."""
+    """The level and the mean above it are those of all of them, `E[V mu0]` is that of half of the new ones."""
     monkeypatch.setattr("ocp_torch.certificate.lower.worst.CLIMBERS", 0)
     monkeypatch.setattr("ocp_torch.certificate.lower.worst.TAIL", 40 / NEW)
     problem = zoo.build(name)
@@ -46,7 +46,8 @@ def test_a_batch_stands_for_all_states_of_the_last_ones(name, M, monkeypatch):
         slack = generator.hjb_slack(generator.chunked_jet(value))
         # The least of `c + M E[max(Q - c, 0)]` over all `c` is at one of the slacks (Rockafellar and Uryasev).
         tail = min(float(c + M * (slack - c).clamp_min(0.0).mean()) for c in slack)
-        paid = float((value(new.x) * new.mu0).mean().detach())
+        start = new.take(slice(NEW // 2))
+        paid = float((value(start.x) * start.mu0).mean().detach())
         assert float(found.detach()) == pytest.approx(tail - paid, rel=1e-9)
 
 
@@ -76,7 +77,7 @@ def test_the_worst_are_those_of_the_value_as_it_is_now(monkeypatch):
     generator = Generator.of(problem, batch)
     slack, judged = generator.hjb_slack(generator.chunked_jet(bump)), batch.penalty_weight > 0.0
     assert len(batch) == NEW + 30
-    assert int(judged.sum()) == 30
+    assert int(judged.sum()) == 3  # the mean is over 1.28 of 128
     assert slack[judged].min() >= slack[~judged].max()
 
 

@@ -54,7 +54,7 @@ def simulate_candidates(
         if roughly:
             effort, tolerance, doublings = max(2, effort // BASELINE_PART), ROUGH * tolerance, HALVED
         sets, how = (settings.replicates, seed, value, initial), (settings.horizon, tolerance, rounded, doublings)
-        return simulate_performance(problem, policy, effort, *sets, *how)
+        return simulate_performance(problem, policy, effort, *sets, *how, settings.audited)
 
     held = [name for name, candidate in candidates.items() if isinstance(candidate.policy, HeldPolicy)]
     many = problem.noisy or held or settings.trajectories * settings.replicates > CHEAP

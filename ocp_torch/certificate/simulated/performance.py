@@ -22,6 +22,7 @@ from ocp_torch.maths.brownian import Grid, at_random_times, discounted, expectat
 from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.runge_kutta import (
+    AUDITED,
     MAX_DOUBLINGS,
     Dynamics,
     Integrate,
@@ -98,6 +99,7 @@ def simulate_performance(
     tolerance: float = CertificateSettings.tolerance,
     rounded: tuple[Policy, Field | None] | None = None,
     doublings: int = MAX_DOUBLINGS,
+    audited: bool = True,
 ) -> Simulated:
     """Perf of ``policy`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts, near `mu0`.
 
@@ -106,10 +108,10 @@ def simulate_performance(
     Steps are halved, without noise ``doublings`` times at most, until a trajectory changes by less than ``tolerance``,
     relative to the answer, or all of them by little beside the standard error. ``rounded``, the controller and `V` in single
     precision, takes their place where it agrees well enough with them at the starts; a few trajectories are exact, and what
-    they differ by goes into the ``bias``. That is the error of integration (`refined`, with noise `expectation`) plus, where
-    the ``horizon`` is truncated, the discount left there times the rate's supremum as met along the trajectories, with
-    head-room. A `HeldPolicy` is simulated as one: its control changes only when it is renewed, always up to a truncated
-    horizon.
+    they differ by goes into the ``bias``, unless, without noise, they are not ``audited``. The ``bias`` is the error of
+    integration (`refined`, with noise `expectation`) plus, where the ``horizon`` is truncated, the discount left there times
+    the rate's supremum as met along the trajectories, with head-room. A `HeldPolicy` is simulated as one: its control changes
+    only when it is renewed, always up to a truncated horizon.
     """
     dim, rho = problem.dim, problem.discount
     dynamics = loop_of(problem, policy, value)
@@ -128,7 +130,9 @@ def simulate_performance(
             ):
                 plain = None if rounded is None else (rounded[0], None)
                 effort = trajectories, replicates, seed
-                return simulate_performance(problem, policy, *effort, None, None, horizon, tolerance, plain, doublings)
+                return simulate_performance(
+                    problem, policy, *effort, None, None, horizon, tolerance, plain, doublings, audited
+                )
         quick = dynamics if rounded is None else loop_of(problem, *rounded)
         off = (quick(quick.renewed(state))[1] - rate).abs().mean()
         velocity, rate = velocity[:, :dim], rate.reshape(len(x0), -1)[:, 0]
@@ -172,7 +176,7 @@ def simulate_performance(
     else:
         error = lambda results: Estimate.of(means(results).tolist()).se
         audit = None if exact is None else integrated(exact)
-        accuracy = tolerance * size, generator, error, audit, doublings
+        accuracy = tolerance * size, generator, error, audit, doublings, AUDITED if audited else 0
         result, end, bias = refined(integrated(swift), mass, steps.count, *accuracy)
         refinement = torch.zeros_like(means(result))
     ended = end[:, :dim].remainder(1.0)
