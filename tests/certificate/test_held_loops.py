@@ -137,7 +137,9 @@ def test_beside_a_held_control_a_worse_controller_stays_rough_and_what_is_rememb
     efforts = []
 
     def simulated(problem, policy, trajectories, *rest):
-        efforts.append((policy, trajectories, rest[-1]))
+        *_, doublings, audited = rest
+        assert audited
+        efforts.append((policy, trajectories, doublings))
         return simulate_performance(problem, policy, trajectories, *rest)
 
     monkeypatch.setattr(candidates, "simulate_performance", simulated)

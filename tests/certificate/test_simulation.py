@@ -8,14 +8,17 @@ import numpy as np
 import pytest
 import torch
 
+from ocp_torch.certificate import CertificateSettings
 from ocp_torch.certificate.simulated.backward import backward_flow, settled_occupation
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
 from ocp_torch.control.policies import ValuePolicy, zero_policy
+from ocp_torch.errors import InputError, call
 from ocp_torch.maths import cores
 from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.runge_kutta import discounted_integral, refined
 from ocp_torch.maths.sampling import evaluation_points
 from ocp_torch.problems import Pendulum, Problem
+from ocp_torch.training.evaluator import QUICK, SEARCHED
 from support import zoo
 
 TURN = 2.0 * math.pi
@@ -297,6 +300,24 @@ def test_what_rounds_is_audited_however_fine_the_steps_of_all_trajectories_are()
     assert float(result.mean()) - 1.0 == pytest.approx(rounding, rel=0.2)
     assert rounding <= bias < 1.5 * rounding
     assert refined(by(rounding), *how)[2] < 0.2 * rounding
+    asked = []
+
+    def counted(rows, steps):
+        asked.append(steps)
+        return by(rounding)(rows, steps)
+
+    plain, _, seen = refined(counted, *how, by(0.0), audited=0)
+    assert torch.equal(plain, result)
+    assert 0.0 < seen < 0.2 * rounding
+    assert asked == [2, 4, *(2**k for k in range(3, 3 + len(asked) - 2))]  # halvings alone
+
+
+def test_only_looks_go_without_audits():
+    assert CertificateSettings().audited
+    assert not QUICK.audited
+    assert not SEARCHED.audited
+    with pytest.raises(InputError, match="audited"):
+        call(CertificateSettings, "certificate", {"audited": False})
 
 
 def rounded_perf(problem, rounded, policy):
