@@ -39,7 +39,7 @@ class Budget:
 # steps 18; in 64-d, after 100, slacks of 1 are left at a few states), and beside kinks one or a dozen show that it is not.
 FIRST, SECOND = SOUGHT_AT[0] + 1, SOUGHT_AT[1] + 1
 BUDGETS = (
-    Budget(1, steps=900, batch=256, good_gap=0.005, stage_steps=150, newton_steps=40, newton_after=FIRST),
+    Budget(1, steps=1050, batch=256, good_gap=0.005, stage_steps=150, newton_steps=40, newton_after=FIRST),
     Budget(2, steps=1100, batch=512, good_gap=0.003, stage_steps=200, newton_steps=40, newton_after=SECOND),
     Budget(4, steps=1000, batch=384, good_gap=0.005, stage_steps=300, newton_steps=40, newton_after=SECOND),
     Budget(8, steps=1000, batch=512, good_gap=0.01, stage_steps=300, newton_steps=40, newton_after=FIRST, lr=5e-3),
