@@ -15,8 +15,8 @@ from ocp_torch.fields.reverse_sweep import Dense, Layer, Product, swept_jet
 from ocp_torch.maths.jets import Jet, is_data, reverse_jet
 
 # Sizes up to so many coordinates. Kinks want Fourier modes, affordable in one and two dimensions; in many dimensions products
-# of tanh learn terms that couple coordinates several times faster. In one dimension 1,050 steps of 64 units a layer take .87 of
-# the time of 900 steps of 96, and leave the circle the same gap: certified .016 to .021 % for .016 to .020 %, three seeds.
+# of tanh learn terms that couple coordinates several times faster. In one dimension 1,050 steps of 64 units a layer take
+# .87 of the time of 900 steps of 96, and leave circles the same gap, certified .016 to .021 % for .016 to .020 %, 3 seeds.
 SIZES = {
     1: dict(modes=6, waves=0, width=64, gated=False),
     2: dict(modes=6, waves=16, width=96, gated=False),
