@@ -320,6 +320,19 @@ def test_only_looks_go_without_audits():
         call(CertificateSettings, "certificate", {"audited": False})
 
 
+def test_rounding_is_in_the_bias_of_a_look_too():
+    problem, error = zoo.Manufactured(dim=1), 1e-6
+    rounded = lambda x: problem.exact_control(x) * (1.0 + error)
+    how = dict(tolerance=1e-3, rounded=(rounded, None))
+    run = lambda **given: simulate_performance(problem, problem.exact_control, 64, 4, 0, **how, **given).perf
+    look, exact = (
+        run(audited=False),
+        simulate_performance(problem, problem.exact_control, 64, 4, 0, tolerance=1e-3).perf,
+    )
+    assert look.bias > abs(look.value - exact.value) > 0.0
+    assert look.bias <= run().bias + 1e-5
+
+
 def rounded_perf(problem, rounded, policy):
     """Of ``policy``, with ``rounded`` in its place; and of ``policy`` alone."""
     run = lambda other: simulate_performance(problem, policy, 64, 4, 0, tolerance=1e-3, rounded=other).perf

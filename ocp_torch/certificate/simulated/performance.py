@@ -178,6 +178,7 @@ def simulate_performance(
         audit = None if exact is None else integrated(exact)
         accuracy = tolerance * size, generator, error, audit, doublings, AUDITED if audited else 0
         result, end, bias = refined(integrated(swift), mass, steps.count, *accuracy)
+        bias += 0.0 if audited or exact is None else float(off)  # rounding alone must not look like a contradiction
         refinement = torch.zeros_like(means(result))
     ended = end[:, :dim].remainder(1.0)
     with torch.no_grad():
