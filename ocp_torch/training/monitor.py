@@ -125,8 +125,8 @@ class Monitor(Silent):
 
     def evaluated(self, trainer: Trainer, certificate: Certificate) -> None:
         record(self.writer, certificate, trainer.step)
-        for name, pixels in self.pictures(trainer).items():
-            self.writer.add_image(f"fields/{name}", pixels, trainer.step, dataformats="HWC")
+        if trainer.step < trainer.end:  # else the end of the run draws them, or the next round
+            self._draw(trainer)
         shown = certificate.lower | certificate.upper
         values = {name: f"{e.value:.6f}" for name in ("F_M", "J") if (e := shown.get(name)) is not None}
         gaps = [gap for kind in ("certified", "simulated") if (gap := certificate.gap[kind]) is not None]
@@ -148,6 +148,7 @@ class Monitor(Silent):
 
     def extended(self, trainer: Trainer) -> None:
         self.bar.total = trainer.end
+        self._draw(trainer)
         log.info("not good yet: training goes on to step %d, with M = %.4g", trainer.end, trainer.constants.M)
 
     def stopped(self, trainer: Trainer, why: str, settings: CertificateSettings) -> None:
@@ -177,6 +178,10 @@ class Monitor(Silent):
                 writer.file_writer.add_summary(summary)
             for name, value in results.items():
                 writer.add_scalar(name, value)
+
+    def _draw(self, trainer: Trainer) -> None:
+        for name, pixels in self.pictures(trainer).items():
+            self.writer.add_image(f"fields/{name}", pixels, trainer.step, dataformats="HWC")
 
     def _show(self, values: dict[str, str]) -> None:
         self._shown |= values

@@ -29,8 +29,8 @@ from ocp_torch.problems.starts import evaluation_distribution, initial_points
 STATES, FEW, PATHS, STEPS = 1024, 256, 32, 24
 # Where a path ends, in discount times: what is left weighs 2 %, and with `V` it is 2 % of a slack.
 HORIZON = 4.0
-# Seconds that every run has for these, twenty points of most problems, and the part of its time that it has beyond them.
-SECONDS, PART = 1.0, 0.02
+# Seconds that every run has for these, ten points of most problems, and the part of its time that it has beyond them.
+SECONDS, PART = 0.5, 0.02
 
 
 class RunningEstimates:
