@@ -107,9 +107,8 @@ def test_what_is_null_is_chosen_in_one_place_for_the_command_line_and_for_python
     config = composed("train", ["problem=torus", "problem.dim=3"])
     problem = build_problem(config["problem"])
     filled = fill(config, problem)
-    assert fill({"model": {"name": "mlp"}, "trainer": {}, "optimizer": {}, "certificate": {}}, problem)["model"] == {
-        name: value for name, value in filled["model"].items() if name != "depth"
-    }
+    bare = fill({"model": {"name": "mlp"}, "trainer": {}, "optimizer": {}, "certificate": {}}, problem)
+    assert bare["model"] == filled["model"]
     for group, section in filled.items():
         if not isinstance(section, dict):
             continue
