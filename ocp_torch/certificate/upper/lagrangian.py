@@ -13,7 +13,7 @@ that, and what is said along trajectories holds in the mean over paths (Ito's fo
 3. By parts again `E[(f + R(u)) mu + V r] = E[V mu0 - mu Q_u]`: the same number with far less variance.
 4. `0 <= V^u <= C_V` with `C_V = sup V + eps_hi` gives `J = E[(f + R(u)) mu + C_V max(r, 0)]`, with `w = mu u`, for the
    smallest `C_V` that these facts prove for this very controller.
-5. All this holds for every multiple `theta V` too, and the best one is taken (`ScaledSlack`).
+5. All this holds for every function `W` of `V` too, and the best one of some is taken (`LoweredSlack`).
 6. And for every multiple `s mu`, with residual `mu0 - s (mu0 - r)`, and each bound is convex in `s`. Where
    `Q_u` is deep on one side only, as at kinks, a little more mass (`s > 1`) makes the dear side of `r` rare. Each half
    of the sets is evaluated with the `s` that is best on the other half: the search does not flatter the bound.
@@ -31,8 +31,8 @@ from ocp_torch.certificate.checks.hidden import Hidden, hidden_divergence
 from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.lower.slack import climbed_from
+from ocp_torch.certificate.upper.lowered import LoweredSlack, Lowering
 from ocp_torch.certificate.upper.multiples import Integrand, Terms, best_multiples, terms_on
-from ocp_torch.certificate.upper.scaled import ScaledSlack
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.supremum import Extremum, batched
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -43,8 +43,8 @@ from ocp_torch.problems.samples import Samples
 if TYPE_CHECKING:
     from ocp_torch.certificate.context import Context
 
-# The first ascents may find a spike that another multiple of `V` makes lower: the suprema of the slack are climbed once more
-# where the best one has moved by more than that.
+# The first ascents may find a spike that another function of `V` makes lower: the suprema of the slack are climbed once more
+# where the best one is of another kind, or has moved by more than that.
 MOVED = 1e-4
 
 
@@ -63,7 +63,7 @@ class ClosedLoopBounds:
     contributions: list[list[Tensor]]  # of `lagrangian` and `J`, parts of each
     sup_occupation: float  # the largest `mu` met
     occupation: Field  # `mu` itself
-    theta: float  # the multiple of `V` that all this is of
+    how: Lowering  # the function of `V` that all this is of
 
 
 def closed_loop_bounds(
@@ -81,25 +81,28 @@ def closed_loop_bounds(
     found = [terms_on(Generator.of(loop, samples), value, log_occupation) for samples in sets]
     plain, _, densities, fluxes = zip(*found, strict=True)
     whole = Terms.join(plain)
-    own = ScaledSlack(loop, value, whole.samples, odd)
-    theta = own.lowest(whole)[1]
-    eps_hi, eps_lo = own.climb(theta, ascents)
+    own = LoweredSlack(loop, value, whole.samples, odd)
+    how = own.lowest(whole)[1]
+    eps_hi, eps_lo = own.climb(how, ascents)
     better = own.lowest(whole)[1]
-    if abs(better - theta) > MOVED:
-        theta = better
-        eps_hi, eps_lo = own.climb(theta, ascents)
-    slacks = own.parts.slack(theta).split([len(samples) for samples in sets])
+    if better.above != how.above or abs(better.by - how.by) > MOVED:
+        how = better
+        eps_hi, eps_lo = own.climb(how, ascents)
+    slacks = own.sampled.of(how).split([len(samples) for samples in sets])
     columns = zip(plain, densities, slacks, strict=True)
-    terms = [replace(t, v=theta * t.v, spent=density * slack) for t, density, slack in columns]
+    terms = [replace(t, v=how(t.v), spent=density * slack) for t, density, slack in columns]
     states, values, mu = whole.samples.x, whole.v, torch.cat(densities)
     occupation = lambda x: log_occupation(x).exp()
     if odd is not None and len(odd):
         states = torch.cat([states, odd])
         values = torch.cat([values, batched(value, odd)])
         mu = torch.cat([mu, batched(occupation, odd)])
-    top = theta * max(climbed_from(value, values, states, ascents).value, 0.0)
+    top = float(how(torch.tensor(max(climbed_from(value, values, states, ascents).value, 0.0))))
     hi, lo, C_V = eps_hi.value, eps_lo.value, top + eps_hi.value
-    started = [theta * e for e in initial] if initial else [integral(t.samples, t.v * t.samples.mu0) for t in terms]
+    started = [integral(t.samples, t.v * t.samples.mu0) for t in terms]
+    if initial:  # of V itself
+        own_means = [integral(t.samples, t.v * t.samples.mu0) for t in plain]
+        started = [e + mean - of_v for e, mean, of_v in zip(initial, started, own_means, strict=True)]
 
     def bound(integrand: Integrand, sign: float = 1.0) -> tuple[Estimate, list[Tensor]]:
         """`E[V mu0]` and ``sign`` times the mean of ``integrand``; and the weighted integrand for `mu` itself."""
@@ -119,7 +122,7 @@ def closed_loop_bounds(
     lagrangian = replace(lagrangian, controller=controller)
     densest = climbed_from(occupation, mu, states, ascents).value
     return ClosedLoopBounds(
-        lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions, densest, occupation, theta
+        lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions, densest, occupation, how
     )
 
 
@@ -157,5 +160,5 @@ def slack_searches(found: ClosedLoopBounds | None) -> list[str]:
     """How the two suprema of the slack behind ``found`` were found."""
     if found is None:
         return []
-    named = lambda what: f"{what} of {found.theta:.4g} V"
+    named = lambda what: f"{what} of {found.how}"
     return [sentence_on(named("eps_hi"), found.eps_hi), sentence_on(named("eps_lo"), found.eps_lo)]

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from ocp_torch.certificate.upper.lowered import UNCHANGED, LoweredSlack
 from ocp_torch.certificate.upper.multiples import terms_on
-from ocp_torch.certificate.upper.scaled import ScaledSlack
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.embedding import FourierEmbedding
@@ -93,9 +93,9 @@ def fit_closed_loop(
     count = min(POOL, settings.steps * settings.batch)
     pool = pool or Pool(loop, derive_seed(seed, Branch.POLICY_EVALUATION, 1), like, count, double=fields is None)
     judged = pool.samples.take(slice(EXCESS_STATES))
-    fixed = None if trained is None else ScaledSlack(loop, trained, judged)
+    fixed = None if trained is None else LoweredSlack(loop, trained, judged)
     if fixed is not None and problem.has_simulator:
-        fixed.climb(1.0, PEAKS, CLIMBED)
+        fixed.climb(UNCHANGED, PEAKS, CLIMBED)
     hi, lo = (0.0, 0.0) if fixed is None else fixed.suprema()
     steep = fixed is not None and max(hi, lo) > STEEP * fixed.unit
     first, batch = (settings.rounds - 1, LARGER * settings.batch) if steep else (0, settings.batch)
@@ -108,7 +108,7 @@ def fit_closed_loop(
         """Below 0 it is where another multiple of `mu` serves a `V` that is far off."""
         value, log_mu = fixed.value if fixed else average.module.value, average.module.log_occupation
         terms, *_ = terms_on(Generator.of(loop, judged), value, log_mu)
-        return abs((fixed or ScaledSlack(loop, value, judged)).excess(terms))
+        return abs((fixed or LoweredSlack(loop, value, judged)).excess(terms))
 
     for k in range(first, settings.rounds):
         steps = settings.steps * 2**k

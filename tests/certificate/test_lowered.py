@@ -1,4 +1,4 @@
-"""The slack of multiples of `V` along a closed loop: the best of them, spikes, and what a fit of a density is judged by."""
+"""The slack of functions of `V` along a closed loop: the best of them, spikes, and what a fit of a density is judged by."""
 
 import math
 
@@ -7,9 +7,10 @@ import torch
 
 from ocp_torch.certificate.lower.slack import slack_function, slack_peaks
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
+from ocp_torch.certificate.upper.lowered import UNCHANGED, Above, Lowered, LoweredSlack, Lowering, Met
 from ocp_torch.certificate.upper.multiples import terms_on
 from ocp_torch.certificate.upper.policy_evaluation import positive_weight
-from ocp_torch.certificate.upper.scaled import ScaledSlack
+from ocp_torch.maths.jets import reverse_jet
 from ocp_torch.problems import Manufactured
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.generator import Generator
@@ -35,7 +36,7 @@ def spike(at: float, width: float, height: float):
 
 def judged(loop, value, samples, log_mu):
     """The slack of ``value``, and the terms it is judged with."""
-    return ScaledSlack(loop, value, samples), terms_on(Generator.of(loop, samples), value, log_mu)[0]
+    return LoweredSlack(loop, value, samples), terms_on(Generator.of(loop, samples), value, log_mu)[0]
 
 
 def lagrangian(loop, value, log_mu, samples, ascents=1):
@@ -57,7 +58,8 @@ def test_the_excess_is_what_the_bound_adds_to_its_integral(optimal):
 def test_the_multiple_of_v_is_found_that_makes_it_the_value_of_the_controller(factor, optimal):
     problem, loop, samples = optimal
     found = lagrangian(loop, lambda x: problem.exact_value(x) / factor, zoo.rough_network(2, 3, size=0.1), samples)
-    assert found.theta == pytest.approx(factor, abs=1e-4)
+    assert found.how.above == Above()
+    assert 1.0 - found.how.by == pytest.approx(factor, abs=1e-4)
     exact = float((problem.exact_value(samples.x) * samples.mu0).mean())
     for bound in (found.lagrangian, found.below, *found.sandwich):
         assert bound.value == pytest.approx(exact, rel=2e-4)
@@ -72,9 +74,46 @@ def test_the_bounds_of_another_multiple_of_v_and_with_more_states_for_its_mean_a
         initial = [float((value(samples.x) * samples.mu0).mean())] * 2
         bounds.append(closed_loop_bounds(loop, value, log_mu, [samples] * 2, 4, "value", initial))
     one, other = bounds
-    assert one.theta == pytest.approx(0.8 * other.theta, abs=5e-3)
+    v = problem.exact_value(samples.x) + rough(samples.x)
+    torch.testing.assert_close(one.how(v), other.how(0.8 * v), rtol=4e-2, atol=0.0)
     for name in ("lagrangian", "J", "below"):
         assert getattr(one, name).value == pytest.approx(getattr(other, name).value, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["manufactured 2-d q=2", "noisy 2-d sigma(x)"])
+@pytest.mark.parametrize("whole", [True, False])
+def test_slack_and_derivatives_of_a_function_of_v_are_those_of_that_function(whole, name):
+    problem = zoo.build(name)
+    loop, V = ClosedLoop(problem, problem.exact_control), zoo.rough_network(2, 3)
+    samples = Samples.of(loop, zoo.states(problem, 500))
+    low, high = (float(V(samples.x).quantile(part)) for part in (0.3, 0.7))  # states below, on the bend and above
+    how = Lowering(Above() if whole else Above(low, high - low), 0.3)
+    W, L = Lowered(V, how), Generator.of(loop, samples)
+    by_hand, own = reverse_jet(W, samples.x, samples.noise), W.jet(samples.x, samples.noise)
+    for part in ("value", "gradient", "curvature"):
+        torch.testing.assert_close(getattr(own, part), getattr(by_hand, part), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(Met.at(L, V).of(how), L.hjb_slack(by_hand), rtol=1e-9, atol=1e-9)
+    assert how(torch.tensor(1e-300)) >= how(torch.tensor(-1.0))
+
+
+def test_what_is_too_large_at_the_top_alone_is_taken_off_there(optimal):
+    """As beside kinks that cross: a multiple would pay below for what is wrong above."""
+    problem, loop, samples = optimal
+    exact = problem.exact_value
+    high = Above(float(exact(samples.x).quantile(0.9)), 0.02)
+    value = lambda x: exact(x) + 0.5 * high(exact(x))[0]
+    slack, terms = judged(loop, value, samples, zoo.rough_network(2, 3, size=0.3))
+    whole, how = slack.lowest(terms)
+    slack.choices = [Above()]
+    multiples, multiple = slack.lowest(terms)
+    slack.choices = []
+    plain, unchanged = slack.lowest(terms)
+    assert unchanged == UNCHANGED
+    assert how.above.height > float(exact(samples.x).median())
+    assert multiple.by > 0.0
+    truth = float((exact(samples.x) * samples.mu0).mean())
+    assert truth - 1e-4 < whole < truth + 0.9 * (multiples - truth)
+    assert multiples < plain
 
 
 def test_a_spike_between_the_samples_counts_once_ascents_have_ended_on_it(optimal):
@@ -84,17 +123,17 @@ def test_a_spike_between_the_samples_counts_once_ascents_have_ended_on_it(optima
     off = samples.take((narrow(samples.x) < 1e-3).nonzero().squeeze(-1))
     slack, terms = judged(loop, value, off, zoo.rough_network(2, 3, size=0.1))
     sampled, excess = max(slack.suprema()), slack.excess(terms)
-    found = slack.climb(1.0, 32, 40)
+    found = slack.climb(UNCHANGED, 32, 40)
     assert max(e.value for e in found) == max(slack.suprema()) > 3.0 * sampled
     assert slack.excess(terms) > 3.0 * excess
-    assert max(slack.suprema(0.999)) > 3.0 * sampled  # and stays known where another multiple is tried
+    assert max(slack.suprema(Lowering(by=0.001))) > 3.0 * sampled  # and stays known where another multiple is tried
 
 
 def test_a_spike_that_all_sampled_states_miss_is_met_at_an_odd_state_on_it(optimal):
     problem, loop, samples = optimal
     narrow = spike(0.5, 1e-4, 0.05)
     value = lambda x: problem.exact_value(x) + narrow(x)
-    largest = lambda odd: max(ScaledSlack(loop, value, samples, odd).suprema())
+    largest = lambda odd: max(LoweredSlack(loop, value, samples, odd).suprema())
     on_it = torch.full((1, 2), 0.5, dtype=torch.float64)
     assert largest(None) < 1e-6
     assert largest(on_it) == pytest.approx(0.05, rel=1e-3)
@@ -109,8 +148,8 @@ def test_the_weight_of_missing_mass_follows_the_slack(optimal):
     """Deep slack on one side makes that side of the residual weigh more, within limits; a sign turned turns the ratio."""
     problem, loop, samples = optimal
     low, high = ((lambda x, c=c: problem.exact_value(x) + c) for c in (-0.1, 0.1))
-    assert positive_weight(*ScaledSlack(loop, low, samples).suprema()) == pytest.approx(4.0)
-    assert positive_weight(*ScaledSlack(loop, high, samples).suprema()) == pytest.approx(0.25)
+    assert positive_weight(*LoweredSlack(loop, low, samples).suprema()) == pytest.approx(4.0)
+    assert positive_weight(*LoweredSlack(loop, high, samples).suprema()) == pytest.approx(0.25)
     assert positive_weight(0.0, 0.0) == 1.0
 
 
