@@ -43,10 +43,6 @@ from ocp_torch.problems.samples import Samples
 if TYPE_CHECKING:
     from ocp_torch.certificate.context import Context
 
-# The first ascents may find a spike that another function of `V` makes lower: the suprema of the slack are climbed once more
-# where the best one is of another kind, or has moved by more than that.
-MOVED = 1e-4
-
 
 @dataclass(frozen=True)
 class ClosedLoopBounds:
@@ -82,12 +78,8 @@ def closed_loop_bounds(
     plain, _, densities, fluxes = zip(*found, strict=True)
     whole = Terms.join(plain)
     own = LoweredSlack(loop, value, whole.samples, odd)
-    how = own.lowest(whole)[1]
-    eps_hi, eps_lo = own.climb(how, ascents)
-    better = own.lowest(whole)[1]
-    if better.above != how.above or abs(better.by - how.by) > MOVED:
-        how = better
-        eps_hi, eps_lo = own.climb(how, ascents)
+    how = own.climbed_lowest(whole, ascents)
+    eps_hi, eps_lo = own.extrema(how, ascents)
     slacks = own.sampled.of(how).split([len(samples) for samples in sets])
     columns = zip(plain, densities, slacks, strict=True)
     terms = [replace(t, v=how(t.v), spent=density * slack) for t, density, slack in columns]

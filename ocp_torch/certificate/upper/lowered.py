@@ -25,7 +25,10 @@ from ocp_torch.problems.samples import Samples
 # What another function must give, relative to `|E[V mu0]|`: less is rounding.
 LEAST = 1e-7
 # Heights above which `V` is lowered, in parts of its range, and within which part of what is left the slope changes.
-HEIGHTS, BEND = (0.3, 0.6), 0.25
+HEIGHTS, BEND = (0.3, 0.6, 0.9), 0.25
+# Ascents may find a spike that another function of `V` makes lower: the best one is sought, and its slack climbed, so many
+# times, or until no ascent ends higher than that part above what was met.
+TIMES, HIGHER = 4, 0.01
 
 
 @dataclass(frozen=True)
@@ -144,18 +147,31 @@ class LoweredSlack:
         return _sides(self.met.of(how))
 
     @torch.no_grad()
-    def climb(self, how: Lowering, ascents: int, steps: int = 60) -> tuple[Extremum, Extremum]:
-        """`eps_hi` and `eps_lo` of `W` after so many ``steps`` of ``ascents`` from the states with the smallest and the
-        largest slack met, whose ends are met too."""
-        function, seen = slack_function(self.loop, Lowered(self.value, how)), len(self.met.x)
+    def climb(self, how: Lowering, ascents: int, steps: int = 60) -> None:
+        """Meet the ends of so many ``steps`` of ``ascents`` from where the slack of `W` is smallest and largest."""
+        function = slack_function(self.loop, Lowered(self.value, how))
         self._meet(slack_peaks(function, self.met.x, self.met.of(how), ascents, steps))
 
+    def extrema(self, how: Lowering, ascents: int) -> tuple[Extremum, Extremum]:
+        """`suprema`, and where they were met: by so many ``ascents`` among others."""
+
         def largest(side: Tensor) -> Extremum:
-            top = int(side.argmax())
+            top, seen = int(side.argmax()), len(self.sampled.x)
             return Extremum(max(float(side[top]), 0.0), self.met.x[top], seen, min(ascents, seen))
 
         slack = self.met.of(how)
         return largest(-slack), largest(slack)
+
+    def climbed_lowest(self, terms: Terms, ascents: int) -> Lowering:
+        """The best `W`, for the ``terms`` of any density, of those whose slack was climbed, by all that was met."""
+        tried: list[Lowering] = []
+        for _ in range(TIMES):
+            tried.append(self.lowest(terms)[1])
+            before = self.suprema(tried[-1])
+            self.climb(tried[-1], ascents)
+            if all(now <= (1.0 + HIGHER) * seen for now, seen in zip(self.suprema(tried[-1]), before, strict=True)):
+                break
+        return min(tried, key=lambda how: self._along(terms, how.above)(how.by)[0])
 
     @torch.no_grad()
     def lowest(self, terms: Terms) -> tuple[float, Lowering]:
@@ -165,28 +181,27 @@ class LoweredSlack:
         By parts `E[W mu0 - mu Q_u]` of `W` is that of `V` less `s E[h(V) r]`, which scatters little: none is chosen by
         chance.
         """
-
-        def along(above: Above) -> Callable[..., tuple[float, float]]:
-            part, h = self.met.part(above), above(terms.v)[0]
-
-            def bound(by: float, scale: float | None = None) -> tuple[float, float]:
-                """The bound, and the multiple of the density: the best one, where none is given."""
-                hi, lo = _sides(self.met.slack - by * part)
-                integrand = lambda t, s: t.lagrangian(s, hi, lo) - by * h * t.residual(s)
-                scale = best_multiple(terms, integrand) if scale is None else scale
-                return self.initial + integral(self.samples, integrand(terms, scale)), scale
-
-            return bound
-
-        lowest, scale = along(Above())(0.0)
+        lowest, scale = self._along(terms, Above())(0.0)
         how = UNCHANGED
         for above in self.choices:
-            bound = along(above)
+            bound = self._along(terms, above)
             by = minimiser(lambda by: bound(by, scale)[0], 1.0 - TOP, 1.0)  # noqa: B023
             found, _ = bound(by)
             if found < lowest - LEAST * self.unit:
                 lowest, how = found, Lowering(above, by)
         return lowest, how
+
+    def _along(self, terms: Terms, above: Above) -> Callable[..., tuple[float, float]]:
+        """By `s`, the bound of `W` and the multiple of the density: the best one, where none is given."""
+        part, h = self.met.part(above), above(terms.v)[0]
+
+        def bound(by: float, scale: float | None = None) -> tuple[float, float]:
+            hi, lo = _sides(self.met.slack - by * part)
+            integrand = lambda t, s: t.lagrangian(s, hi, lo) - by * h * t.residual(s)
+            scale = best_multiple(terms, integrand) if scale is None else scale
+            return self.initial + integral(self.samples, integrand(terms, scale)), scale
+
+        return bound
 
     def excess(self, terms: Terms) -> float:
         """What the residual adds to that bound, relative to `|E[V mu0]|`: what it is above `E[V mu0 - mu Q_u]`."""
