@@ -89,7 +89,8 @@ def closed_loop_bounds(
         states = torch.cat([states, odd])
         values = torch.cat([values, batched(value, odd)])
         mu = torch.cat([mu, batched(occupation, odd)])
-    top = float(how(torch.tensor(max(climbed_from(value, values, states, ascents).value, 0.0))))
+    highest = max(climbed_from(value, values, states, ascents).value, 0.0)
+    top = float(how(values.new_tensor(highest)))  # as W grows with V
     hi, lo, C_V = eps_hi.value, eps_lo.value, top + eps_hi.value
     started = [integral(t.samples, t.v * t.samples.mu0) for t in terms]
     if initial:  # of V itself

@@ -77,16 +77,15 @@ class Lowered:
         return self.how(self.value(x))
 
     def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
-        V = jet(self.value, x, sigma)
-        _, slope, bend = self.how.above(V.value)
-        found = V.map(lambda part: (1.0 - self.how.by * slope).view(-1, *[1] * (part.ndim - 1)) * part)
-        if sigma is not None:
-            found = Jet(None, found.gradient, found.curvature - self.how.by * bend * spread(sigma, V))
-        return Jet(self.how(V.value), found.gradient, found.curvature)
+        V, by = jet(self.value, x, sigma), self.how.by
+        h, slope, bend = self.how.above(V.value)
+        steep = 1.0 - by * slope
+        curvature = None if sigma is None else steep * V.curvature - by * bend * spread(sigma, V)
+        return Jet(V.value - by * h, steep.unsqueeze(-1) * V.gradient, curvature)
 
 
 def spread(sigma: Tensor, V: Jet) -> Tensor:
-    """`D : grad V grad V^T`, ``(N,)``: the rate at which the square of `V` grows by noise."""
+    """`D : grad V grad V^T`, ``(N,)``: half the rate of the quadratic variation of `V` along paths."""
     return 0.5 * pull_back(sigma, V.gradient).square().sum(-1)
 
 
@@ -102,10 +101,9 @@ class Met(NamedTuple):
     @classmethod
     def at(cls, loop: Generator, value: Field) -> "Met":
         samples, V = loop.data, loop.chunked_jet(value)
-        none = torch.zeros_like(V.value)
-        moved = none if (found := loop.transport(V)) is None else found
-        grown = none if samples.noise is None else spread(samples.noise, V) / loop.rho
-        return cls(samples.x, V.value, loop.hjb_slack(V), moved, grown)
+        moved, zero = loop.transport(V), torch.zeros_like(V.value)
+        varied = zero if samples.noise is None else spread(samples.noise, V) / loop.rho
+        return cls(samples.x, V.value, loop.hjb_slack(V), zero if moved is None else moved, varied)
 
     def part(self, above: Above) -> Tensor:
         """What the slack of `W` is less than that of `V`, for each unit of ``by``."""
