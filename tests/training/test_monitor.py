@@ -83,8 +83,8 @@ def test_running_estimates_take_a_small_part_of_the_time():
     running = RunningEstimates(trainer.problem, trainer.trained, 0)
     assert running.due(0.0)
     running._spent = 3.0
-    assert not running.due(90.0)
-    assert running.due(110.0)
+    assert not running.due(120.0)
+    assert running.due(130.0)
 
 
 @pytest.mark.parametrize("way", ["saddle with drift", "pd with drift"])

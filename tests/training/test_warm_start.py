@@ -134,7 +134,7 @@ def test_a_run_that_is_killed_in_its_warm_start_goes_on_to_the_same_bits(way, tm
 
 @pytest.mark.usefixtures("little")
 def test_the_controller_of_the_warm_start_is_a_candidate_and_can_be_handed_out(tmp_path):
-    trainer = small(*WARM, *FEW, "method=dual", "trainer.figures=false", "certificate.tolerance=0.05")
+    trainer = small(*WARM, *FEW, "model.modes=3", "method=dual", "trainer.figures=false", "certificate.tolerance=0.05")
     certificate = run_to_end(trainer, build_certificate_settings(trainer.config), tmp_path)
     assert {name for name, perf in certificate.perf.items() if perf is not None} == {"value", "trajectories"}
     # The bounds that take a divergence are of the controller that acts at every instant.
