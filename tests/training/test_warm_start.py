@@ -106,7 +106,7 @@ class Stop(Silent):
             raise KeyboardInterrupt
 
 
-PLAIN = ("problem=circle", "method=dual")
+PLAIN = ("problem=circle", "method=dual", "model.modes=3")
 NOISY = ("problem=cart_pole", "method=pd", "problem.noise=1e-3", "warm_start.rounds=24")
 ON_A_GRID = (*SWING, "method=dual", "warm_start.rounds=42")
 
