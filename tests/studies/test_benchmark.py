@@ -12,6 +12,7 @@ from ocp_torch.control import policies
 from ocp_torch.errors import InputError
 from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields, SobolevField
 from ocp_torch.gym.environment import ControlEnvironment, observe
+from ocp_torch.problems import PROBLEMS
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
@@ -79,6 +80,15 @@ def test_the_judge_agrees_with_quadrature_on_a_dense_grid():
     assert numbers["G"] == pytest.approx(float(G), abs=2e-5)
     assert numbers["F_M"] < problem.exact_optimum < numbers["G"] <= numbers["J"]
     assert min(numbers["value"], numbers["density"]) > problem.exact_optimum
+
+
+def test_the_judge_knows_no_bound_by_a_guessed_M():
+    problem = PROBLEMS["pendulum"](noise=1e-3)
+    constants = resolve_constants(problem)
+    fields = Fields({VALUE: zoo.rough_network(2, 3)})
+    assert constants.needs_no_M
+    assert "F_M" not in Judge(problem, constants)(fields, None, perf=False)
+    assert "F_M" in Judge(problem, resolve_constants(problem, occupation_bound=9.0))(fields, None, perf=False)
 
 
 def test_the_judge_finds_the_optimum_of_the_optimal_controller():

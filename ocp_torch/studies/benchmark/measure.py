@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from ocp_torch.certificate import BOUNDS, LOWER, UPPER, CertificateSettings, Run, StageSettings, Trained, bounds
 from ocp_torch.certificate.estimate import replicated_samples
+from ocp_torch.certificate.lower.penalised import PenalisedDual
 from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.certificate.trained import TrainedContext
 from ocp_torch.certificate.upper.penalised import DensityBounds
@@ -133,11 +134,13 @@ class Judge:
     @torch.no_grad()
     def __call__(self, fields: Fields, occupation: str | None, perf: bool = True) -> dict[str, float]:
         """The values of the listed bounds on `OPT` that ``fields`` give, `F_M`, `shifted`, `J` and `G` among them, and with
-        ``perf`` of the controllers' performances, `value` and `density`, all by their keys in `certificate.json`."""
+        ``perf`` of the controllers' performances, `value` and `density`, all by their keys in `certificate.json`. `F_M` is
+        left out where its `M` is guessed or none is large enough: it would be no bound."""
         trained = Trained(fields, occupation, nn.Identity)  # nothing is fitted, so that no network is made
         context = Measured(problem=self.problem, constants=self.constants, trained=trained, sets=self.sets)
         listed = [bound for bound in BOUNDS if bound.side in (LOWER, UPPER) and bound.applies(context)]
-        found = {bound.name: bound.evaluate(context) for bound in listed}
+        unproved = (PenalisedDual.name,) if self.constants.needs_no_M else ()
+        found = {bound.name: bound.evaluate(context) for bound in listed if bound.name not in unproved}
         numbers = {name: estimate.value for name, estimate in found.items() if estimate is not None}
         if perf:
             initial = None if context.sampled_value is None else context.sampled_value.initial
