@@ -34,7 +34,7 @@ class Budget:
 # .044 % below OPT, at 5e-3 .0014 %. Where nothing is lost 5e-3 costs little: .0013 for .0009, .0014 for .0008 %.
 # Beside kinks the number of steps counts: on a torus in two dimensions the certified gap is .031 to .064 % after 1,100 steps
 # of 512 states, .034 to .057 after 1,600 of 256, .032 to .046 after 1,600 of 384 and .032 to .040 after 2,000 of 256 (four
-# seeds; 19.5, 20.8, 22.5 and 22.5 s), and the last takes 2 s longer than the third with `pd`.
+# seeds; 19.5, 20.8 and 22.5 s alone; the last takes .5 to 1.7 s longer than the third, with `pd` 2 s).
 # Gauss-Newton steps on V end a round, and are tried just after waves of V were sought for the first time or the second: where
 # V is smooth they then find it to 1e-5 of the cost (seed 3202: 1-d 7 steps, 2-d 10, 8-d 17, 16-d 18, 32-d 17; 2-d after 100
 # steps 18; in 64-d, after 100, slacks of 1 are left at a few states), and beside kinks one or a dozen show that it is not.

@@ -74,10 +74,10 @@ def test_the_bounds_of_another_multiple_of_v_and_with_more_states_for_its_mean_a
         initial = [float((value(samples.x) * samples.mu0).mean())] * 2
         bounds.append(closed_loop_bounds(loop, value, log_mu, [samples] * 2, 4, "value", initial))
     one, other = bounds
-    v = problem.exact_value(samples.x) + rough(samples.x)
-    torch.testing.assert_close(one.how(v), other.how(0.8 * v), rtol=4e-2, atol=0.0)
+    more = closed_loop_bounds(loop, value, log_mu, [samples] * 2, 4, "value", [e + 0.01 for e in initial])
     for name in ("lagrangian", "J", "below"):
         assert getattr(one, name).value == pytest.approx(getattr(other, name).value, rel=1e-3)
+        assert getattr(more, name).value == pytest.approx(getattr(other, name).value + 0.01, rel=1e-9)
 
 
 @pytest.mark.parametrize("name", ["manufactured 2-d q=2", "noisy 2-d sigma(x)"])
@@ -93,7 +93,7 @@ def test_slack_and_derivatives_of_a_function_of_v_are_those_of_that_function(who
     for part in ("value", "gradient", "curvature"):
         torch.testing.assert_close(getattr(own, part), getattr(by_hand, part), rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(Met.at(L, V).of(how), L.hjb_slack(by_hand), rtol=1e-9, atol=1e-9)
-    assert how(torch.tensor(1e-300)) >= how(torch.tensor(-1.0))
+    assert bool((how(V(samples.x).sort().values).diff() >= 0.0).all())  # as C_V takes for granted
 
 
 def test_what_is_too_large_at_the_top_alone_is_taken_off_there(optimal):
