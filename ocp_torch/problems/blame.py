@@ -86,8 +86,8 @@ def place(x: Tensor) -> str:
 
 
 def failing_state(function: Callable[[Tensor], object], x: Tensor) -> Tensor | None:
-    """A state of ``x`` ``(N, d)`` at which ``function`` raises; `None` where it raises at any other as well (at each of
-    `OTHERS`), or at none of them alone."""
+    """A state of ``x`` ``(N, d)`` at which ``function`` raises; `None` where it raises at each of the `OTHERS` that are asked
+    too, or at none of them alone."""
 
     def raises(rows: Tensor) -> bool:
         try:
