@@ -29,7 +29,8 @@ SIZES = {
 # converge in 20 to 30 on the network above, on this one or with half of those waves not at all; a torus has the same gap.
 PLAIN = dict(modes=3, waves=32, width=128, depth=3, gated=False)
 # Where the worst state counts: waves at least, for an error that is small everywhere and not on average. And gelu leaves
-# fewer steep spots than tanh.
+# fewer steep spots than tanh, without products in any dimension: of six oscillators `F_M` with M = 40 was .641 with products
+# of tanh and .645 so, in two thirds of the time.
 MANY_WAVES = 64
 # In one dimension with noise, which turns a kink of the cost into one of the second derivative: on the circle with nu = 0.05
 # F_M was 0.055 % below OPT with 6 modes, and 0.017 % with 24 and the 2,000 steps that these take.
@@ -108,11 +109,11 @@ class PeriodicMLP(nn.Module):
         is decided by the worst state and not by an average."""
         sizes = next(sizes for largest, sizes in SIZES.items() if dim <= largest)
         sizes = PLAIN if 2 < dim <= 4 and (worst_state or noisy) else sizes
-        gentle = worst_state and not sizes["gated"]
-        waves = max(sizes["waves"], MANY_WAVES) if worst_state else sizes["waves"]
         if noisy and dim == 1:
             sizes = {**sizes, "modes": NOISY_MODES}
-        return {**sizes, "waves": waves, "activation": "gelu" if gentle else "tanh"}
+        if not worst_state:
+            return {**sizes, "activation": "tanh"}
+        return {**sizes, "gated": False, "waves": max(sizes["waves"], MANY_WAVES), "activation": "gelu"}
 
     @torch.no_grad()
     def add_waves(self, waves: Tensor) -> None:

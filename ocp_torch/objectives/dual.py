@@ -18,7 +18,9 @@ class Dual(Objective):
 
     Where no `M` is known to be large enough (`Constants.unbounded`) what is certified is `E[V mu0] - sup Q`. A large
     `M` keeps the supremum small; but from the start it ends in subsolutions far below `V*`, which have no gradient. So `M`
-    grows along a round: first `V` is too high, and then comes down until it is feasible.
+    grows along a round: first `V` is too high, and then comes down until it is feasible. That leaves it below `V*` nearly
+    everywhere, as hinges and noise of steps push it down only. So from the second round on, when `V` is close, the squared
+    slack weighs more; from the start it would lead to functions that solve the equation almost everywhere and are not `V*`.
     """
 
     players = {"value": (VALUE,)}
@@ -35,8 +37,8 @@ class Dual(Objective):
 
 
 def value_loss(phase: Phase, fields: Fields, samples: Samples, value: Tensor, slack: Tensor, residual: float) -> Tensor:
-    """What a value player on its own minimises: `E[M max(Q, 0) + (residual / s) Q^2 - V mu0]`."""
+    """What a value player on its own minimises: `E[M max(Q, 0) + (residual / s) Q^2 - V mu0]`, both weighed by ``phase``."""
     violation = phase.growth * phase.constants.M * slack.clamp_min(0.0)
     if residual > 0.0:
-        violation = violation + residual / getattr(fields.value, "scale", 1.0) * slack.square()
+        violation = violation + phase.attraction * residual / getattr(fields.value, "scale", 1.0) * slack.square()
     return samples.penalty(violation) - samples.mean(value * samples.mu0)

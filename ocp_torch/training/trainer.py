@@ -88,7 +88,8 @@ class Trainer:
     @property
     def phase(self) -> Phase:
         """What the next step's losses may know of time."""
-        return Phase(self.constants, self.settings.part_done(self.step, self.state.round), self.batches.ranks.size)
+        k = self.state.round
+        return Phase(self.constants, self.settings.part_done(self.step, k), self.batches.ranks.size, later=k > 0)
 
     def fit(self, monitor: Silent, checkpoint: Path | None = None, signals: Signals | None = None) -> str:
         """Train until there is a reason to stop, and return it; save to ``checkpoint`` on the way and at the end.

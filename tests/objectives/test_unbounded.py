@@ -9,12 +9,15 @@ import pytest
 from ocp_torch.fields import VALUE, Fields, PeriodicMLP
 from ocp_torch.maths.jets import jet
 from ocp_torch.objectives import Dual, Phase
+from ocp_torch.objectives.objective import LATER_ATTRACTION
 from ocp_torch.problems import Arm, Circle, Torus
 from ocp_torch.problems.constants import OCCUPATION_WEIGHT, resolve_constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.training.budgets import DENSITY_BATCH, fill
+from ocp_torch.training.monitor import Silent
 from support import zoo
+from support.small import small
 
 
 def test_which_problems_are_known_to_be_unbounded():
@@ -46,6 +49,43 @@ def test_the_weight_of_the_slack_grows_along_a_round():
     for progress, expected in ((0.0, M / 20.0), (0.35, M / math.sqrt(20.0)), (0.7, M), (1.0, M)):
         assert weights[True, progress] == pytest.approx(expected, rel=1e-6)
         assert weights[False, progress] == pytest.approx(M, rel=1e-6)
+
+
+@pytest.mark.parametrize("residual", [0.0, 0.3])
+def test_the_squared_slack_weighs_more_once_a_round_is_over(residual):
+    """Two losses, at the same states and weight of the hinge, differ by multiples of `residual / s E[Q^2]`; where `M` is
+    known, and in the paper's dual, by nothing."""
+    problem = zoo.build("arm n=2")
+    constants = resolve_constants(problem)
+    fields = Fields.build(problem, (VALUE,), partial(PeriodicMLP, width=16), 0).double()
+    samples = Samples.of(problem, zoo.states(problem, 500), divergences=False)
+    slack = Generator.of(problem, samples).hjb_slack(jet(fields.value, samples.x))
+    square = residual / float(fields.value.scale) * float(slack.square().mean())
+    for unbounded in (True, False):
+        phase = Phase(replace(constants, unbounded=unbounded), 0.5)
+        first, later = (
+            float(Dual(problem, residual=residual).losses(fields, samples, replace(phase, later=later))["value"])
+            for later in (False, True)
+        )
+        assert later - first == pytest.approx((LATER_ATTRACTION - 1.0) * square if unbounded else 0.0, abs=1e-9)
+        assert (phase.form == replace(phase, later=True).form) is not unbounded  # a replay of one is none of the other
+
+
+def test_a_run_tells_its_losses_that_a_round_is_over():
+    trainer = small("problem=arm", "method=dual", "trainer.steps=2", "trainer.rounds=2")
+    trainer.evaluator.reaches = lambda gap, run: False
+    seen, ask = [], trainer.objective.losses
+    trainer.objective.losses = lambda fields, samples, phase: seen.append(phase.later) or ask(fields, samples, phase)
+    trainer.fit(Silent())
+    assert seen == [False] * 2 + [True] * 4
+
+
+def test_the_worst_state_wants_no_products():
+    """With none in three dimensions and more, with or without noise; averages of smooth problems in many want them."""
+    for dim in (1, 2, 3, 5, 16):
+        for noisy in (False, True):
+            assert not PeriodicMLP.defaults(dim, worst_state=True, noisy=noisy)["gated"]
+    assert PeriodicMLP.defaults(5)["gated"]
 
 
 def test_default_sizes_follow():
