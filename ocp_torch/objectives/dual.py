@@ -40,5 +40,5 @@ def value_loss(phase: Phase, fields: Fields, samples: Samples, value: Tensor, sl
     """What a value player on its own minimises: `E[M max(Q, 0) + (residual / s) Q^2 - V mu0]`, both weighed by ``phase``."""
     violation = phase.growth * phase.constants.M * slack.clamp_min(0.0)
     if residual > 0.0:
-        violation = violation + phase.attraction * residual / getattr(fields.value, "scale", 1.0) * slack.square()
+        violation = violation + phase.residual_growth * residual / getattr(fields.value, "scale", 1.0) * slack.square()
     return samples.penalty(violation) - samples.mean(value * samples.mu0)

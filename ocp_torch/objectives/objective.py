@@ -24,7 +24,7 @@ LEAST_WEIGHT, GROWTH = 1.0 / 20.0, 0.7
 # And then the squared slack weighs so many times as much from the second round on. Simulated gaps in % with 1 and with 32:
 # six oscillators 2.88 and 1.69, dubins 1.42 and 1.06, a pendulum with limited torque 2.89 and 2.21, an arm .55 and .51, a
 # pendulum with noise .77 and .40. With 100 the arm has .99; where it weighs so much from the first step of a run on, 8.7.
-LATER_ATTRACTION = 32.0
+LATER_RESIDUAL = 32.0
 
 
 @dataclass(frozen=True)
@@ -50,16 +50,16 @@ class Phase:
         return LEAST_WEIGHT ** max(0.0, 1.0 - self.progress / GROWTH) if self.constants.unbounded else 1.0
 
     @property
-    def attraction(self) -> float:
+    def residual_growth(self) -> float:
         """What the weight of the squared slack is multiplied by: 1, but later on, where no `M` is known (see `Dual`)."""
-        return LATER_ATTRACTION if self.later and self.constants.unbounded else 1.0
+        return LATER_RESIDUAL if self.later and self.constants.unbounded else 1.0
 
     @property
     def form(self) -> tuple:
         """What stays the same for as long as losses are computed alike: all but `progress`, of which they may read `growth`,
         and `Objective.needs_divergences`."""
         constants = self.constants
-        return constants.M, constants.C_V, constants.C_u, constants.unbounded, self.shares, self.attraction
+        return constants.M, constants.C_V, constants.C_u, constants.unbounded, self.shares, self.residual_growth
 
 
 class Objective(ABC):

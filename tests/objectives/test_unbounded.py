@@ -9,7 +9,7 @@ import pytest
 from ocp_torch.fields import VALUE, Fields, PeriodicMLP
 from ocp_torch.maths.jets import jet
 from ocp_torch.objectives import Dual, Phase
-from ocp_torch.objectives.objective import LATER_ATTRACTION
+from ocp_torch.objectives.objective import LATER_RESIDUAL
 from ocp_torch.problems import Arm, Circle, Torus
 from ocp_torch.problems.constants import OCCUPATION_WEIGHT, resolve_constants
 from ocp_torch.problems.generator import Generator
@@ -67,7 +67,7 @@ def test_the_squared_slack_weighs_more_once_a_round_is_over(residual):
             float(Dual(problem, residual=residual).losses(fields, samples, replace(phase, later=later))["value"])
             for later in (False, True)
         )
-        assert later - first == pytest.approx((LATER_ATTRACTION - 1.0) * square if unbounded else 0.0, abs=1e-9)
+        assert later - first == pytest.approx((LATER_RESIDUAL - 1.0) * square if unbounded else 0.0, abs=1e-9)
         assert (phase.form == replace(phase, later=True).form) is not unbounded  # a replay of one is none of the other
 
 
