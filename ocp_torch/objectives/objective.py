@@ -21,9 +21,9 @@ CLOSED, SADDLE, NETWORK = "closed", "saddle", "network"
 # Where no `M` is known, its weight grows geometrically from this part of `M` to all of it, over this part of each round. A
 # heavier start leaves `V` stuck far below `V*`; a longer growth leaves it less of the round to become feasible.
 LEAST_WEIGHT, GROWTH = 1.0 / 20.0, 0.7
-# And then the squared slack weighs so many times as much from the second round on. Simulated gaps in % with 1 and with 33: six
-# oscillators 2.05 (192 wide) and 1.69 (128), dubins 1.42 and 1.06, a pendulum with limited torque 2.89 and 2.21, an arm .55
-# and .51, a pendulum with noise .77 and .40. With 100 the arm has .99; where it weighs 10 from the first step of a run on, 8.7.
+# And then the squared slack weighs so many times as much from the second round on. Simulated gaps in % with 1 and with 33:
+# six oscillators 2.05 (width 192) and 1.69 (128), dubins 1.42 and 1.06, a pendulum with limited torque 2.89 and 2.21, an arm
+# .55 and .51, a pendulum with noise .77 and .40. With 100 the arm has .99; where it weighs 10 from the first step on, 8.7.
 LATER_RESIDUAL = 32.0
 
 
