@@ -4,9 +4,11 @@ PyTorch's own threads wait for one another in a loop: of two processes with two 
 long as with one. Threads of Python wait without working, and give up their lock while PyTorch computes.
 """
 
+import math
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import cache
 from typing import TypeVar
 
 import torch
@@ -24,14 +26,47 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+@cache
+def _helpers(count: int) -> ThreadPoolExecutor:
+    """``count`` threads that wait for pieces: new ones for each call would take a millisecond and a half to be of use."""
+    return ThreadPoolExecutor(count, thread_name_prefix="ocp_torch pieces")
+
+
 def side_by_side(function: Callable[[T], S], pieces: Sequence[T], together: bool = True) -> list[S]:
-    """``function`` of each of ``pieces``: ``together``, for which it must be pure, or one after the other."""
-    threads = min(cores(), len(pieces)) if together else 1
-    if threads < 2:
+    """``function`` of each of ``pieces``: ``together``, for which it must be pure, or one after the other.
+
+    Whoever asks takes pieces too, so that nobody waits for a thread that others keep busy.
+    """
+    count = min(cores(), len(pieces)) - 1 if together else 0
+    if count < 1:
         return [function(piece) for piece in pieces]
-    # A thread would take as many of PyTorch's as there are cores, not as many as are set: slower, and sums in another order.
-    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(torch.get_num_threads(),)) as pool:
-        return list(pool.map(function, pieces))
+    left, found, threads = iter(list(enumerate(pieces))), dict[int, S](), torch.get_num_threads()
+
+    def work() -> None:
+        # A thread would take as many of PyTorch's as there are cores, not as many as are set: slower, and sums in another order.
+        if torch.get_num_threads() != threads:
+            torch.set_num_threads(threads)
+        for k, piece in left:  # whoever is free takes the next
+            found[k] = function(piece)
+
+    helping = [_helpers(cores() - 1).submit(work) for _ in range(count)]
+    try:
+        work()
+    finally:
+        wait([helper for helper in helping if not helper.cancel()])
+    for helper in helping:
+        if not helper.cancelled():
+            helper.result()  # raises what was raised there
+    return [found[k] for k in range(len(pieces))]
+
+
+def parted(count: int, size: int = CHUNK) -> list[int]:
+    """The sizes of an even number of pieces of ``count`` rows, as equal as can be and at most ``size``, for two cores to have
+    the same to do; a single one where all fit."""
+    if count <= size:
+        return [count]
+    pieces = 2 * math.ceil(count / (2 * size))
+    return [count // pieces + (k < count % pieces) for k in range(pieces)]
 
 
 def in_pieces(
@@ -40,5 +75,5 @@ def in_pieces(
     """The tensors ``function(rows)``, of a row for each of ``rows``: ``together`` from pieces of ``size``, or all at once."""
     if not together:
         return function(rows)
-    found = side_by_side(function, rows.split(size))
+    found = side_by_side(function, rows.split(parted(len(rows), size)))
     return tuple(torch.cat(parts) for parts in zip(*found, strict=True))

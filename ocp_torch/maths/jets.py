@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ocp_torch.maths.cores import CHUNK, side_by_side
+from ocp_torch.maths.cores import CHUNK, parted, side_by_side
 
 Field = Callable[[Tensor], Tensor]
 
@@ -110,9 +110,10 @@ def is_data(x: Tensor) -> bool:
 def chunked_jet(field: Field, x: Tensor, sigma: Tensor | None = None, chunk: int = CHUNK) -> Jet:
     """The jet of a scalar ``field`` at many states, without a graph; on all cores that of a network of this package, which is
     known by its method ``jet`` to be a pure function."""
-    columns = [None] * len(x.split(chunk)) if sigma is None else sigma.split(chunk)
+    sizes = parted(len(x), chunk)
+    columns = [None] * len(sizes) if sigma is None else sigma.split(sizes)
     quiet = torch.no_grad()(lambda of: jet(field, *of))  # each thread decides for itself whether there are graphs
-    pieces = list(zip(x.split(chunk), columns, strict=True))
+    pieces = list(zip(x.split(sizes), columns, strict=True))
     return Jet.concatenate(side_by_side(quiet, pieces, together=isinstance(field, nn.Module) and hasattr(field, "jet")))
 
 
