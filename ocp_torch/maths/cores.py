@@ -43,7 +43,7 @@ def side_by_side(function: Callable[[T], S], pieces: Sequence[T], together: bool
     left, found, threads = iter(list(enumerate(pieces))), dict[int, S](), torch.get_num_threads()
 
     def work() -> None:
-        # A thread would take as many of PyTorch's as there are cores, not as many as are set: slower, and sums in another order.
+        # A thread would take as many of PyTorch's as there are cores, not as are set: slower, and sums in another order.
         if torch.get_num_threads() != threads:
             torch.set_num_threads(threads)
         for k, piece in left:  # whoever is free takes the next
