@@ -80,11 +80,15 @@ def test_a_run_tells_its_losses_that_a_round_is_over():
     assert seen == [False] * 2 + [True] * 4
 
 
-def test_the_worst_state_wants_no_products():
-    """With none in three dimensions and more, with or without noise; averages of smooth problems in many want them."""
-    for dim in (1, 2, 3, 5, 16):
+def test_the_worst_state_wants_a_smooth_network():
+    """Without products in any dimension, with or without noise, and waves for each pair of coordinates but hardly more;
+    averages of smooth problems in many dimensions want products."""
+    for dim in (1, 2, 3, 5, 8):
         for noisy in (False, True):
-            assert not PeriodicMLP.defaults(dim, worst_state=True, noisy=noisy)["gated"]
+            sizes = PeriodicMLP.defaults(dim, worst_state=True, noisy=noisy)
+            assert not sizes["gated"]
+            assert sizes["activation"] == "silu"
+            assert math.comb(dim, 2) <= sizes["waves"] <= 64
     assert PeriodicMLP.defaults(5)["gated"]
 
 
