@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ocp_torch.cli.explain import CHECKOUT, CONFIGS, INSTALLED, explain
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, nearest
 from ocp_torch.runs.configuration import next_subfolder
 from ocp_torch.runs.resume import find_run, resumed_configuration
 
@@ -82,7 +82,7 @@ def composed(config_name: str, overrides: list[str], roots: tuple[Path, ...] = (
 def configuration(config_name: str, overrides: list[str], whole: bool = True) -> tuple[DictConfig, dict]:
     """The composed configuration with Hydra's own part, and without that part as plain data (see `resolved`).
 
-    Raises `InputError` where it cannot be composed, or a group or field of ``config_name`` is left out or has no place.
+    Raises `InputError` where it cannot be composed, or a group or field of ``config_name`` is left out, or another is added.
     """
     own = any(o.key_or_group == "problem._target_" and not o.is_delete() for o in parsed(overrides))
     for override in parsed(overrides):
@@ -108,10 +108,15 @@ def configuration(config_name: str, overrides: list[str], whole: bool = True) ->
     finally:
         GlobalHydra.instance().clear()
     chosen, fields = _file(config_name)
-    groups = [(key.partition("@")[2] or key).split(".")[0] for key, choice in chosen if choice is not None]
-    for name in (*groups, *fields):
+    groups = {(key.partition("@")[2] or key).split(".")[0]: choice for key, choice in chosen}
+    for name in (*(group for group, choice in groups.items() if choice is not None), *fields):
         if name not in data and not name.startswith(("hydra", "override ")):
             raise InputError(f"{name} is missing; give {name}=... on the command line.")
+    for name in data:
+        if name not in groups and name not in fields:
+            known = [known for known in (*groups, *fields) if not known.startswith(("hydra", "override "))]
+            hint = nearest(str(name), known)
+            raise InputError(f"{name} is not a field of the configuration{hint}; it has {', '.join(known)}.")
     return config, data
 
 

@@ -37,7 +37,8 @@ def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -
             takes = f"{field}=... takes one of {', '.join(choices(field))}, and {field}.<field>=... a value"
             return f"{field} is a group, not a field: {takes}."
         hint = field_hint(field, config_name, overrides)
-        return f"{field} is not a field of the configuration{hint}; write +{field}=... to add an argument of your own."
+        add = f"; write +{field}=... to add an argument of your own" if "." in field else ""
+        return f"{field} is not a field of the configuration{hint}{add}."
     missing = re.search(r"Missing mandatory value: ([\w.]+)", text)
     if missing:
         field = getattr(error, "full_key", None) or missing.group(1)

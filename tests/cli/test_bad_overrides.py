@@ -154,6 +154,8 @@ REFUSED = {
     ("~problem",): "~problem leaves out problem",
     ("problem=[]",): "problem is missing",
     ("method={a: 1}",): "method is a group, not a field",
+    ("+traner.steps=10",): "traner is not a field of the configuration (did you mean 'trainer'?)",
+    ("x=1",): "x is not a field of the configuration.",
     ("-m", "seed=1,x"): "seed is 'x'",
     ("-m", "trainer.steps=1,true"): "trainer.steps is True",
     ("-m", "averaging.decay=0.5,1"): "averaging.decay is 1",
