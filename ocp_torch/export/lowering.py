@@ -216,6 +216,9 @@ class Lowering:
     def _sign(self, x: View) -> View:
         return self._entrywise("sub", (self._entrywise("gt", (x, 0.0)), self._entrywise("lt", (x, 0.0))))
 
+    def _exp2(self, x: View) -> View:
+        return self._entrywise("exp", (self._entrywise("mul", (x, math.log(2.0))),))
+
     def _log1p(self, x: View) -> View:
         return self._entrywise("log", (self._entrywise("add", (1.0, x)),))
 

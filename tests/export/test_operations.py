@@ -19,6 +19,7 @@ FUNCTIONS = {
     "acos": lambda x: torch.acos(x.clamp(-1.0, 1.0)),
     "sinh": torch.sinh,
     "cosh": torch.cosh,
+    "exp2": torch.exp2,
     "gelu": lambda x: torch.nn.functional.gelu(4.0 * x),
     "cumsum": lambda x: x.cumsum(dim=1),
     "prod": lambda x: x.prod(dim=1, keepdim=True) + x,
