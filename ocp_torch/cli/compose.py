@@ -114,7 +114,7 @@ def configuration(config_name: str, overrides: list[str], whole: bool = True) ->
             raise InputError(f"{name} is missing; give {name}=... on the command line.")
     for name in data:
         if name not in groups and name not in fields:
-            known = [known for known in (*groups, *fields) if not known.startswith(("hydra", "override "))]
+            known = [own for own in (*groups, *fields) if not own.startswith(("hydra", "override "))]
             hint = nearest(str(name), known)
             raise InputError(f"{name} is not a field of the configuration{hint}; it has {', '.join(known)}.")
     return config, data

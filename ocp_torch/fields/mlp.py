@@ -1,6 +1,6 @@
 """Smooth multilayer perceptrons on a periodic embedding."""
 
-from math import inf
+from math import comb, inf
 from typing import Any
 
 import torch
@@ -28,16 +28,15 @@ SIZES = {
 # In three and four coordinates where the worst state counts, or with noise: where there are no Gauss-Newton steps. These
 # converge in 20 to 30 on the network above, on this one or with half of those waves not at all; a torus has the same gap.
 PLAIN = dict(modes=3, waves=32, width=128, depth=3, gated=False)
-# Where the worst state counts networks shall bend little, for an error that is small everywhere and not on average: silu, and
-# no products. With them tanh gave six oscillators an `F_M` with M = 40 of .641, without them gelu .645. With gelu their
-# simulated gap was 1.59 %, with silu 1.20 %, an arm's .51 and .82 or .64 and .67 %, that of dubins 1.06 and 1.36 or 1.31 and
-# 1.05 %; a step with silu takes four fifths of the time. Softplus left the oscillators 1.1 % where silu left 1.25 %, and the
-# arm .84 and .89 %.
+# Where the worst state counts a network shall bend little, for an error that is small everywhere and not on average: no
+# products, and silu. `F_M` with M = 40 of six oscillators was .641 with products and tanh, .645 without and with gelu. Their
+# simulated gap was 1.59 % with gelu, 1.20 % with silu; an arm's, on two seeds, .51 and .82, or .64 and .67 %; that of dubins
+# 1.06 and 1.36, or 1.31 and 1.05 %. A step with silu takes four fifths of the time. With softplus the arm has .84 and .89 %.
 SMOOTH = dict(gated=False, activation="silu")
-# How many waves then: in two coordinates all harmonics of kinks that fit the embedding help (an arm has .97 and 1.11 % with
-# 16), in more of them those not seen in the data make spikes. With 64 waves six oscillators had 1.2 %, dubins 1.05 %, a
-# unicycle .77 %, eight oscillators 5.4 %; with so many .9, .84, .66 and 4.2 %. A pair of coordinates is a wave or two.
-WAVES_IN_A_PLANE, WAVES_BEYOND, WAVES_FOR_EACH = 64, 16, 4
+# How many waves then. In two coordinates the harmonics of kinks help: an arm has .67 % with 64 waves, 1.11 % with 16. In more
+# of them such harmonics make spikes: six oscillators have 1.2 % with 64 waves and .9 % with 16, dubins 1.05 and .84, a
+# unicycle .77 and .66, eight oscillators 5.4 and 4.2 with 28. Each pair of coordinates has one, as far as `SIZES` has many.
+WAVES_IN_TWO, LEAST_WAVES, WAVES_PER_COORDINATE = 64, 16, 4
 # In one dimension with noise, which turns a kink of the cost into one of the second derivative: on the circle with nu = 0.05
 # F_M was 0.055 % below OPT with 6 modes, and 0.017 % with 24 and the 2,000 steps that these take.
 NOISY_MODES = 24
@@ -119,7 +118,8 @@ class PeriodicMLP(nn.Module):
             sizes = {**sizes, "modes": NOISY_MODES}
         if not worst_state:
             return {**sizes, "activation": "tanh"}
-        return {**sizes, **SMOOTH, "waves": WAVES_IN_A_PLANE if dim <= 2 else max(WAVES_BEYOND, WAVES_FOR_EACH * dim)}
+        enough = max(LEAST_WAVES, WAVES_PER_COORDINATE * dim, comb(dim, 2))
+        return {**sizes, **SMOOTH, "waves": WAVES_IN_TWO if dim <= 2 else min(sizes["waves"], enough)}
 
     @torch.no_grad()
     def add_waves(self, waves: Tensor) -> None:

@@ -40,23 +40,25 @@ def side_by_side(function: Callable[[T], S], pieces: Sequence[T], together: bool
     count = min(cores(), len(pieces)) - 1 if together else 0
     if count < 1:
         return [function(piece) for piece in pieces]
-    left, found, threads = iter(list(enumerate(pieces))), dict[int, S](), torch.get_num_threads()
+    left, found, failed = iter(list(enumerate(pieces))), dict[int, S](), dict[int, BaseException]()
+    threads = torch.get_num_threads()
 
     def work() -> None:
         # A thread would take as many of PyTorch's as there are cores, not as are set: slower, and sums in another order.
         if torch.get_num_threads() != threads:
             torch.set_num_threads(threads)
         for k, piece in left:  # whoever is free takes the next
-            found[k] = function(piece)
+            try:
+                found[k] = function(piece)
+            except BaseException as error:  # for whoever asked
+                failed[k] = error
+                return
 
     helping = [_helpers(cores() - 1).submit(work) for _ in range(count)]
-    try:
-        work()
-    finally:
-        wait([helper for helper in helping if not helper.cancel()])
-    for helper in helping:
-        if not helper.cancelled():
-            helper.result()  # raises what was raised there
+    work()
+    wait([helper for helper in helping if not helper.cancel()])
+    if failed:  # of several the one that a single core would meet: all pieces before it were taken before it
+        raise failed[min(failed)]
     return [found[k] for k in range(len(pieces))]
 
 

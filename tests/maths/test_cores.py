@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ocp_torch.maths import cores
-from ocp_torch.maths.cores import CHUNK, in_pieces, side_by_side
+from ocp_torch.maths.cores import CHUNK, in_pieces, parted, side_by_side
 
 
 @pytest.mark.parametrize(("count", "together"), [(1, True), (2, True), (4, True), (4, False)])
@@ -47,6 +47,31 @@ def test_an_error_in_a_piece_reaches_whoever_asked(monkeypatch, together):
 
     with pytest.raises(ArithmeticError, match="piece 1"):
         side_by_side(work, [0, 1, 2], together)
+
+
+def test_of_several_errors_it_is_the_first_that_is_told(monkeypatch):
+    monkeypatch.setattr(cores, "cores", lambda: 2)
+    later = threading.Event()
+
+    def work(k):
+        if k == 1:
+            later.set()
+        else:
+            later.wait(timeout=60.0)  # until the other has failed, or is about to
+        raise ArithmeticError(f"piece {k}")
+
+    with pytest.raises(ArithmeticError, match="piece 0"):
+        side_by_side(work, [0, 1])
+
+
+@pytest.mark.parametrize("size", [1, 7, CHUNK])
+@pytest.mark.parametrize("count", [0, 1, 6, 7, 8, 100, 2624])
+def test_parts_are_even_and_not_too_large(count, size):
+    sizes = parted(count, size)
+    assert sum(sizes) == count
+    assert max(sizes) <= size
+    assert max(sizes) - min(sizes) <= 1
+    assert len(sizes) == 1 or len(sizes) % 2 == 0
 
 
 @pytest.mark.parametrize("count", [1, CHUNK, 2 * CHUNK + 3])

@@ -83,12 +83,12 @@ def test_a_run_tells_its_losses_that_a_round_is_over():
 def test_the_worst_state_wants_a_smooth_network():
     """Without products in any dimension, with or without noise, and waves for each pair of coordinates but hardly more;
     averages of smooth problems in many dimensions want products."""
-    for dim in (1, 2, 3, 5, 8):
+    for dim in (1, 2, 3, 5, 8, 16):
         for noisy in (False, True):
             sizes = PeriodicMLP.defaults(dim, worst_state=True, noisy=noisy)
             assert not sizes["gated"]
             assert sizes["activation"] == "silu"
-            assert math.comb(dim, 2) <= sizes["waves"] <= 64
+            assert math.comb(dim, 2) <= sizes["waves"] <= 128
     assert PeriodicMLP.defaults(5)["gated"]
 
 
