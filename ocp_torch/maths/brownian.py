@@ -160,7 +160,7 @@ def expectation(
         at, fine = few.flatten(), Grid(grid.horizon, grid.steps * 2**halvings, grid.grading)
         drawn = torch.cat(moves, dim=2).flatten(1, 2)
         along = lambda n: path_integral(by, noise, x0[at[n]], fine.of(at[n]), drawn[:, n], weight)
-        integrals, end = in_pieces(along, torch.arange(len(at)), together, PIECE)
+        integrals, end = in_pieces(along, torch.arange(len(at)), together, PIECE, long=True)
         return integrals.view_as(few), end
 
     mass = weights.view_as(rows)

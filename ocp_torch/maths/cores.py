@@ -1,4 +1,5 @@
-"""Work in pieces, on as many cores as there are. The pieces do not depend on these, and so neither do the results.
+"""Work in pieces, on as many cores as there are, and on other processes of the run where these wait. The pieces do not depend
+on any of that, and so neither do the results.
 
 PyTorch's own threads wait for one another in a loop: of two processes with two of them on two cores each took three times as
 long as with one. Threads of Python wait without working, and give up their lock while PyTorch computes.
@@ -8,11 +9,13 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from functools import cache
+from functools import cache, partial
 from typing import TypeVar
 
 import torch
 from torch import Tensor
+
+from ocp_torch.maths.ranks import joined
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -22,8 +25,9 @@ CHUNK = 1024
 
 
 def cores() -> int:
-    """How many this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """How many this process may use, beside others of its run on this machine."""
+    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, there // joined().busy)
 
 
 @cache
@@ -62,6 +66,15 @@ def side_by_side(function: Callable[[T], S], pieces: Sequence[T], together: bool
     return [found[k] for k in range(len(pieces))]
 
 
+def spread(function: Callable[[T], S], pieces: Sequence[T], together: bool = True) -> list[S]:
+    """`side_by_side`, on other processes of the run that wait as well: for what takes longer than the way there and back."""
+    return (
+        joined().spread(partial(side_by_side, function), pieces)
+        if together
+        else side_by_side(function, pieces, together)
+    )
+
+
 def parted(count: int, size: int = CHUNK) -> list[int]:
     """The sizes of an even number of pieces of ``count`` rows, as equal as can be and at most ``size``, for two cores to have
     the same to do; a single one where all fit."""
@@ -72,10 +85,15 @@ def parted(count: int, size: int = CHUNK) -> list[int]:
 
 
 def in_pieces(
-    function: Callable[[Tensor], tuple[Tensor, ...]], rows: Tensor, together: bool, size: int = CHUNK
+    function: Callable[[Tensor], tuple[Tensor, ...]],
+    rows: Tensor,
+    together: bool,
+    size: int = CHUNK,
+    long: bool = False,
 ) -> tuple[Tensor, ...]:
-    """The tensors ``function(rows)``, of a row for each of ``rows``: ``together`` from pieces of ``size``, or all at once."""
+    """The tensors ``function(rows)``, of a row for each of ``rows``: ``together`` from pieces of ``size``, or all at once.
+    Pieces that take ``long`` are `spread`."""
     if not together:
         return function(rows)
-    found = side_by_side(function, rows.split(parted(len(rows), size)))
+    found = (spread if long else side_by_side)(function, rows.split(parted(len(rows), size)))
     return tuple(torch.cat(parts) for parts in zip(*found, strict=True))

@@ -15,9 +15,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ocp_torch.maths.cores import CHUNK, parted, side_by_side
+from ocp_torch.maths.cores import CHUNK, parted, side_by_side, spread
 
 Field = Callable[[Tensor], Tensor]
+
+# Of so many pieces and more other processes take some: the way there and back takes as long as one to four of them.
+MANY = 8
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,8 @@ def chunked_jet(field: Field, x: Tensor, sigma: Tensor | None = None, chunk: int
     columns = [None] * len(sizes) if sigma is None else sigma.split(sizes)
     quiet = torch.no_grad()(lambda of: jet(field, *of))  # each thread decides for itself whether there are graphs
     pieces = list(zip(x.split(sizes), columns, strict=True))
-    return Jet.concatenate(side_by_side(quiet, pieces, together=isinstance(field, nn.Module) and hasattr(field, "jet")))
+    shared = spread if len(pieces) >= MANY else side_by_side
+    return Jet.concatenate(shared(quiet, pieces, isinstance(field, nn.Module) and hasattr(field, "jet")))
 
 
 def value_and_jacobian(field: Field, x: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,10 +1,12 @@
 """The processes that torchrun starts for one run: which of them this one is, and what they tell one another.
 
-The first writes, prints and decides; the others take their shares of each batch. Collectives are for the main thread alone:
-two threads would begin theirs in another order on every process. Without torchrun a process is `Alone`, at no cost.
+The first writes, prints and decides; the others take their shares of each batch, and of what the first has to do while they
+wait for it. Collectives are for the main thread alone: two threads would begin theirs in another order on every process.
+Without torchrun a process is `Alone`, at no cost.
 """
 
 import os
+import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import timedelta
@@ -16,8 +18,10 @@ import torch.distributed as dist
 from torch import Tensor
 
 from ocp_torch.errors import InputError, ProblemError
+from ocp_torch.maths.packing import packed, unpacked
 
 T = TypeVar("T")
+S = TypeVar("S")
 
 # How long a process waits for the others in a step; and for the first one, which may be making a certificate.
 STEP, WORD = timedelta(minutes=15), timedelta(days=7)
@@ -39,9 +43,10 @@ class Alone:
     """The only process."""
 
     first, size, share = True, 1, slice(None)
+    busy = 1  # processes of the run that compute on this machine now
 
-    def use(self, device: torch.device) -> None:
-        """Take the means of what is on ``device``."""
+    def use(self, device: torch.device, problem: object = None) -> None:
+        """Take the means of what is on ``device``, of a run of ``problem``, which every process has."""
 
     def require_shares(self, name: str, count: int) -> None:
         """Raise `InputError` where ``count``, which ``name`` was given as, cannot be shared equally."""
@@ -58,9 +63,14 @@ class Alone:
         """Which of ``flags`` any process has raised, in time for the last `mean`: that is the same everywhere."""
         return list(flags)
 
-    def from_first(self, work: Callable[[], T]) -> T:
-        """What ``work``, which only the first process does, gives there."""
+    def from_first(self, work: Callable[[], T], told: Callable[[T], Any] = lambda found: found) -> Any:
+        """What ``work``, which only the first process does, gives there; the others get what ``told`` makes of it, and do
+        until then what it may `spread`."""
         return work()
+
+    def spread(self, work: Callable[[Sequence[T]], list[S]], pieces: Sequence[T]) -> list[S]:
+        """What the pure function ``work`` makes of each of ``pieces``, which the processes that wait for this one share."""
+        return work(pieces)
 
     def gathered(self, value: T) -> list[T]:
         """The ``value`` of each process."""
@@ -85,6 +95,8 @@ class Ranks(Alone):
         self.first, self.size, self.share = rank == 0, size, slice(rank, None, size)
         self._store, self._said, self._heard = store, list[bool](), list[bool]()
         self._steps: Any = None
+        self._problem: object = None
+        self._waited_for = False  # all others wait for this one in `from_first`
         self._together(self._join)  # the first may have left again before this one is connected
 
     def _join(self) -> None:
@@ -93,8 +105,13 @@ class Ranks(Alone):
         self._steps = dist.new_group(backend="gloo", timeout=STEP)
         dist.barrier(self._steps)  # who leaves before the others are connected makes Gloo print so
 
-    def use(self, device: torch.device) -> None:
+    @property
+    def busy(self) -> int:  # type: ignore[override]
+        return 1 if self._waited_for else int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+
+    def use(self, device: torch.device, problem: object = None) -> None:
         """Raises `InputError` where a GPU would be that of two processes."""
+        self._problem = problem
         if device.type != "cuda" or dist.get_backend(self._steps) == "nccl":
             return
         if (here := int(os.environ["LOCAL_WORLD_SIZE"])) > (has := torch.cuda.device_count()):
@@ -116,10 +133,60 @@ class Ranks(Alone):
         self._said = list(flags)
         return [*self._heard, *[False] * len(flags)][: len(flags)]
 
-    def from_first(self, work: Callable[[], T]) -> T:
-        told: list[Any] = [work() if self.first else None]
-        self._together(lambda: dist.broadcast_object_list(told, src=0))
-        return told[0]
+    def from_first(self, work: Callable[[], T], told: Callable[[T], Any] = lambda found: found) -> Any:
+        while not self.first:
+            task, found = self._heard_from_first()
+            if task is None:
+                return found
+            self._gathered_by_first(self._attempted(*unpacked(task, self._problem)))
+        self._waited_for = True
+        try:
+            found = work()
+        finally:
+            self._waited_for = False
+        self._heard_from_first(None, told(found))
+        return found
+
+    def spread(self, work: Callable[[Sequence[T]], list[S]], pieces: Sequence[T]) -> list[S]:
+        """Pieces at which another process fails are left to the first, which then says what is wrong."""
+        if not self._waited_for or len(pieces) < 2 or threading.current_thread() is not threading.main_thread():
+            return work(pieces)
+        self._waited_for = False
+        try:
+            self._heard_from_first(packed((work, pieces), self._problem))
+            own, error = None, None
+            try:
+                own = work(pieces[self.share])
+            except BaseException as raised:  # the others are about to give what they have found
+                error = raised
+            shares = self._gathered_by_first(own)
+            if error is not None:
+                raise error
+        finally:
+            self._waited_for = True
+        found: list[Any] = [None] * len(pieces)
+        for rank, share in enumerate(shares):
+            rows = slice(rank, None, self.size)
+            found[rows] = work(pieces[rows]) if share is None else share
+        return found
+
+    def _attempted(self, work: Callable[[Sequence[T]], list[S]], pieces: Sequence[T]) -> list[S] | None:
+        """What ``work`` makes of this process's share of ``pieces``; `None` where it fails."""
+        with suppress(Exception, SystemExit):
+            return work(pieces[self.share])
+        return None
+
+    def _heard_from_first(self, task: bytes | None = None, found: object = None) -> tuple[bytes | None, Any]:
+        """A ``task`` of the first process, or what it has ``found`` in the end, in all of them."""
+        heard = [(task, found)]
+        self._together(lambda: dist.broadcast_object_list(heard, src=0))
+        return heard[0]
+
+    def _gathered_by_first(self, value: T) -> list[T]:
+        """The ``value`` of each process, in the first; nothing in the others."""
+        values: list[Any] = [None] * self.size if self.first else []
+        self._together(lambda: dist.gather_object(value, values or None, dst=0))
+        return values
 
     def gathered(self, value: T) -> list[T]:
         values: list[Any] = [None] * self.size

@@ -135,12 +135,15 @@ def run_to_end(trainer: Trainer, settings: CertificateSettings, folder: Path) ->
 
 
 def assist(trainer: Trainer) -> None:
-    """What a process does that is not the first of its run: its share of every step. It writes nothing."""
+    """What a process does that is not the first of its run: its share of every step, and of the certificate. It writes
+    nothing."""
     if trainer.fresh:
         seed_generators(trainer.seed)
     with Signals() as signals:
-        while trainer.fit(Silent(), signals=signals) == TARGET_GAP and not trainer.ranks.from_first(bool):
+        trainer.fit(Silent(), signals=signals)
+        while not trainer.ranks.from_first(bool):
             postpone(trainer.state)
+            trainer.fit(Silent(), signals=signals)
 
 
 def handed_out(trainer: Trainer) -> str:
@@ -206,14 +209,23 @@ def _trained(
         signals.saved = True  # from here on a signal need not wait
         signals.take()
         monitor.stopped(trainer, f"Training stopped: {trainer.why_stopped}", settings)
-        fields, note = trainer.evaluator.choose(trainer.run)
-        certificate = trainer.certify(settings, fields)
-        gap = certificate.gap["certified"]
-        reached = gap is not None and target is not None and gap <= target
-        if reason != TARGET_GAP or trainer.ranks.from_first(partial(bool, reached)):
-            return with_warnings(trainer, certificate, [note] if note else []), fields
+        ended = partial(_certified, trainer, settings, target if reason == TARGET_GAP else None)
+        certificate, fields, enough = trainer.ranks.from_first(ended, lambda end: end[-1])
+        if enough:
+            return certificate, fields
         log.info("step %d: the certified gap is not %g yet; training goes on.", trainer.step, target)
         postpone(trainer.state)
+
+
+def _certified(
+    trainer: Trainer, settings: CertificateSettings, target: float | None
+) -> tuple[Certificate, Fields, bool]:
+    """The certificate, the fields it is of, and whether its gap is below ``target``, or there is none."""
+    fields, note = trainer.evaluator.choose(trainer.run)
+    certificate = trainer.certify(settings, fields)
+    gap = certificate.gap["certified"]
+    enough = target is None or (gap is not None and gap <= target)
+    return with_warnings(trainer, certificate, [note] if note else []) if enough else certificate, fields, enough
 
 
 def summary(trainer: Trainer) -> str:

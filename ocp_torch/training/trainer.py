@@ -104,7 +104,7 @@ class Trainer:
         """
         signals = signals or Signals()
         self.state.ended = False
-        self.ranks.use(self.settings.torch_device)
+        self.ranks.use(self.settings.torch_device, self.problem)
         self.stepper.ranks = self.batches.ranks = self.ranks
         try:
             self.stopped = self._until_stopped(monitor, checkpoint, signals)

@@ -1,13 +1,20 @@
 """One process is its own mean; several agree, fail and part as they should, by the files each leaves."""
 
 import os
+import threading
 
 import pytest
 import torch
 import torch.distributed as dist
 
+from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.errors import InputError, ProblemError
+from ocp_torch.maths.cores import cores, in_pieces, spread
+from ocp_torch.maths.jets import chunked_jet
 from ocp_torch.maths.ranks import Alone, Left, LostError, joined
+from ocp_torch.problems import Circle
+from support.zoo import rough_network
 
 
 def test_a_process_alone_gives_back_what_it_is_given():
@@ -87,3 +94,77 @@ def test_what_is_wrong_in_one_process_alone_is_raised_by_the_first():
         return ranks.alike(lambda: rank if rank != 1 else int("one"))
 
     assert parted(2, play) == [InputError.__name__, Left.__name__]
+
+
+def test_those_that_wait_for_the_first_take_their_share_of_its_pieces():
+    def play(ranks, rank):
+        def work():
+            shared = spread(lambda piece: (piece, os.getpid()), list(range(7)))
+            return [piece for piece, _ in shared], len({process for _, process in shared})
+
+        return ranks.from_first(work), ranks.from_first(work, told=lambda found: "told")
+
+    answer = ([*range(7)], 3)
+    assert parted(3, play) == [str((answer, answer)), *[str((answer, "told"))] * 2]
+
+
+def test_pieces_at_which_another_process_fails_fail_in_the_first():
+    def broken(piece):
+        raise ZeroDivisionError(f"of {piece}")
+
+    def odd(piece):
+        return broken(piece) if os.environ["RANK"] == "1" else piece
+
+    def work():
+        assert spread(odd, [0, 1, 2, 3]) == [0, 1, 2, 3]  # the others' luck is not the first one's
+        with pytest.raises(ZeroDivisionError, match="of 0"):
+            spread(broken, [0, 1, 2, 3])
+        return spread(abs, [-1, -2, -3])  # and all go on together
+
+    assert parted(2, lambda ranks, rank: ranks.from_first(work)) == ["[1, 2, 3]"] * 2
+
+
+def test_nothing_is_spread_by_another_thread_nor_where_nobody_waits(monkeypatch):
+    def play(ranks, rank):
+        ranks.use(torch.device("cpu"))
+        own = lambda: set(spread(lambda piece: os.getpid(), [0, 1, 2])) == {os.getpid()}
+        found = [own()]
+
+        def work():
+            thread = threading.Thread(target=lambda: found.append(own()))
+            thread.start()
+            thread.join()
+            found.append(spread(lambda piece: own(), [0, 1]) == [True, True])  # not what was spread already
+
+        ranks.from_first(work)
+        return found
+
+    assert parted(2, play) == ["[True, True, True]", "[True]"]
+
+
+def test_processes_on_one_machine_do_not_take_each_others_cores(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
+
+    def play(ranks, rank):
+        os.environ["LOCAL_WORLD_SIZE"] = "2"
+        return cores(), ranks.from_first(cores)
+
+    assert parted(2, play) == [str((4, 8))] * 2
+
+
+def test_a_simulation_and_slopes_are_the_same_to_the_bit_however_many_processes_share_them():
+    problem, value, x = Circle(), rough_network(1, 0).double(), torch.rand(9000, 1).double()
+    problem.kept = threading.Lock()  # what cannot be sent stays where it is
+    policy = ValuePolicy(problem, value)
+
+    def numbers():
+        seen = simulate_performance(problem, policy, 512, 8, 3, tolerance=0.1, rounded=(policy, None))
+        (squares,) = in_pieces(lambda rows: (rows**2,), x, True, long=True)
+        slopes = chunked_jet(value, x).gradient
+        return seen.perf, [float(part.sum()) for part in (seen.end_states, squares, slopes)]
+
+    def play(ranks, rank):
+        ranks.use(torch.device("cpu"), problem)
+        return ranks.from_first(numbers)
+
+    assert parted(2, play) == [str(numbers())] * 2

@@ -242,3 +242,22 @@ def test_torchrun_makes_a_run_in_one_folder(tmp_path):
     assert run.wait(300.0) == 0, out.read_text()
     assert out.read_text().count("controller from") == 1
     assert json.loads((folder / "certificate.json").read_text())["step"] == 60
+
+
+def dying():
+    """In the child: the second process dies over its first piece of the certificate."""
+    from ocp_torch.maths.ranks import Ranks
+
+    Ranks._attempted = lambda *_: os._exit(1)
+
+
+def test_a_death_while_the_certificate_is_made_ends_the_run_with_a_sentence_and_a_resume_makes_it(tmp_path):
+    folder = tmp_path / "run"
+    way = (*TINY, "certificate.trajectories=1024", f"hydra.run.dir={folder}")
+    first, _ = ended(shared(2, *way, cwd=tmp_path, before=dying))
+    assert "another process of this run died" in first.sentence
+    assert "go on with" in first.sentence
+    assert "Traceback" not in first.stdout + first.stderr
+    assert not (folder / "certificate.json").exists()
+    completed(f"resume={folder}", cwd=tmp_path)
+    assert certificate_in(folder)["gap"]["simulated"] is not None

@@ -68,7 +68,7 @@ class Thinning:
             if not len(on):
                 break
             part = lambda n: discounted_integral(switched, end[n], rho, duration, steps, wrap=False)
-            paid, after = in_pieces(part, on, together)
+            paid, after = in_pieces(part, on, together, long=True)
             paid = paid - worth(end[on]) + math.exp(-rho * duration) * worth(after)
             total[on] += self.count / self.kept(piece) * math.exp(-rho * piece * duration) * paid
             end[on] = after

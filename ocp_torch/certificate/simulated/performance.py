@@ -156,7 +156,8 @@ def simulate_performance(
             return discounted_integral(by, state[rows], rho, steps.horizon, count, wrap=False, grading=steps.grading)
 
         finer = in_finer_steps(some, steps.multiples)
-        all_rows = lambda rows, count: cast(tuple[Tensor, Tensor], in_pieces(lambda n: finer(n, count), rows, together))
+        pieces = lambda rows, count: in_pieces(lambda n: finer(n, count), rows, together, long=True)
+        all_rows = lambda rows, count: cast(tuple[Tensor, Tensor], pieces(rows, count))
         return all_rows if sliding is None else sliding.by(all_rows)
 
     swift, exact = steps.taken_by(quick), None if quick is dynamics else steps.taken_by(dynamics)
