@@ -42,7 +42,7 @@ def waves_of(x: Tensor, functions: list[Tensor], count: int, entries: int = 1) -
     left, right = (k.float() for k in candidate_parts(dim))
     score = torch.zeros(len(left), len(right), dtype=torch.float32)
     significant = torch.zeros(score.shape, dtype=torch.bool)
-    E_left, E_right = (_wave(x.float() @ k.T) for k in (left, right))
+    E_left, E_right = (conjugate(x.float() @ k.T) for k in (left, right))
     bar = math.log(score.numel() * len(functions)) + MARGIN
     for y in functions:
         # Under noise alone N |c|^2 is exponential with mean 1.
@@ -61,9 +61,14 @@ def waves_of(x: Tensor, functions: list[Tensor], count: int, entries: int = 1) -
     return torch.tensor(list(found), dtype=torch.float32).reshape(-1, dim)
 
 
-def _wave(turns: Tensor) -> Tensor:
+def conjugate(turns: Tensor) -> Tensor:
     """`e^{-2 pi i t}`."""
     return torch.polar(torch.ones_like(turns), -2.0 * math.pi * turns)
+
+
+def looks_at_all(dim: int) -> bool:
+    """Whether the candidates are all wave vectors with entries up to 2, or more."""
+    return 5**dim <= MOST_SUMS
 
 
 def candidate_parts(dim: int) -> tuple[Tensor, Tensor]:

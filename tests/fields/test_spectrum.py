@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from ocp_torch.certificate.estimate import integrals
 from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields, PeriodicMLP
+from ocp_torch.fields.coupled_waves import coupled_waves
 from ocp_torch.fields.waves import prominent_waves
 from ocp_torch.maths.jets import jet
 from ocp_torch.maths.sampling import evaluation_points
@@ -62,6 +63,61 @@ def test_pairs_are_found_in_many_dimensions(dim):
     waves[1, 3], waves[1, 7] = 1.0, 1.0
     waves[2, 5], waves[2, dim // 2] = 2.0, 1.0
     assert {tuple(k) for k in waves.tolist()} <= found_in(Planted(waves))
+
+
+def coupled_in(function, dim, known=()):
+    x = torch.rand(8192, dim, generator=torch.Generator().manual_seed(1))
+    return coupled_waves(function, x, torch.tensor([*torch.eye(dim).tolist(), *known]), 32)
+
+
+def test_waves_of_many_coordinates_are_found_in_many_dimensions():
+    """More than lists of candidates hold, small ones beside large ones too, and each once."""
+    waves = torch.zeros(4, 14)
+    waves[0, [0, 2, 5, 7, 13]] = torch.tensor([1.0, -1.0, 2.0, 1.0, -2.0])
+    waves[1] = 1.0
+    waves[2, [1, 2, 3, 4]] = torch.tensor([2.0, 1.0, 1.0, -1.0])
+    waves[3, [6, 8, 9, 10, 11, 12]] = -1.0
+    wanted = {tuple(wave) for wave in [*waves[:3].tolist(), (-waves[3]).tolist()]}
+    sizes = torch.tensor([1.0, 0.7, 1.0, 0.2])
+    function = lambda x: 3.0 + (TURN * (x @ waves.T)).cos() @ sizes + (TURN * x[:, 0]).sin()
+    found = coupled_in(function, 14).tolist()
+    assert {tuple(wave) for wave in found} == wanted
+    assert len(found) == 4
+    assert len(coupled_in(function, 14, waves[:3].tolist())) == 0  # what is left is not worth it
+    assert wanted - {tuple(wave) for wave in found_in(Planted(waves))}  # lists do not hold them
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0])
+def test_nothing_is_found_where_single_coordinates_make_all(size):
+    assert len(coupled_in(lambda x: 1.0 + size * (TURN * x).cos().sum(dim=-1), 10)) == 0
+
+
+class Asked(Planted):
+    """Says how many states its cost was asked at."""
+
+    concurrent, asked = True, 0
+
+    def state_cost(self, x):
+        self.asked += len(x)
+        return super().state_cost(x)
+
+
+class OneByOne(Asked):
+    """As a simulator that takes one state at a time."""
+
+    concurrent, scan_factor = False, 0
+
+
+def test_networks_get_them_where_states_cost_little():
+    waves = torch.tensor([[1.0, -1.0, 1.0, 2.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0]])
+    problem, dear = Asked(waves), OneByOne(waves)
+    network = partial(PeriodicMLP, width=8, modes=1, waves=4)
+    assert Fields.build(problem, (VALUE,), network, 0).value.embedding.mixed.tolist() == [
+        *waves.tolist(),
+        *[[0.0] * 10] * 3,
+    ]
+    assert not Fields.build(dear, (VALUE,), network, 0).value.embedding.mixed.any()
+    assert dear.asked < problem.asked
 
 
 def test_nothing_is_found_where_coordinates_do_not_interact():
