@@ -17,13 +17,13 @@ UNIT = 0.01
 
 
 class Logarithmic(nn.Module):
-    """`x -> unit (e^{network(x)} - 1)`, ``(N, d) -> (N,)``, for a scalar ``network``, which may resolve a state of rest."""
+    """`x -> unit (e^{logarithm(x)} - 1)`, ``(N, d) -> (N,)``, for a scalar network, which may resolve a state of rest."""
 
     unit: Tensor
 
     def __init__(self, network: nn.Module, unit: float) -> None:
         super().__init__()
-        self.network = network
+        self.logarithm = network
         self.register_buffer("unit", torch.tensor(float(unit)))
 
     @classmethod
@@ -33,11 +33,11 @@ class Logarithmic(nn.Module):
         return cls(network(shift=math.log1p(max(shift, 0.0) / unit), scale=1.0, centred=True, **form), unit)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.unit * (self.network(x).exp() - 1.0)
+        return self.unit * (self.logarithm(x).exp() - 1.0)
 
     def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
         """The jet at states ``(N, d)`` with noise ``sigma`` ``(N, d, k)``, as `jets.jet` has it, by the chain rule."""
-        z = jets.jet(self.network, x, sigma)
+        z = jets.jet(self.logarithm, x, sigma)
         grown = self.unit * z.value.exp()
         curvature = None
         if sigma is not None:

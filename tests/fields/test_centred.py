@@ -50,7 +50,7 @@ def test_a_jet_is_that_of_reverse_passes(columns):
         torch.manual_seed(1)
         network = Logarithmic.of(PeriodicMLP, dim=3, width=16, activation="tanh").double()
     features, at, bend = centred()
-    network.network.centred.centre(at, bend, 0.1)
+    network.logarithm.centred.centre(at, bend, 0.1)
     x = torch.rand(32, 3, dtype=torch.float64)
     sigma = None if columns is None else torch.randn(32, 3, columns, dtype=torch.float64)
     own, nested = jet(network, x, sigma), reverse_jet(network, x, sigma)
@@ -62,8 +62,8 @@ def test_only_the_value_of_a_warm_start_has_them():
     problem = PROBLEMS["pendulum"]()
     fields = Fields.build(problem, ("value", "trajectory_value"), PeriodicMLP, 0)
     assert fields.value.centred is None
-    own = fields.trajectory_value.network.centred
+    own = fields.trajectory_value.logarithm.centred
     torch.testing.assert_close(own.at.double(), equilibrium(problem).at)
     assert float(own.root.abs().max()) > 0.0
-    lost = Fields.build(PROBLEMS["dubins"](), ("trajectory_value",), PeriodicMLP, 0).trajectory_value.network.centred
+    lost = Fields.build(PROBLEMS["dubins"](), ("trajectory_value",), PeriodicMLP, 0).trajectory_value.logarithm.centred
     assert float(lost.root.abs().max()) == 0.0
