@@ -16,9 +16,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ocp_torch.fields.waves import MARGIN, conjugate
+from ocp_torch.fields.waves import MARGIN, conjugate, looks_at_all
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import batched
+from ocp_torch.problems.problem import Problem
 
 # Coordinates added at once, and the entries that each may have.
 ADDED, ENTRIES = 3, (0.0, 1.0, -1.0, 2.0, -2.0)
@@ -31,6 +32,13 @@ ALIKE, GROUPS, SURE, GO_ON, AT_ONCE = 64, 512, 4.0, 256, 64
 WORTH, PASSES = 0.15, 3
 # In more coordinates it would take longer than what it is for: 3 s in 12, 15 s in 32.
 DEEPEST = 32
+
+
+def may_be_coupled(problem: Problem) -> bool:
+    """Whether waves of ``problem`` may have more coordinates than `prominent_waves` looks at together, and it can be asked at
+    so many states."""
+    cheap = problem.has_simulator and (problem.concurrent or problem.scan_factor > 0)
+    return cheap and not looks_at_all(problem.dim) and problem.dim <= DEEPEST
 
 
 def coupled_waves(function: Callable[[Tensor], Tensor], x: Tensor, known: Tensor, count: int) -> Tensor:

@@ -10,11 +10,11 @@ from torch import Tensor, nn
 
 from ocp_torch.errors import InputError
 from ocp_torch.fields.centred import Centred
-from ocp_torch.fields.coupled_waves import DEEPEST, coupled_waves
+from ocp_torch.fields.coupled_waves import coupled_waves, may_be_coupled
 from ocp_torch.fields.embedding import FourierEmbedding
 from ocp_torch.fields.logarithmic import Logarithmic
 from ocp_torch.fields.rounded import Rounded
-from ocp_torch.fields.waves import STATES, looks_at_all, prominent_waves
+from ocp_torch.fields.waves import STATES, prominent_waves
 from ocp_torch.problems.equilibrium import equilibrium
 from ocp_torch.problems.problem import Problem
 
@@ -113,8 +113,7 @@ def _waves(problem: Problem, count: int) -> Tensor:
     if count not in known:
         samples, dim = problem.independent_samples(STATES), problem.dim
         known[count] = prominent_waves(samples, count)
-        cheap = problem.has_simulator and (problem.concurrent or problem.scan_factor > 0)
-        if len(known[count]) < count and not looks_at_all(dim) and dim <= DEEPEST and cheap:
+        if len(known[count]) < count and may_be_coupled(problem):
             listed = torch.cat([torch.eye(dim), 2.0 * torch.eye(dim), known[count]])
             more = coupled_waves(problem.state_cost, samples.x.float(), listed, count - len(known[count]))
             known[count] = torch.cat([known[count], more])

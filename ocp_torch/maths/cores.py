@@ -15,7 +15,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.ranks import joined
+from ocp_torch.maths.ranks import here
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -27,7 +27,7 @@ CHUNK = 1024
 def cores() -> int:
     """How many this process may use, beside others of its run on this machine."""
     there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, there // joined().busy)
+    return max(1, there // here().busy)
 
 
 @cache
@@ -69,9 +69,7 @@ def side_by_side(function: Callable[[T], S], pieces: Sequence[T], together: bool
 def spread(function: Callable[[T], S], pieces: Sequence[T], together: bool = True) -> list[S]:
     """`side_by_side`, on other processes of the run that wait as well: for what takes longer than the way there and back."""
     return (
-        joined().spread(partial(side_by_side, function), pieces)
-        if together
-        else side_by_side(function, pieces, together)
+        here().spread(partial(side_by_side, function), pieces) if together else side_by_side(function, pieces, together)
     )
 
 

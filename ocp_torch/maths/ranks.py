@@ -138,7 +138,7 @@ class Ranks(Alone):
             task, found = self._heard_from_first()
             if task is None:
                 return found
-            self._gathered_by_first(self._attempted(*unpacked(task, self._problem)))
+            self.gathered(self._attempted(*unpacked(task, self._problem)))
         self._waited_for = True
         try:
             found = work()
@@ -148,20 +148,18 @@ class Ranks(Alone):
         return found
 
     def spread(self, work: Callable[[Sequence[T]], list[S]], pieces: Sequence[T]) -> list[S]:
-        """Pieces at which another process fails are left to the first, which then says what is wrong."""
+        """Pieces at which a process fails are done again by the first, which then says what is wrong; and so are all, where
+        they cannot be sent."""
         if not self._waited_for or len(pieces) < 2 or threading.current_thread() is not threading.main_thread():
+            return work(pieces)
+        try:
+            task = packed((work, pieces), self._problem)
+        except Exception:  # whatever a stranger's object may raise
             return work(pieces)
         self._waited_for = False
         try:
-            self._heard_from_first(packed((work, pieces), self._problem))
-            own, error = None, None
-            try:
-                own = work(pieces[self.share])
-            except BaseException as raised:  # the others are about to give what they have found
-                error = raised
-            shares = self._gathered_by_first(own)
-            if error is not None:
-                raise error
+            self._heard_from_first(task)
+            shares = self.gathered(self._attempted(work, pieces))
         finally:
             self._waited_for = True
         found: list[Any] = [None] * len(pieces)
@@ -181,12 +179,6 @@ class Ranks(Alone):
         heard = [(task, found)]
         self._together(lambda: dist.broadcast_object_list(heard, src=0))
         return heard[0]
-
-    def _gathered_by_first(self, value: T) -> list[T]:
-        """The ``value`` of each process, in the first; nothing in the others."""
-        values: list[Any] = [None] * self.size if self.first else []
-        self._together(lambda: dist.gather_object(value, values or None, dst=0))
-        return values
 
     def gathered(self, value: T) -> list[T]:
         values: list[Any] = [None] * self.size
@@ -248,3 +240,8 @@ def joined() -> Alone:
     if torch.cuda.is_available():
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]) % torch.cuda.device_count())
     return Ranks(*next(dist.rendezvous("env://", timeout=timedelta(minutes=5))))
+
+
+def here() -> Alone:
+    """The same, without joining: who only loads a controller in a distributed program of one's own is alone."""
+    return joined() if joined.cache_info().currsize else Alone()

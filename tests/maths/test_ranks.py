@@ -12,7 +12,7 @@ from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.errors import InputError, ProblemError
 from ocp_torch.maths.cores import cores, in_pieces, spread
 from ocp_torch.maths.jets import chunked_jet
-from ocp_torch.maths.ranks import Alone, Left, LostError, joined
+from ocp_torch.maths.ranks import Alone, Left, LostError, here, joined
 from ocp_torch.problems import Circle
 from support.zoo import rough_network
 
@@ -25,6 +25,18 @@ def test_a_process_alone_gives_back_what_it_is_given():
     assert alone.from_first(lambda: 3) == alone.alike(lambda: 3) == 3
     assert alone.gathered(4) == [4]
     assert torch.arange(5)[alone.share].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_whoever_has_not_joined_is_alone_in_a_distributed_program_too(monkeypatch):
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "somebody's own")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    joined.cache_clear()
+    try:
+        assert cores() == len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else cores() >= 1
+        assert type(here()) is Alone
+        assert not dist.is_initialized()
+    finally:
+        joined.cache_clear()
 
 
 def test_only_equal_shares_are_shares():
@@ -117,6 +129,8 @@ def test_pieces_at_which_another_process_fails_fail_in_the_first():
 
     def work():
         assert spread(odd, [0, 1, 2, 3]) == [0, 1, 2, 3]  # the others' luck is not the first one's
+        lock = threading.Lock()
+        assert spread(lambda piece: (piece, lock)[0], [0, 1]) == [0, 1]  # which cannot be sent
         with pytest.raises(ZeroDivisionError, match="of 0"):
             spread(broken, [0, 1, 2, 3])
         return spread(abs, [-1, -2, -3])  # and all go on together

@@ -75,6 +75,15 @@ def test_the_terms_that_are_missing_are_found_and_none_that_is_there(noise):
     assert not both(found) & both(problem.V0.waves[kept])
 
 
+def test_terms_of_many_coordinates_are_found_when_they_are_asked_for():
+    problem, left_out = Manufactured(dim=10, interaction=7, drift=0.0, seed=2), [0, 3]
+    fields = Fields({VALUE: Lacking(problem, left_out)})
+    both = lambda waves: {tuple(k) for k in waves.tolist()} | {tuple(-e for e in k) for k in waves.tolist()}
+    wanted = both(problem.V0.waves[left_out])
+    assert not wanted & both(missed_waves(problem, fields))
+    assert wanted <= both(missed_waves(problem, fields, coupled=True))
+
+
 def test_the_exact_value_lacks_nothing_and_without_room_or_a_value_nothing_is_sought():
     problem = Manufactured(dim=5, seed=2)
     assert len(missed_waves(problem, Fields({VALUE: Lacking(problem, [])}))) == 0
