@@ -16,7 +16,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from ocp_torch.fields.waves import MARGIN, conjugate, looks_at_all
+from ocp_torch.fields.waves import MARGIN, conjugate, looks_at_all, standardised
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
@@ -45,6 +45,8 @@ def coupled_waves(function: Callable[[Tensor], Tensor], x: Tensor, known: Tensor
     """At most ``count`` wave vectors ``(W, d)`` of ``function`` ``(N, d) -> (N,)`` beside ``known`` ``(K, d)``, with entries
     of at most 2, found in what all of these leave of it; ``x`` ``(N, d)`` are independent states."""
     found, generator, y = known[:0], fixed_generator(), function(x)
+    if not standardised(y) or not y.isfinite().all():  # nothing varies, or checks of the problem say what is wrong
+        return found
     for k in range(PASSES):
         waves = torch.cat([known, found])
         weights = torch.linalg.lstsq(_design(x, waves), y.unsqueeze(-1)).solution
@@ -84,6 +86,8 @@ def _extended(function: Callable[[Tensor], Tensor], dim: int, generator: torch.G
         )
         strongest = torch.where(shows, energy, 0.0).flatten().argsort(descending=True)[: min(GO_ON, int(shows.sum()))]
         begun = torch.cat([begun[strongest // len(more)], more[strongest % len(more)]], dim=-1)
+        if not len(begun):
+            return torch.zeros(0, dim)
     return begun[(begun != 0.0).any(dim=-1)]
 
 

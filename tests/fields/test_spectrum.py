@@ -2,6 +2,7 @@
 
 import math
 from functools import partial
+from itertools import product
 
 import pytest
 import torch
@@ -90,6 +91,21 @@ def test_waves_of_many_coordinates_are_found_in_many_dimensions():
 @pytest.mark.parametrize("size", [0.0, 1.0])
 def test_nothing_is_found_where_single_coordinates_make_all(size):
     assert len(coupled_in(lambda x: 1.0 + size * (TURN * x).cos().sum(dim=-1), 10)) == 0
+
+
+def test_all_waves_of_a_parity_are_found_and_nothing_in_noise():
+    """`sign sin 2 pi x_1 .. sign sin 2 pi x_6`: 32 waves of six coordinates of the same size."""
+    found = coupled_in(lambda x: 2.0 - (TURN * x[:, :6]).sin().sign().prod(dim=-1), 9)
+    assert {tuple(wave) for wave in found.tolist()} == {
+        (1.0, *rest, 0.0, 0.0, 0.0) for rest in product((1.0, -1.0), repeat=5)
+    }
+    noise = torch.Generator().manual_seed(0)
+    assert len(coupled_in(lambda x: torch.randn(len(x), generator=noise), 9)) == 0
+
+
+@pytest.mark.parametrize("odd", [math.nan, math.inf])
+def test_a_cost_that_is_not_finite_has_no_waves(odd):
+    assert len(coupled_in(lambda x: torch.where(x[:, 0] > 0.999, odd, (TURN * x[:, 1]).cos()), 9)) == 0
 
 
 class Asked(Planted):
