@@ -30,8 +30,8 @@ ALIKE, GROUPS, SURE, GO_ON, AT_ONCE = 64, 512, 4.0, 256, 64
 # made too, are 6 to 14 %. Else what was found is taken off, and smaller ones show: in 12 coordinates with waves of four 20 of
 # 24 are found the first time, all of them the second.
 WORTH, PASSES = 0.15, 3
-# In more coordinates it would take longer than what it is for: 3 s in 12, 15 s in 32.
-DEEPEST = 32
+# In more coordinates it would take longer than what it is for: 3 s in 12, 15 in 32, a minute or two in 64.
+DEEPEST = 64
 
 
 def may_be_coupled(problem: Problem) -> bool:
