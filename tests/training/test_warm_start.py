@@ -54,6 +54,26 @@ def little(monkeypatch):
         monkeypatch.setattr(f"ocp_torch.training.warm_start.{name}", size)
 
 
+@pytest.mark.parametrize("bent", [True, False])
+def test_pieces_start_about_a_state_of_rest_at_every_height(bent):
+    problem, generator = PROBLEMS["cart_pole"](), torch.Generator().manual_seed(0)
+    settings = WarmStartSettings(mode="on", rounds=1, pieces=40, steps=2, trace=0.9)
+    pieces = Trajectories(problem, Pace.of(problem), torch.zeros(1, 4), settings, generator, unit=0.01)
+    rest = pieces.rest if bent else pieces.rest._replace(bend=torch.zeros(4, 4, dtype=torch.float64))
+    x = pieces._about(rest, 4096).double()
+    assert x.shape == (4096, 4)
+    assert ((x >= 0.0) & (x < 1.0)).all()
+    away = (x - rest.at + 0.5).remainder(1.0) - 0.5
+    assert float(away.abs().max()) <= 0.25 + 1e-6
+    if bent:
+        inside = away.abs().amax(dim=-1) < 0.24  # where nothing was cut off
+        height = 0.5 * torch.einsum("ni,ij,nj->n", away, rest.bend, away)[inside] / 0.01
+        assert 0.05 < float(height.min()) < 0.2
+        assert 1.0 < float(height.median()) < 10.0
+        assert float(height.max()) > 30.0
+    assert len(pieces._draw()) == 40
+
+
 @pytest.mark.parametrize("trace", [0.0, 0.6, 1.0])
 def test_lambda_returns_are_the_weighted_sum_of_all_returns_of_n_steps(trace):
     rho, step, K = 1.3, 0.2, 5

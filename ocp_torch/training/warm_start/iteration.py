@@ -49,7 +49,7 @@ class ValueIteration:
         self.source: GridValues | Trajectories = GridValues(problem, pace, self.like)
         if not GridValues.suits(problem):
             starts = drawn_starts(problem, POOLED * settings.pieces, place(0)).to(self.like)
-            self.source = Trajectories(problem, pace, starts, settings, self.generator)
+            self.source = Trajectories(problem, pace, starts, settings, self.generator, float(network.unit))
         self.trial = Trial(problem, pace, drawn_starts(problem, STARTS, place(1)).to(self.like), place(2))
         self.round, self.done = 0, False
         # Of the last fit, of the last trial and of the best one.

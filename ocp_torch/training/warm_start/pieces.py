@@ -7,32 +7,48 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.pace import Pace
 from ocp_torch.errors import InputError
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems import Problem
+from ocp_torch.problems.equilibrium import Equilibrium, equilibrium
 from ocp_torch.problems.samples import Samples
 from ocp_torch.training.warm_start.settings import WarmStartSettings
 from ocp_torch.training.warm_start.targets import Targets
 
-# Parts of the pieces that start uniformly, and where earlier pieces ended; the rest start as `mu0` says.
-UNIFORM, GOING_ON = 0.125, 0.5
+# Parts of the pieces that start uniformly, where earlier pieces ended, and about a state of rest, where there is one; the
+# others start as `mu0` says. A pendubot that never came to rest upright took `V` to be .13 there, where it is 0, and stayed
+# leaning by 22 degrees for ever.
+UNIFORM, GOING_ON, RESTING = 0.125, 0.5, 0.125
+# Those about a state of rest start where the quadratic `V` has risen by so many of its units.
+RISEN = (0.1, 100.0)
+# Along directions in which it is as good as flat, and in turns at most.
+FLAT, TINY, FARTHEST = 1e-6, 1e-300, 0.25
 # Starts that pieces draw from, for each piece.
 POOLED = 8
 
 
 class Trajectories:
-    """Returns along pieces of trajectory of ``problem``, which start among ``starts`` ``(M, d)`` and elsewhere."""
+    """Returns along pieces of trajectory of ``problem``, which start among ``starts`` ``(M, d)`` and elsewhere; ``unit`` is
+    that of `V`."""
 
     # A trial follows so many rounds; and the first learning rate of a fit, in units of the usual one.
     trial_every, fastest = 10, 1.5
 
     def __init__(
-        self, problem: Problem, pace: Pace, starts: Tensor, settings: WarmStartSettings, generator: torch.Generator
+        self,
+        problem: Problem,
+        pace: Pace,
+        starts: Tensor,
+        settings: WarmStartSettings,
+        generator: torch.Generator,
+        unit: float,
     ) -> None:
         self.problem, self.pace, self.starts, self.settings, self.generator = problem, pace, starts, settings, generator
+        self.rest, self.unit = equilibrium(problem), unit
         self.ends: Tensor | None = None  # (k, d), where pieces ended
         self.largest = math.inf if problem.state_cost_bound is None else float(problem.state_cost_bound)
         self.drawn = settings.pieces * settings.steps  # states a round
@@ -56,8 +72,19 @@ class Trajectories:
         count = self.settings.pieces
         ends = [] if self.ends is None else [self.ends]
         uniform = torch.rand(round(UNIFORM * count), self.problem.dim, generator=self.generator).to(self.starts)
-        rest = count - len(uniform) - sum(map(len, ends))
-        return torch.cat([uniform, self.starts[self._pick(len(self.starts), rest)], *ends])
+        about = [] if self.rest is None else [self._about(self.rest, round(RESTING * count))]
+        left = count - len(uniform) - sum(map(len, ends)) - sum(map(len, about))
+        return torch.cat([uniform, self.starts[self._pick(len(self.starts), left)], *ends, *about])
+
+    def _about(self, rest: Equilibrium, count: int) -> Tensor:
+        """States ``(count, d)`` about that of ``rest``, in every direction at every height of the quadratic `V`."""
+        drawn = lambda sampler, n: sampler(count, n, dtype=torch.float64, generator=self.generator)
+        low, high = (math.log(self.unit * units) for units in RISEN)
+        height = (low + (high - low) * drawn(torch.rand, 1)).exp()
+        sizes, axes = torch.linalg.eigh(0.5 * rest.bend)
+        along = height.sqrt() * normalize(drawn(torch.randn, self.problem.dim), dim=-1)
+        away = (along / sizes.clamp_min(max(FLAT * float(sizes[-1]), TINY)).sqrt()) @ axes.T
+        return (rest.at + away.clamp(-FARTHEST, FARTHEST)).remainder(1.0).to(self.starts)
 
     def _pick(self, of: int, count: int) -> Tensor:
         return torch.randint(of, (count,), generator=self.generator).to(self.starts.device)
