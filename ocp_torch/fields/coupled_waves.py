@@ -41,6 +41,7 @@ def may_be_coupled(problem: Problem) -> bool:
     return cheap and not looks_at_all(problem.dim) and problem.dim <= DEEPEST
 
 
+@torch.no_grad()
 def coupled_waves(function: Callable[[Tensor], Tensor], x: Tensor, known: Tensor, count: int) -> Tensor:
     """At most ``count`` wave vectors ``(W, d)`` of ``function`` ``(N, d) -> (N,)`` beside ``known`` ``(K, d)``, with entries
     of at most 2, found in what all of these leave of it; ``x`` ``(N, d)`` are independent states."""

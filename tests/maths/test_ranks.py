@@ -138,7 +138,7 @@ def test_pieces_at_which_another_process_fails_fail_in_the_first():
     assert parted(2, lambda ranks, rank: ranks.from_first(work)) == ["[1, 2, 3]"] * 2
 
 
-def test_nothing_is_spread_by_another_thread_nor_where_nobody_waits(monkeypatch):
+def test_nothing_is_spread_by_another_thread_nor_where_nobody_waits():
     def play(ranks, rank):
         ranks.use(torch.device("cpu"))
         own = lambda: set(spread(lambda piece: os.getpid(), [0, 1, 2])) == {os.getpid()}
