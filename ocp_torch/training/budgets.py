@@ -42,7 +42,7 @@ FIRST, SECOND = SOUGHT_AT[0] + 1, SOUGHT_AT[1] + 1
 BUDGETS = (
     Budget(1, steps=1050, batch=256, good_gap=0.005, stage_steps=150, newton_steps=40, newton_after=FIRST),
     Budget(2, steps=1600, batch=384, good_gap=0.003, stage_steps=200, newton_steps=40, newton_after=SECOND),
-    Budget(4, steps=1000, batch=384, good_gap=0.005, stage_steps=300, newton_steps=40, newton_after=SECOND),
+    Budget(4, steps=1000, batch=384, good_gap=0.005, stage_steps=300, newton_steps=40, newton_after=FIRST),
     Budget(8, steps=1000, batch=512, good_gap=0.01, stage_steps=300, newton_steps=40, newton_after=FIRST, lr=5e-3),
     Budget(
         math.inf,

@@ -18,10 +18,10 @@ from ocp_torch.problems.problem import Problem
 
 # The integral over the past is taken in pieces of so many discount times, until the last one adds next to nothing; what
 # has not settled after so many pieces is extrapolated.
-PIECE, PIECES, SETTLED = 5.0, 8, 1e-2
+PIECE, PIECES, SETTLED = 2.5, 16, 5e-3
 # Steps of a piece: in each no more than that part of a discount time passes, and no state moves farther than that part of a
 # turn, but so few and so many at least and at most; more are more exact and take longer.
-DISCOUNTED, MOVED, FEWEST_STEPS, MOST_STEPS = 0.25, 0.1, 20, 150
+DISCOUNTED, MOVED, FEWEST_STEPS, MOST_STEPS = 0.25, 0.1, 10, 75
 # The logarithm at which the growth of a density is cut off, so that it stays a number: e^60 is unbounded to any check.
 LARGEST_GROWTH = 60.0
 # Evaluations of the closed loop at each state and time where there is noise, at first and from the highest, shared by the

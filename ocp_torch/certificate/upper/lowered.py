@@ -28,8 +28,9 @@ LEAST = 1e-7
 # heights on four tori .3 was best three times and .8 once; .5 to .9 differ little where the spike is at the top alone.
 HEIGHTS, BEND = (0.3, 0.6, 0.9), 0.25
 # Ascents may find a spike that another function of `V` makes lower: the best one is sought, and its slack climbed, so many
-# times, or until no ascent ends higher than that part above what was met.
-TIMES, HIGHER = 4, 0.01
+# times, or until no ascent ends higher than that part above what was met, or the bound rises by less than that part of
+# `|E[V mu0]|`: where `V` solves its equation its slack is rounding, of which there is always a higher spike.
+TIMES, HIGHER, RISE = 4, 0.01, 1e-6
 
 
 @dataclass(frozen=True)
@@ -164,13 +165,16 @@ class LoweredSlack:
     def climbed_lowest(self, terms: Terms, ascents: int) -> Lowering:
         """The best `W`, for the ``terms`` of any density, of those whose slack was climbed, by all that was met."""
         tried: list[Lowering] = []
+        bound = lambda how: self._along(terms, how.above)(how.by)[0]
         for _ in range(TIMES):
-            tried.append(self.lowest(terms)[1])
-            before = self.suprema(tried[-1])
-            self.climb(tried[-1], ascents)
-            if all(now <= (1.0 + HIGHER) * seen for now, seen in zip(self.suprema(tried[-1]), before, strict=True)):
+            lowest, how = self.lowest(terms)
+            tried.append(how)
+            before = self.suprema(how)
+            self.climb(how, ascents)
+            higher = any(now > (1.0 + HIGHER) * seen for now, seen in zip(self.suprema(how), before, strict=True))
+            if not higher or bound(how) <= lowest + RISE * self.unit:
                 break
-        return min(tried, key=lambda how: self._along(terms, how.above)(how.by)[0])
+        return min(tried, key=bound)
 
     @torch.no_grad()
     def lowest(self, terms: Terms) -> tuple[float, Lowering]:
