@@ -50,7 +50,7 @@ def test_steps_are_those_of_the_formula(gated):
         J = torch.stack([torch.cat([g.flatten() for g in row]) for row in rows])
         phi = torch.zeros(J.shape[1], dtype=J.dtype) if before is None else MOMENTUM * before
         gram = J @ J.T
-        gram.diagonal().add_(DAMPING * gram.diagonal().mean())
+        gram.diagonal().add_(DAMPING[2] * gram.diagonal().mean())
         wanted = phi + J.T @ torch.linalg.solve(gram, residual.detach() - J @ phi)
         assert stepper.step(samples) == pytest.approx(float(residual.detach().square().mean().sqrt()), rel=1e-10)
         before = torch.cat([(w - p).flatten() for w, p in zip(weights, field.parameters(), strict=True)]).detach()
@@ -118,7 +118,7 @@ def test_steps_end_where_the_residual_is_small_enough_and_where_it_stays_as_it_i
 
 def test_states_that_are_all_alike_and_numbers_that_are_none_end_the_steps(monkeypatch):
     problem = Manufactured(dim=1)
-    monkeypatch.setattr(gauss_newton, "DAMPING", -1.0)  # no positive definite system
+    monkeypatch.setattr(gauss_newton, "DAMPING", {1: -1.0})  # no positive definite system
     assert (
         GaussNewton(network(1).double().requires_grad_(False), slack_of(problem)).step(draw_of(problem)(8)) == torch.inf
     )
