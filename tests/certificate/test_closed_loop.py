@@ -104,7 +104,7 @@ def test_the_stage_takes_another_round_only_while_the_residual_costs_too_much(mo
     network = partial(PeriodicMLP, modes=1, width=16, depth=2)
     fields = Fields.build(problem, ("value",), network, 0)
     policy = ValuePolicy(problem, problem.exact_value)
-    settings = StageSettings(steps=24, rounds=3, batch=64)
+    settings = StageSettings(steps=40, rounds=3, batch=64)
     fit = lambda **change: fit_closed_loop(
         problem, policy, fields, network, resolve_constants(problem), replace(settings, **change), seed=0
     )
@@ -114,7 +114,7 @@ def test_the_stage_takes_another_round_only_while_the_residual_costs_too_much(mo
     assert not torch.equal(weights(fit(good_excess=1e-12)), once)
 
 
-@pytest.mark.parametrize(("rounds", "good", "steps"), [(1, 1e-12, 30), (2, 1e-12, 60), (3, 1e-12, 120), (3, 1e12, 25)])
+@pytest.mark.parametrize(("rounds", "good", "steps"), [(1, 1e-12, 30), (2, 1e-12, 60), (3, 1e-12, 120), (3, 1e12, 100)])
 def test_where_the_slack_is_steep_one_long_round_is_made_until_the_excess_is_good(rounds, good, steps, monkeypatch):
     problem, made = zoo.build("manufactured 2-d q=2"), []
     network = partial(PeriodicMLP, modes=1, width=16, depth=2)
@@ -137,7 +137,7 @@ def test_the_first_round_ends_early_where_v_is_solved_so_well_that_any_density_w
     counted = policy_evaluation.advance
     monkeypatch.setattr(policy_evaluation, "advance", lambda *a: steps.append(0) or counted(*a))
     fit_closed_loop(problem, policy, fields, network, resolve_constants(problem), settings, seed=0)
-    assert len(steps) == (25 if solved else 250)
+    assert len(steps) == (100 if solved else 250)
 
 
 def test_a_fit_whose_first_steps_lose_all_mass_is_begun_anew_more_slowly(monkeypatch):
