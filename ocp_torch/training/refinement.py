@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 
 # States on which `F_M` is compared: the same for both, so that it differs by what the steps do.
 JUDGED = 8192
-# States among which the largest slacks are sought, and how many steps are climbed from how many of either sign.
-SOUGHT, PEAKS, CLIMBED = 4096, 16, 20
+# States among which the largest slacks are sought, and how many steps are climbed from how many of either sign. Among 4,096
+# states in eight coordinates a spike of 1e-3 was missed, and the certified gap .010 %; among these it was found: .0006 %.
+SOUGHT, PEAKS, CLIMBED = 16384, 16, 20
 # A slack whose root mean square is so small a part of the mean state cost is small enough for the steps to end, and for
 # training: `F_M` was .0001 to .0003 % below OPT where it is below the first, .002 % where it is just below the second.
 ENOUGH, SOLVED = 5e-6, 4e-5
