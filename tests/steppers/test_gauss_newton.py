@@ -1,6 +1,7 @@
 """Gauss-Newton steps: each against its formula with a Jacobian that is written down, and where they lead."""
 
 import copy
+import math
 
 import pytest
 import torch
@@ -35,10 +36,10 @@ def network(dim, **form):
     return made
 
 
-@pytest.mark.parametrize("gated", [False, True])
-def test_steps_are_those_of_the_formula(gated):
-    problem = Manufactured(dim=2, exponent=1.7)
-    field, draw = network(2, depth=2, gated=gated).double().requires_grad_(False), draw_of(problem)
+@pytest.mark.parametrize(("dim", "gated", "damping"), [(2, False, DAMPING[2]), (3, True, DAMPING[math.inf])])
+def test_steps_are_those_of_the_formula(dim, gated, damping):
+    problem = Manufactured(dim=dim, exponent=1.7)
+    field, draw = network(dim, depth=2, gated=gated).double().requires_grad_(False), draw_of(problem)
     stepper, before = GaussNewton(field, slack_of(problem)), None
     for _ in range(3):
         samples, weights = draw(20), [p.clone().requires_grad_(True) for p in field.parameters()]
@@ -50,7 +51,7 @@ def test_steps_are_those_of_the_formula(gated):
         J = torch.stack([torch.cat([g.flatten() for g in row]) for row in rows])
         phi = torch.zeros(J.shape[1], dtype=J.dtype) if before is None else MOMENTUM * before
         gram = J @ J.T
-        gram.diagonal().add_(DAMPING[2] * gram.diagonal().mean())
+        gram.diagonal().add_(damping * gram.diagonal().mean())
         wanted = phi + J.T @ torch.linalg.solve(gram, residual.detach() - J @ phi)
         assert stepper.step(samples) == pytest.approx(float(residual.detach().square().mean().sqrt()), rel=1e-10)
         before = torch.cat([(w - p).flatten() for w, p in zip(weights, field.parameters(), strict=True)]).detach()
