@@ -27,8 +27,8 @@ from ocp_torch.problems.samples import Samples
 # States of a step: in 64 coordinates steps on 512 diverge, on 1,024 they converge.
 STATES = 1024
 # The damping `l` relative to the mean of the diagonal, up to so many coordinates: with 1e-3 convergence is several times
-# slower, with 1e-6 four, eight and sixteen coordinates take 42, 36 and 32 steps, with 1e-7 30, 25 and 24. In one and two they
-# take as many with either, but the states are more than a small network has degrees of freedom, and some residuals explode.
+# slower; with 1e-6 four, eight and sixteen coordinates take 42, 36 and 32 steps, with 1e-7 30, 25 and 24 (one seed each). One
+# and two coordinates take no fewer, and in one, with 24 units to a layer, the first steps make residuals ten times as large.
 DAMPING = {2: 1e-6, math.inf: 1e-7}
 # The momentum `m`: with none there is hardly any convergence, with .9 it is no faster.
 MOMENTUM = 0.8
@@ -81,7 +81,7 @@ class GaussNewton:
         residual = residual.detach()
         sweep.turn(*slopes)
         gram = sweep.products()
-        damping = next(l for most, l in DAMPING.items() if samples.x.shape[1] <= most)
+        damping = next(part for most, part in DAMPING.items() if samples.x.shape[1] <= most)
         gram.diagonal().add_(damping * gram.diagonal().mean())
         wanted = residual if self.momentum is None else residual - MOMENTUM * self._along(samples)
         factor, failed = torch.linalg.cholesky_ex(gram)

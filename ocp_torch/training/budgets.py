@@ -38,7 +38,7 @@ class Budget:
 # Gauss-Newton steps on V end a round, and are tried just after waves of V were sought for the first time or the second: where
 # V is smooth they then find it to 1e-5 of the cost (seed 3202: 1-d 7 steps, 2-d 10, 8-d 17, 16-d 18, 32-d 17; 2-d after 100
 # steps 18; in 64-d, after 100, slacks of 1 are left at a few states), and beside kinks one or a dozen show that it is not.
-# Whole runs in 4-d take 19 to 21 s where they are tried after 100 steps, 21 to 25 after 200.
+# Whole runs in 4-d take 19 to 21 s where they are tried after 100 steps (three seeds), 21 and 25 after 200 (two).
 FIRST, SECOND = SOUGHT_AT[0] + 1, SOUGHT_AT[1] + 1
 BUDGETS = (
     Budget(1, steps=1050, batch=256, good_gap=0.005, stage_steps=150, newton_steps=40, newton_after=FIRST),

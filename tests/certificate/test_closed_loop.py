@@ -18,6 +18,7 @@ from ocp_torch.certificate.upper.policy_evaluation import (
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.maths.runge_kutta import discounted_integral
+from ocp_torch.maths.sampling import SobolSampler
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.generator import Generator
@@ -125,6 +126,36 @@ def test_where_the_slack_is_steep_one_long_round_is_made_until_the_excess_is_goo
     policy = ValuePolicy(problem, problem.exact_value)
     fit_closed_loop(problem, policy, fields, network, resolve_constants(problem), settings, seed=0)
     assert made == [32] * steps
+
+
+@pytest.mark.parametrize("good_from", [1, 2])
+def test_a_round_ends_at_the_first_look_that_finds_a_good_excess(good_from, monkeypatch):
+    problem, made, looks = zoo.build("manufactured 2-d q=2"), [], []
+    network = partial(PeriodicMLP, modes=1, width=16, depth=2)
+    counted = policy_evaluation.advance
+    monkeypatch.setattr(policy_evaluation, "advance", lambda *a: made.append(0) or counted(*a))
+    seen = lambda self, terms: looks.append(len(made)) or (0.0 if len(looks) >= good_from else 1.0)
+    monkeypatch.setattr(policy_evaluation.LoweredSlack, "excess", seen)
+    fields, policy = Fields({"value": network(problem.dim)}), ValuePolicy(problem, problem.exact_value)
+    settings = StageSettings(steps=200, rounds=1, batch=16)
+    fit_closed_loop(problem, policy, fields, network, resolve_constants(problem), settings, seed=0)
+    assert looks == [100, 125][:good_from]
+    assert len(made) == looks[-1]
+
+
+def test_a_pool_makes_what_is_drawn_and_gives_the_same_states_again_only_after_all(monkeypatch):
+    monkeypatch.setattr(policy_evaluation, "EXCESS_STATES", 8)
+    problem = zoo.build("manufactured 2-d q=2")
+    loop = ClosedLoop(problem, ValuePolicy(problem, problem.exact_value))
+    pool = policy_evaluation.Pool(loop, 1, torch.zeros(()), 20)
+    assert len(pool.samples) == 8
+    first = [pool.draw(6).x for _ in range(3)]
+    assert len(pool.samples) == 20
+    wanted = SobolSampler(2, 1, torch.float32).draw(20)
+    assert torch.equal(torch.cat(first), wanted[:18])
+    assert torch.equal(pool.draw(6).x, torch.cat([wanted[18:], wanted[:4]]))
+    pool.grow(30)
+    assert torch.equal(pool.draw(6).x, SobolSampler(2, 1, torch.float32).draw(30)[24:])
 
 
 @pytest.mark.parametrize("solved", [False, True])

@@ -162,3 +162,18 @@ def test_peaks_of_the_slack_are_of_both_signs():
     assert found.shape == (2 * PEAKS, 2)
     assert bool((slack(found[:PEAKS]) <= -(-slack(x)).topk(PEAKS).values + 1e-12).all())
     assert bool((slack(found[PEAKS:]) >= slack(x).topk(PEAKS).values - 1e-12).all())
+
+
+@pytest.mark.parametrize(("off", "again"), [(1e-9, False), (0.1, True)])
+def test_spikes_are_sought_again_while_those_found_raise_the_bound(off, again, optimal, monkeypatch):
+    problem, loop, samples = optimal
+    slack, terms = judged(loop, lambda x: problem.exact_value(x) + off, samples, zoo.rough_network(2, 3, size=0.1))
+    climbs = []
+
+    def climb(self, how, ascents, steps=60):
+        climbs.append(how)
+        self.met = self.met._replace(slack=1.5 * self.met.slack)
+
+    monkeypatch.setattr(LoweredSlack, "climb", climb)
+    slack.climbed_lowest(terms, ascents=1)
+    assert (len(climbs) > 1) == again

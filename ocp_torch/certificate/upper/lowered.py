@@ -29,7 +29,8 @@ LEAST = 1e-7
 HEIGHTS, BEND = (0.3, 0.6, 0.9), 0.25
 # Ascents may find a spike that another function of `V` makes lower: the best one is sought, and its slack climbed, so many
 # times, or until no ascent ends higher than that part above what was met, or the bound rises by less than that part of
-# `|E[V mu0]|`: where `V` solves its equation its slack is rounding, of which there is always a higher spike.
+# `|E[V mu0]|`: where `V` solves its equation higher spikes are always found, and hardly count. In eight coordinates the
+# ascents then take 2.2 s for 3.7.
 TIMES, HIGHER, RISE = 4, 0.01, 1e-6
 
 

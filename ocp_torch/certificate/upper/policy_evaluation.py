@@ -40,12 +40,12 @@ MOST_LOPSIDED = 16.0
 LOOKED_AT, LEAST_MASS, SLOWER, SLOWEST = 40, 0.01, 0.3, 1e-3
 # Ascents of either sign, and their steps: of 64 coordinates the largest slack at 4,096 states was .1 where they found 7.
 PEAKS, CLIMBED = 32, 40
-# States at which the excess is computed after a round: what decides on a next one need not be exact. In the first one that is
-# made it is also looked at after so many steps, and then again after each so many, and the round ends once the excess is that
-# part of what is good enough: where the slack is steep the last number (at 1 the circle's certified gap was .002 % wider than
-# with a round of 300 steps), elsewhere the other, as any `mu` will do where `V` solves its equation. After 25 steps that is
-# so already (an excess of 5e-6 in 16 coordinates), but where the certificate then finds spikes of the slack the bound was
-# 5e-5 above the optimum, after 100 steps 5e-6.
+# States at which the excess is computed after a round, and that are made at once: what decides need not be exact. In the
+# first one that is made it is also looked at after so many steps, and then again after each so many, and the round ends once
+# the excess is that part of what is good enough: where the slack is steep the last number (at 1 the circle's certified gap
+# was .002 % wider than with a round of 300 steps), elsewhere the other, as any `mu` will do where `V` solves its equation.
+# After 25 steps that is so already (an excess of 5e-6 in 16 coordinates), but where the certificate then finds spikes of the
+# slack the bound was 5e-5 above the optimum, after 100 steps 5e-6.
 EXCESS_STATES, EXCESS_FIRST, EXCESS_EVERY, EXCELLENT, GOOD = 4096, 100, 25, 0.05, 0.5
 
 
