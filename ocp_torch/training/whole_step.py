@@ -13,7 +13,9 @@ from ocp_torch.training.state import TrainState
 def whole_step(state: TrainState, phase: Phase, ranks: Alone) -> StepReport:
     """One step of ``state`` at ``phase``. Where others of ``ranks`` are lost in the middle of it, all that it moved is put
     back, and `LostError` raised. Raises `NonFiniteError` as `Stepper.step` does."""
-    moved: Sequence[Any] = (state.batches, state.stepper, state.fields) if ranks.size > 1 else ()
+    moved: Sequence[Any] = (state.batches,) if ranks.size > 1 else ()
+    if moved and state.stepper.draws > 1:  # one of a single batch moves no weights before it has heard of all others
+        moved = (state.batches, state.stepper, state.fields)
     before = [copy.deepcopy(part.state_dict()) for part in moved]
     try:
         return advance(state.stepper, state.average, state.batches.draw, phase)
