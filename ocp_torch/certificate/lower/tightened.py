@@ -31,9 +31,9 @@ from ocp_torch.steppers.nonfinite import NonFiniteError
 # stands for its supremum. With noise kinks are rounded, and a step takes twice as long.
 ROUNDS, NOISY_ROUNDS = ((1000.0, 600, 5e-3), (3000.0, 1400, 3e-3)), ((3000.0, 700, 2e-3),)
 # Memory of the optimiser's moments, below the usual (.95, .95): with that, at 1e-3, one `V` of a unicycle came to 1.2959 by
-# 2,100 steps and to 1.2986 by 4,500, with this, at 5e-3, to 1.2985 by 2,000 (mean over the part 1 / 3000). Bounds, and
-# seconds of one core, of the two: a pendulum with limited torque 2.979 (61) and 3.004 (56), dubins 1.1503 (108) and 1.1505
-# (74, 2,500 steps), with noise 1.1725 (62, 1,400 steps at 1e-3) and 1.1726 (34). With (.8, .95) more spikes are left.
+# 2,100 steps and to 1.2986 by 4,500, with this, at 5e-3, to 1.2985 by 2,000 (mean over the part 1 / 3000), as with (.8, .95).
+# Bounds, and seconds of one core, of the two: a pendulum with limited torque 2.979 (61) and 3.004 (56), dubins 1.1503 (108)
+# and 1.1505 (74, 2,500 steps); with noise dubins 1.1725 (62, 1,400 steps at 1e-3) and 1.1726 (34, 700 at 2e-3).
 BETAS = (0.9, 0.95)
 BATCH = 2048  # new states of a step, at most
 
@@ -52,8 +52,8 @@ def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> 
     for k, (M, whole, rate) in enumerate(NOISY_ROUNDS if problem.noisy else ROUNDS):
         steps = max(1, whole * states // BATCH)
         stepper, average = short_fit(fields, objective, rate, steps, unit, betas=BETAS)
-        generator = torch.Generator().manual_seed(derive_seed(seed, Branch.TIGHTENING, k))
         phase = Phase(Constants(M=M, C_V=1.0, C_u=1.0, sources={}))
+        generator = torch.Generator().manual_seed(derive_seed(seed, Branch.TIGHTENING, k))
         draw = WorstStates(problem, fields.value, new, generator)
         try:
             for _ in range(steps):
