@@ -22,8 +22,8 @@ from ocp_torch.problems.samples import Samples
 # two arms .39 and .85 % were to gain, which gave .51 and 1.0 %; two dubins and a unicycle with noise had 1.1 to 7.3 %, which
 # gave 1.2 to 7.5 %, and .2 to .35 % after it.
 WORTH, NOISY_WORTH = 0.0006, 0.005
-# The mean of the slack over its largest part `1 / TAIL` of the torus says what is to gain.
-TAIL = 100.0
+# What is to gain is seen by the mean of the slack over its largest part of the torus, a hundredth, in place of its supremum.
+LARGEST_PART = 0.01
 
 
 @dataclass(frozen=True)
@@ -98,4 +98,4 @@ def to_gain(shift: Shift) -> float:
     above the bound: where that is nothing, no spike is left to take off."""
     weights = torch.cat([samples.weight for samples in shift.sets])
     mean = sum(shift.initial) / len(shift.initial)
-    return best_level(SlackParts.join(shift.parts), weights, mean, TAIL)[2] - shift.bound
+    return best_level(SlackParts.join(shift.parts), weights, mean, 1.0 / LARGEST_PART)[2] - shift.bound
