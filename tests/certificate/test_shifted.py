@@ -214,10 +214,11 @@ def perturbed(problem, size=1e-3, seed=0):
 @pytest.mark.parametrize("name", ["manufactured 2-d q=1.5", pytest.param("noisy 1-d", marks=pytest.mark.nightly)])
 def test_a_value_trained_on_for_the_bound_comes_closer_to_the_optimum_from_below(name, monkeypatch):
     for rounds in ("ROUNDS", "NOISY_ROUNDS"):
-        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{rounds}", ((100.0, 150, 2e-2),))
+        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{rounds}", ((100.0, 150),))
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.BATCH", 512)
+    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.RATE", 2e-2)
     monkeypatch.setattr("ocp_torch.certificate.lower.mollified.RADII", (1.0 / 64.0,))
-    for least in ("WORTH", "NOISY_WORTH"):
+    for least in ("WORTH", "WORTH_AT_FIRST"):
         monkeypatch.setattr(f"ocp_torch.certificate.lower.sampled.{least}", 0.0)
     problem = zoo.build(name)
     value = perturbed(problem)
@@ -239,7 +240,7 @@ def test_what_cannot_be_trained_on_stays_as_it_is():
 
 
 def test_a_quick_certificate_trains_for_as_many_times_fewer_steps_as_it_has_fewer_states(monkeypatch):
-    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.ROUNDS", ((100.0, 8, 1e-3), (1000.0, 16, 1e-3)))
+    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.ROUNDS", ((100.0, 8), (1000.0, 16)))
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.BATCH", 64)
     for batch, first, second in ((1000, 8, 16), (64, 8, 16), (16, 2, 4), (1, 1, 1)):
         met = list(tightened(Circle(), perturbed(Circle()), 0, batch))
@@ -263,7 +264,7 @@ class AsIfNoisy(Circle):
         (Circle(), (0.02, 0.03, 0.01, 0.0), 3),
         (Circle(), (6e-4, 2e-4, 1.8e-4, 0.0), 3),  # a third of one per cent is much
         (Circle(), (2e-4, 0.0, 0.0, 0.0), 1),
-        (Circle(), (6e-4, 6e-5, 4e-5, 0.0), 2),  # less than a tenth is not
+        (Circle(), (6e-4, 6e-5, 4e-5, 0.0), 2),  # a tenth is not, after the second
         (Circle(), (1e-5, 0.0, 0.0, 0.0), 0),
     ],
 )
@@ -306,8 +307,8 @@ def test_rounds_go_on_while_there_is_enough_to_gain(problem, heights, made, monk
 @pytest.mark.parametrize("name", ["kuramoto n=3", "noisy 1-d"])
 def test_a_second_core_gives_the_same_certificate(name, monkeypatch):
     for rounds in ("ROUNDS", "NOISY_ROUNDS"):
-        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{rounds}", ((100.0, 10, 1e-3), (1000.0, 20, 1e-3)))
-    for least in ("WORTH", "NOISY_WORTH"):
+        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{rounds}", ((100.0, 10), (1000.0, 20)))
+    for least in ("WORTH", "WORTH_AT_FIRST"):
         monkeypatch.setattr(f"ocp_torch.certificate.lower.sampled.{least}", 0.0)
     problem, threads = zoo.build(name), []
     torch.manual_seed(0)
