@@ -14,6 +14,15 @@ FIRST_STEP, GROWTH, SHRINKAGE = 1e-2, 1.5, 0.4
 # Ascents whose steps are all below this, in turns, have arrived: in one dimension after 30 of 60 to 100 steps, in two after
 # 40 to 90. The maximum is then the same to 15 digits where the function is smooth, to 9 or more for slacks beside kinks.
 ARRIVED = 1e-7
+# How far an ascent is thought to go where starts are chosen by their slope, and how long its first step is. Slacks of a
+# unicycle and of a pendulum with limited torque had peaks .09 and .30 % of the bound above all that ascents from the largest
+# of 131,072 values showed: from most places that lead there the slack is below its median. Ascents of 24 steps from 2,048 of
+# 32,768 states found them with 8 of 8 seeds each, from random ones with 2 and 1; with a reach of 3e-3 with 1 and 8, of 3e-2
+# with 8 and 3, with a first step of 1e-2 with 8 and 7.
+REACH, SHORT_STEP = 1e-2, 3e-3
+# Parts of the starts that each stage of these ascents goes on from, and its steps: as sure as 24 steps from all of them, in
+# two thirds of the time.
+STAGES = ((1.0, 8), (0.25, 16))
 # How often `minimiser` narrows its interval: (2/3)^30 of it is left.
 NARROWINGS = 30
 
@@ -25,7 +34,7 @@ class Extremum:
     value: float
     x: Tensor  # (d,) where it is attained
     points: int  # states sampled
-    ascents: int  # local ascents started from the largest of them
+    ascents: int  # local ascents started from some of them
 
 
 @torch.no_grad()
@@ -91,6 +100,31 @@ def climb(
         if differentiable and float(step.max()) < ARRIVED:
             break
     return x, best
+
+
+@torch.no_grad()
+def peaks_in_reach(function: Callable[[Tensor], Tensor], points: Tensor, starts: int) -> tuple[Tensor, Tensor]:
+    """Where ascents of ``function`` end, ``(K, d)``, and the values there, from as many ``starts``: those of ``points``
+    ``(N, d)`` with the largest `f + REACH |grad f|`, which to first order is what is within reach.
+
+    Ascents from the largest values miss narrow peaks that stand where ``function`` is low.
+    """
+    x, (values, slopes) = points, in_parts(lambda at: value_and_gradient(function, at), points)
+    promising = values + REACH * slopes.norm(dim=-1)
+    for part, steps in STAGES:
+        best = promising.topk(max(1, min(int(part * starts), len(x)))).indices
+        climbed = lambda at, met, steps=steps: climb(function, at, met, steps, SHORT_STEP)
+        x, values = in_parts(climbed, x[best], values[best])
+        promising = values
+    return x.remainder(1.0), values
+
+
+def in_parts(
+    function: Callable[..., tuple[Tensor, Tensor]], *columns: Tensor, chunk: int = 1024
+) -> tuple[Tensor, Tensor]:
+    """``function`` of ``columns`` in chunks of rows, so that memory stays bounded."""
+    first, second = zip(*map(function, *(column.split(chunk) for column in columns)), strict=True)
+    return torch.cat(first), torch.cat(second)
 
 
 def value_and_gradient(function: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, Tensor]:

@@ -150,12 +150,12 @@ def advance(stepper: Stepper, average: Average, draw: Callable[[Phase], Samples]
 
 
 def short_fit(
-    fields: Fields, objective: Objective, lr: float, steps: int, unit: float = 1.0
+    fields: Fields, objective: Objective, lr: float, steps: int, unit: float = 1.0, **options
 ) -> tuple[Simultaneous, Average]:
     """Stepper and average of a fit that nobody configures: SOAP, a learning rate that falls from ``lr`` to 0 in ``steps``.
 
-    ``unit`` is what losses are divided by (see `cost_unit`).
+    ``unit`` is what losses are divided by (see `cost_unit`); ``options`` are those of SOAP.
     """
-    makers = {player: optimizer_maker("soap", lr) for player in objective.players}
+    makers = {player: optimizer_maker("soap", lr, **options) for player in objective.players}
     stepper = Simultaneous(fields, objective, makers, schedule_maker("cosine", steps), unit=unit)
     return stepper, averaged(fields)

@@ -16,6 +16,7 @@ from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from support import zoo
+from support.hidden_peak import HILLS, Still, hidden_peak, top
 
 PEAKS, CLIMBED = 16, 20
 
@@ -177,3 +178,19 @@ def test_spikes_are_sought_again_while_those_found_raise_the_bound(off, again, o
     monkeypatch.setattr(LoweredSlack, "climb", climb)
     slack.climbed_lowest(terms, ascents=1)
     assert (len(climbs) > 1) == again
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_peaks_in_hollows_are_sought_on_both_sides_of_the_slack(side):
+    problem, sign = Still(), 2 * side - 1
+    loop = ClosedLoop(problem, lambda x: torch.zeros_like(x))
+    slack = LoweredSlack(
+        loop, lambda x: problem.state_cost(x) + sign * hidden_peak(x), Samples.of(loop, zoo.states(problem, 4000))
+    )
+    slack.climb(UNCHANGED, 32)
+    assert slack.suprema()[side] < 1.001 * HILLS
+    slack.seek(32)
+    assert slack.suprema()[side] == pytest.approx(top(), rel=1e-4)
+    found = slack.extrema(UNCHANGED, 32)[side]
+    assert found.points == 4000
+    assert found.ascents >= 32 + 2 * 32 * 64

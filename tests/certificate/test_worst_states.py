@@ -12,6 +12,7 @@ from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from support import zoo
+from support.hidden_peak import HILLS, Still, hidden_peak, top
 
 NEW = 64
 
@@ -101,3 +102,18 @@ def test_the_worst_states_climb_to_the_top_of_a_narrow_spike():
     truth = float(generator.hjb_slack(generator.chunked_jet(spike)).max())
     assert top == sorted(top)
     assert top[-1] > truth - 0.1 * (truth - top[0])
+
+
+@pytest.mark.parametrize("every", [2, 1000])
+def test_peaks_in_hollows_are_sought_now_and_then(every, monkeypatch):
+    monkeypatch.setattr("ocp_torch.certificate.lower.worst.SEEK_EVERY", every)
+    problem = Still()
+    value = lambda x: problem.state_cost(x) + hidden_peak(x)
+    given = [Samples.of(problem, x, divergences=False) for x in zoo.states(problem, 16 * 2048).split(2048)]
+    draw, largest = WorstStates(problem, value, iter(given).__next__, fixed_generator()), []
+    for _ in given:
+        batch = draw(phase_of(1000.0))
+        largest.append(float((value(batch.x) - batch.f)[batch.penalty_weight > 0.0].max()))
+    assert largest[0] < 1.001 * HILLS
+    assert (max(largest) > 0.99 * top()) == (every == 2)
+    assert (max(largest) < 1.001 * HILLS) == (every == 1000)

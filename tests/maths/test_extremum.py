@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from ocp_torch.maths.sampling import scrambled_sobol
-from ocp_torch.maths.supremum import batched, supremum
+from ocp_torch.maths.supremum import batched, peaks_in_reach, supremum
+from support.hidden_peak import HILLS, hidden_peak, top
 
 TURN = 2.0 * math.pi
 each_dimension = pytest.mark.parametrize("dim", [1, 2, 4])
@@ -100,3 +101,22 @@ def test_an_infinite_value_is_the_supremum():
 def test_batches_of_any_size_give_the_same_values(chunk):
     function, _ = bumpy(2)
     assert torch.equal(batched(function, points(2, 100), chunk), function(points(2, 100)))
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3, 4])
+def test_a_peak_in_a_hollow_is_found_from_steep_places_alone(seed):
+    x = scrambled_sobol(32768, 2, seed, torch.float64)
+    assert supremum(hidden_peak, x).value < 1.001 * HILLS
+    ends, values = peaks_in_reach(hidden_peak, x, 2048)
+    assert float(values.max()) == pytest.approx(top(), rel=1e-4)
+    torch.testing.assert_close(hidden_peak(ends), values)
+    assert bool(((ends >= 0.0) & (ends < 1.0)).all())
+
+
+@pytest.mark.parametrize("count", [1, 3, 100])
+def test_few_points_are_as_many_starts_as_there_can_be(count):
+    x = points(2, count)
+    ends, values = peaks_in_reach(bumpy(2)[0], x, 1000)
+    assert 1 <= len(ends) == len(values) <= count
+    assert float(values.max()) >= float(bumpy(2)[0](x).max())
+    assert math.isnan(float(peaks_in_reach(lambda at: at[:, 0] * math.nan, x, 1000)[1].max()))

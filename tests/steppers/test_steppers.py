@@ -21,6 +21,7 @@ from ocp_torch.steppers import (
     averaged,
     optimizer_maker,
     schedule_maker,
+    short_fit,
 )
 from ocp_torch.steppers.stepper import project_on_ball
 
@@ -291,3 +292,20 @@ def test_a_non_finite_gradient_of_a_finite_loss_stops_as_well():
     with pytest.raises(NonFiniteError, match="gradient"):
         game.step()
     np.testing.assert_array_equal(game.point[1], B0)
+
+
+@pytest.mark.parametrize("betas", [(0.9, 0.95), (0.5, 0.8)])
+def test_a_short_fit_moves_as_its_optimiser_with_these_options(betas):
+    game = lambda: Fields({"value": Vector(A0), "control_density": Vector(B0)})
+    one, other, draws = game(), game(), [Samples.of(Circle(), torch.rand(6, 1, dtype=torch.float64)) for _ in range(4)]
+    fit, _ = short_fit(one, MatrixGame(), 1e-2, len(draws), betas=betas)
+    makers = dict.fromkeys(MatrixGame.players, optimizer_maker("soap", 1e-2, betas=betas))
+    by_hand = Simultaneous(other, MatrixGame(), makers, schedule_maker("cosine", len(draws)))
+    for samples in draws:
+        fit.step([samples], PHASE)
+        by_hand.step([samples], PHASE)
+    torch.testing.assert_close(list(one.parameters()), list(other.parameters()), rtol=0.0, atol=0.0)
+    usual, _ = short_fit(game(), MatrixGame(), 1e-2, 4)
+    assert (
+        usual.optimizers["value"].param_groups[0]["betas"] != betas == fit.optimizers["value"].param_groups[0]["betas"]
+    )

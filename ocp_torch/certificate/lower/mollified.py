@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.lower.shifted import Shift
+from ocp_torch.certificate.lower.shifted import Shift, higher
 from ocp_torch.certificate.lower.slack import SlackParts
 from ocp_torch.maths.jets import Field, Jet, jet
 from ocp_torch.maths.seeds import fixed_generator
@@ -71,16 +71,20 @@ def mollified_shift(own: Shift) -> Shift:
 
     def averaged(radius: float, sets: list[Samples], ascents: int) -> Shift:
         W = Mollified(own.value, own.problem.dim, radius)
-        return replace(own, value=W, sets=W.fitting(sets), ascents=ascents, beside=[worst], radius=radius)
+        starts = own.starts / len(W.offsets)  # peaks are as wide as the radius, and a value takes so many times as long
+        return replace(
+            own, value=W, sets=W.fitting(sets), ascents=ascents, beside=[worst], radius=radius, starts=starts
+        )
 
-    on_few = lambda radius: averaged(radius, few, min(own.ascents, FEW_ASCENTS)).bound
+    on_few = lambda radius: averaged(radius, few, min(own.ascents, FEW_ASCENTS)).looked.bound
     best, looks = own, {radius: on_few(radius) for radius in RADII}
     for _ in range(TRIALS):
         radius = max(looks, key=looks.__getitem__, default=0.0)
         if radius == 0.0 or looks[radius] <= best.bound:
             break
         tried = averaged(radius, own.sets, own.ascents)
-        best = max(best, tried, key=lambda shift: shift.bound)
-        worst = Samples.concatenate([worst, own.problem.samples(tried.largest.x.unsqueeze(0), divergences=False)])
+        best = higher(best, tried)
+        spike = tried.looked.largest.x.unsqueeze(0)
+        worst = Samples.concatenate([worst, own.problem.samples(spike, divergences=False)])
         looks = {r: on_few(r) for r, look in looks.items() if r != radius and look > best.bound}
     return best

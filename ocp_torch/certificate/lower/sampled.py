@@ -10,20 +10,20 @@ from torch import Tensor
 
 from ocp_torch.certificate.lower.levels import best_level
 from ocp_torch.certificate.lower.mollified import mollified_shift
-from ocp_torch.certificate.lower.shifted import Shift
+from ocp_torch.certificate.lower.shifted import Shift, higher
 from ocp_torch.certificate.lower.slack import SlackParts
-from ocp_torch.certificate.lower.tightened import ROUNDS, tightened
+from ocp_torch.certificate.lower.tightened import tightened
 from ocp_torch.maths.ahead import Ahead
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# With noise training for the bound is worth it where that part of it is to gain. Two dubins and a unicycle had 1.1 to 7.3 %
-# before, of which it gave 1.2 to 7.5 %, and .2 to .35 % after it.
-WORTH = 0.005
-# Without noise less is enough, as gaps are narrow, and twice as much after each round, as the next takes twice as long. Of
-# two arms .39 and .85 % were to gain, by which no round was made of one, and one of the other; three gave .51 and 1.0 %.
-WORTH_AT_FIRST = 0.0006
+# Training for the bound is worth it where that part of it is to gain: without noise, where gaps are narrow, and with it. Of
+# two arms .39 and .85 % were to gain, and it gave .51 and 1.0 %; two dubins and a unicycle with noise had 1.1 to 7.3 %, of
+# which it gave 1.2 to 7.5 %, and .2 to .35 % after it.
+WORTH, NOISY_WORTH = 0.0006, 0.005
+# What is to gain is seen by the mean of the slack over its largest part of the torus, a hundredth, in place of its supremum.
+LARGEST_PART = 0.01
 
 
 @dataclass(frozen=True)
@@ -81,23 +81,21 @@ class SampledValue:
         if not self.search:
             return self.own
         best, batch = self.own, len(self.sets[0])  # a small certificate is a quick one
-        least = WORTH if self.problem.noisy else WORTH_AT_FIRST
-        worth = lambda gain: gain > least * abs(best.bound)
-        for found in tightened(self.problem, self.value, self.seed, batch) if worth(to_gain(best)) else ():
+        worth = lambda: to_gain(best) > (NOISY_WORTH if self.problem.noisy else WORTH) * abs(best.bound)
+        for found in tightened(self.problem, self.value, self.seed, batch) if worth() else ():
             yield
             if found is not None:
                 W, worst = found
                 tried = replace(self.own, value=W, name="V tightened", beside=[*self.own.beside, worst])
-                best = max(best, tried, key=lambda shift: shift.bound)
-                if not worth(to_gain(best)):
+                best = higher(best, tried)
+                if not worth():
                     break
-                least *= 2.0
         return best if self.problem.noisy else mollified_shift(best)
 
 
 def to_gain(shift: Shift) -> float:
-    """By how much the bound that training maximises, with the mean of the largest slacks for their supremum, is above the
-    bound: where that is nothing, no spike is left to take off."""
+    """By how much the bound with the mean of the largest slacks for their supremum, which is like what training maximises, is
+    above the bound: where that is nothing, no spike is left to take off."""
     weights = torch.cat([samples.weight for samples in shift.sets])
     mean = sum(shift.initial) / len(shift.initial)
-    return best_level(SlackParts.join(shift.parts), weights, mean, ROUNDS[0][0])[2] - shift.bound
+    return best_level(SlackParts.join(shift.parts), weights, mean, 1.0 / LARGEST_PART)[2] - shift.bound

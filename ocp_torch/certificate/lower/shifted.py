@@ -6,14 +6,14 @@ every state, so the bound is concave in `theta`: its maximum is found by a searc
 changes nothing.) Where `V` has large slack, at kinks for instance, a `theta` below 1 trades a little of `E[V mu0]` for it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from ocp_torch.certificate.bound import LOWER, Bound, sentence_on
 from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
 from ocp_torch.certificate.estimate import Estimate, integrals
-from ocp_torch.certificate.lower.slack import TOP, Scaled, SlackParts, climbed_from, slack_function
+from ocp_torch.certificate.lower.slack import STARTS, TOP, Scaled, SlackParts, climbed_from, slack_function, steep_peaks
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.supremum import Extremum, minimiser
 from ocp_torch.problems.generator import Generator
@@ -25,12 +25,26 @@ if TYPE_CHECKING:
     from ocp_torch.certificate.context import Context
 
 
+class Scaling(NamedTuple):
+    """``theta``, `E[W mu0]` and `sup Q_{theta W}`."""
+
+    theta: float
+    initial: float
+    largest: Extremum
+
+    @property
+    def bound(self) -> float:
+        """`E[theta W mu0] - sup Q_{theta W}`."""
+        return self.theta * self.initial - self.largest.value
+
+
 @dataclass(frozen=True, eq=False)
 class Shift:
     """The shifted bound of the best multiple of a ``value`` `W` on ``sets`` of samples of ``problem``.
 
-    The supremum of the slack is climbed from the ``ascents`` worst states, and sought ``beside`` too. `W` is what ``name``
-    says, averaged over neighbours at ``radius`` where that is not 0. All is computed when it is first asked for.
+    The supremum of the slack is climbed from the ``ascents`` worst states, and sought ``beside`` too, and where so many times
+    ``starts`` ascents end from where it is steep. `W` is what ``name`` says, averaged over neighbours at ``radius`` where
+    that is not 0. All is computed when it is first asked for.
     """
 
     problem: Problem
@@ -40,6 +54,7 @@ class Shift:
     beside: list[Samples]
     name: str = "V"
     radius: float = 0.0
+    starts: float = STARTS
 
     @cached_property
     def parts(self) -> list[SlackParts]:
@@ -55,35 +70,52 @@ class Shift:
         return integrals([s.x for s in self.sets], [p.initial for p in self.parts], [s.weight for s in self.sets])
 
     @cached_property
-    def _found(self) -> tuple[float, Extremum]:
-        """`theta`, which is 1 or the maximiser of the bound over the sampled states, and `sup Q_{theta W}`.
+    def _sampled(self) -> SlackParts:
+        return SlackParts.join([*self.parts, *self._parts_on(self.beside)])
+
+    @cached_property
+    def looked(self) -> "Scaling":
+        """The best multiple by the sampled states and ascents from the largest slacks alone."""
+        return self._scaled(self._sampled)
+
+    @cached_property
+    def found(self) -> "Scaling":
+        """By what is sought in steep places too."""
+        slack, starts = slack_function(self.problem, self.value), max(1, int(self.starts * self.ascents))
+        known = climbed(self.problem, self.value, self._sampled, 1.0, self.ascents).value
+        peaks = steep_peaks(slack, self.problem.dim, starts, known)
+        there = Samples.of(self.problem, peaks.x, divergences=False)
+        best = self._scaled(SlackParts.join([self._sampled, *self._parts_on([there])]))
+        found = replace(best.largest, points=len(self._sampled.x), ascents=best.largest.ascents + peaks.ascents)
+        return best._replace(largest=found)
+
+    def _scaled(self, everywhere: SlackParts) -> "Scaling":
+        """The multiple 1, or that which maximises the bound over ``everywhere``.
 
         The supremum at the maximiser is searched for anew, and 1 stays where that shows no gain. Where `f < 0` is met the
         problem breaks its promise, `0` is no subsolution to scale towards, and `theta` is 1.
         """
-        everywhere = SlackParts.join([*self.parts, *self._parts_on(self.beside)])
         mean = sum(self.initial) / len(self.initial)
         largest = lambda theta: climbed(self.problem, self.value, everywhere, theta, self.ascents)
-        plain = largest(1.0)
+        multiple = lambda theta: Scaling(theta, mean, largest(theta))
+        plain = multiple(1.0)
         if bool((everywhere.f < 0.0).any()):
-            return 1.0, plain
-        theta = scaled_by(everywhere, mean)
-        scaled = largest(theta)
-        return (theta, scaled) if theta * mean - scaled.value > mean - plain.value else (1.0, plain)
+            return plain
+        return max(plain, multiple(scaled_by(everywhere, mean)), key=lambda scaling: scaling.bound)
 
     @property
     def theta(self) -> float:
-        return self._found[0]
+        return self.found.theta
 
     @property
     def largest(self) -> Extremum:
         """`sup Q_{theta W}`."""
-        return self._found[1]
+        return self.found.largest
 
     @property
     def bound(self) -> float:
         """`E[theta W mu0] - sup Q_{theta W}`."""
-        return self.theta * sum(self.initial) / len(self.initial) - self.largest.value
+        return self.found.bound
 
     @property
     def estimate(self) -> Estimate:
@@ -95,6 +127,11 @@ class Shift:
         """What the slack is of."""
         averaged = f", averaged {self.radius:.2g} around," if self.radius else ""
         return f"sup Q of {self.theta:.4g} {self.name}{averaged}"
+
+
+def higher(best: Shift, other: Shift) -> Shift:
+    """The one with the higher bound. Steep places of ``other`` are only looked at where it is the higher one without them."""
+    return other if other.looked.bound > best.bound and other.bound > best.bound else best
 
 
 def climbed(problem: Problem, value: Field, parts: SlackParts, theta: float, ascents: int) -> Extremum:

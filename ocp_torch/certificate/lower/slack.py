@@ -1,12 +1,14 @@
 """The HJB slack `Q` of a value function and of its multiples: at sampled states, anywhere, and where it peaks."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ocp_torch.maths.jets import Field, Jet, jet
-from ocp_torch.maths.supremum import Extremum, climb, supremum
+from ocp_torch.maths.seeds import fixed_generator
+from ocp_torch.maths.supremum import Extremum, climb, peaks_in_reach, supremum
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.generator import Generator, hjb_slack
 from ocp_torch.problems.problem import Problem
@@ -14,6 +16,9 @@ from ocp_torch.problems.samples import Samples
 
 # The largest theta that is tried.
 TOP = 1.5
+# A search for peaks in steep places: its ascents for each one from the largest values, and the states that are looked at for
+# each of its own; and how many searches are made at most.
+STARTS, STEEPEST, SEARCHES = 64, 16, 4
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,27 @@ def slack_peaks(slack: Field, x: Tensor, met: Tensor, count: int, steps: int) ->
         start, index = found.topk(count)
         ends.append(climb(function, x[index], start, steps if count else 0)[0].remainder(1.0))
     return torch.cat(ends)
+
+
+class Peaks(NamedTuple):
+    """States ``(K, d)`` where so many ``ascents`` ended."""
+
+    x: Tensor
+    ascents: int
+
+
+def steep_peaks(slack: Field, dim: int, starts: int, known: float) -> Peaks:
+    """Where ascents of ``slack`` end from the ``starts`` steepest of random states, and from others, while it is higher there
+    than anywhere before, and than ``known``."""
+    generator, found = fixed_generator(), []
+    for _ in range(SEARCHES):
+        x = torch.rand(STEEPEST * starts, dim, generator=generator, dtype=torch.float64)
+        ends, values = peaks_in_reach(slack, x, starts)
+        found.append(ends)
+        if not float(values.max()) > known:
+            break
+        known = float(values.max())
+    return Peaks(torch.cat(found), starts * len(found))
 
 
 def climbed_from(function: Field, values: Tensor, states: Tensor, ascents: int) -> Extremum:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.estimate import integral
-from ocp_torch.certificate.lower.slack import TOP, slack_function, slack_peaks
+from ocp_torch.certificate.lower.slack import STARTS, TOP, slack_function, slack_peaks, steep_peaks
 from ocp_torch.certificate.upper.multiples import Terms, best_multiple
 from ocp_torch.maths.jets import Field, Jet, jet
 from ocp_torch.maths.supremum import Extremum, minimiser
@@ -126,6 +126,7 @@ class LoweredSlack:
     def __init__(self, loop: ClosedLoop, value: Field, samples: Samples, odd: Tensor | None = None) -> None:
         self.loop, self.value, self.samples = loop, value, samples
         self.sampled = self.met = Met.at(Generator.of(loop, samples), value)
+        self.sought = 0  # ascents of `seek` for one of the suprema
         self.initial = integral(samples, self.sampled.v * samples.mu0)
         low, high = (float(v) for v in self.sampled.v.aminmax())
         heights = [low + part * (high - low) for part in HEIGHTS] if high > low else []
@@ -153,12 +154,24 @@ class LoweredSlack:
         function = slack_function(self.loop, Lowered(self.value, how))
         self._meet(slack_peaks(function, self.met.x, self.met.of(how), ascents, steps))
 
+    @torch.no_grad()
+    def seek(self, ascents: int) -> None:
+        """Meet peaks of the slack of `V`, and of what it is below 0, in steep places too, which ascents from its smallest and
+        largest values miss."""
+        self.climb(UNCHANGED, ascents)
+        slack = slack_function(self.loop, self.value)
+        for function, known in ((slack, self.met.slack.max()), (lambda x: -slack(x), -self.met.slack.min())):
+            peaks = steep_peaks(function, self.samples.x.shape[1], STARTS * ascents, float(known))
+            self._meet(peaks.x)
+            self.sought = max(self.sought, peaks.ascents)
+
     def extrema(self, how: Lowering, ascents: int) -> tuple[Extremum, Extremum]:
         """`suprema`, and where they were met: by so many ``ascents`` among others."""
 
         def largest(side: Tensor) -> Extremum:
             top, seen = int(side.argmax()), len(self.sampled.x)
-            return Extremum(max(float(side[top]), 0.0), self.met.x[top], seen, min(ascents, seen))
+            climbed = min(ascents, seen) + self.sought
+            return Extremum(max(float(side[top]), 0.0), self.met.x[top], seen, climbed)
 
         slack = self.met.of(how)
         return largest(-slack), largest(slack)
