@@ -1,5 +1,6 @@
 """Suprema over the torus: sampled, then climbed by local ascent from the worst points."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -103,16 +104,21 @@ def climb(
 
 
 @torch.no_grad()
-def peaks_in_reach(function: Callable[[Tensor], Tensor], points: Tensor, starts: int) -> tuple[Tensor, Tensor]:
-    """Where ascents of ``function`` end, ``(K, d)``, and the values there, from as many ``starts``: those of ``points``
-    ``(N, d)`` with the largest `f + REACH |grad f|`, which to first order is what is within reach.
+def peaks_in_reach(
+    function: Callable[[Tensor], Tensor], points: Tensor, starts: int, above: float = -math.inf
+) -> tuple[Tensor, Tensor]:
+    """Where ascents of ``function`` end, ``(K, d)``, and the values there, from at most so many ``starts``: those of ``points``
+    ``(N, d)`` with the largest `f + REACH |grad f|`, which to first order is what is within reach, if it is ``above`` that.
 
     Ascents from the largest values miss narrow peaks that stand where ``function`` is low.
     """
     x, (values, slopes) = points, in_parts(lambda at: value_and_gradient(function, at), points)
     promising = values + REACH * slopes.norm(dim=-1)
+    starts = min(starts, int((~(promising <= above)).sum()))  # what is not a number is not below
+    if starts == 0:
+        return x[:0], values[:0]
     for part, steps in STAGES:
-        best = promising.topk(max(1, min(int(part * starts), len(x)))).indices
+        best = promising.topk(math.ceil(part * starts)).indices
         climbed = lambda at, met, steps=steps: climb(function, at, met, steps, SHORT_STEP)
         x, values = in_parts(climbed, x[best], values[best])
         promising = values

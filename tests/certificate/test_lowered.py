@@ -189,8 +189,10 @@ def test_peaks_in_hollows_are_sought_on_both_sides_of_the_slack(side):
     )
     slack.climb(UNCHANGED, 32)
     assert slack.suprema()[side] < 1.001 * HILLS
-    slack.seek(32)
+    assert slack.seek(UNCHANGED, 32)
     assert slack.suprema()[side] == pytest.approx(top(), rel=1e-4)
     found = slack.extrema(UNCHANGED, 32)[side]
     assert found.points == 4000
     assert found.ascents >= 32 + 2 * 32 * 64
+    slack.climb(UNCHANGED, 32)
+    assert not slack.seek(UNCHANGED, 32)

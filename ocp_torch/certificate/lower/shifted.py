@@ -74,34 +74,41 @@ class Shift:
         return SlackParts.join([*self.parts, *self._parts_on(self.beside)])
 
     @cached_property
+    def _plain(self) -> Extremum:
+        return climbed(self.problem, self.value, self._sampled, 1.0, self.ascents)
+
+    @cached_property
     def looked(self) -> "Scaling":
         """The best multiple by the sampled states and ascents from the largest slacks alone."""
-        return self._scaled(self._sampled)
+        return self._scaled(self._sampled, self._plain)
 
     @cached_property
     def found(self) -> "Scaling":
         """By what is sought in steep places too."""
         slack, starts = slack_function(self.problem, self.value), max(1, int(self.starts * self.ascents))
-        known = climbed(self.problem, self.value, self._sampled, 1.0, self.ascents).value
-        peaks = steep_peaks(slack, self.problem.dim, starts, known)
-        there = Samples.of(self.problem, peaks.x, divergences=False)
-        best = self._scaled(SlackParts.join([self._sampled, *self._parts_on([there])]))
-        found = replace(best.largest, points=len(self._sampled.x), ascents=best.largest.ascents + peaks.ascents)
-        return best._replace(largest=found)
+        peaks, best = steep_peaks(slack, self.problem.dim, starts, self._plain.value), self.looked
+        if len(peaks.x):
+            there = Samples.of(self.problem, peaks.x, divergences=False)
+            everywhere = SlackParts.join([self._sampled, *self._parts_on([there])])
+            if not float(everywhere.slack(best.theta).max()) <= best.largest.value:  # NaN is no bound either
+                plain = climbed(self.problem, self.value, everywhere, 1.0, self.ascents)
+                best = self._scaled(everywhere, plain)
+        ascents = min(self.ascents, len(self._sampled.x)) + peaks.ascents
+        return best._replace(largest=replace(best.largest, points=len(self._sampled.x), ascents=ascents))
 
-    def _scaled(self, everywhere: SlackParts) -> "Scaling":
-        """The multiple 1, or that which maximises the bound over ``everywhere``.
+    def _scaled(self, everywhere: SlackParts, plain: Extremum) -> "Scaling":
+        """The multiple 1, whose supremum is ``plain``, or that which maximises the bound over ``everywhere``.
 
         The supremum at the maximiser is searched for anew, and 1 stays where that shows no gain. Where `f < 0` is met the
         problem breaks its promise, `0` is no subsolution to scale towards, and `theta` is 1.
         """
         mean = sum(self.initial) / len(self.initial)
-        largest = lambda theta: climbed(self.problem, self.value, everywhere, theta, self.ascents)
-        multiple = lambda theta: Scaling(theta, mean, largest(theta))
-        plain = multiple(1.0)
+        unscaled = Scaling(1.0, mean, plain)
         if bool((everywhere.f < 0.0).any()):
-            return plain
-        return max(plain, multiple(scaled_by(everywhere, mean)), key=lambda scaling: scaling.bound)
+            return unscaled
+        theta = scaled_by(everywhere, mean)
+        scaled = Scaling(theta, mean, climbed(self.problem, self.value, everywhere, theta, self.ascents))
+        return max(unscaled, scaled, key=lambda scaling: scaling.bound)
 
     @property
     def theta(self) -> float:

@@ -18,7 +18,7 @@ from ocp_torch.problems.samples import Samples
 TOP = 1.5
 # A search for peaks in steep places: its ascents for each one from the largest values, and the states that are looked at for
 # each of its own; and how many searches are made at most.
-STARTS, STEEPEST, SEARCHES = 64, 16, 4
+STARTS, STEEPEST, SEARCHES = 64, 8, 8
 
 
 @dataclass(frozen=True)
@@ -89,17 +89,18 @@ class Peaks(NamedTuple):
 
 
 def steep_peaks(slack: Field, dim: int, starts: int, known: float) -> Peaks:
-    """Where ascents of ``slack`` end from the ``starts`` steepest of random states, and from others, while it is higher there
-    than anywhere before, and than ``known``."""
-    generator, found = fixed_generator(), []
+    """Where ascents of ``slack`` end from the ``starts`` steepest of random states, as far as it can be higher than ``known``
+    there, and from others, while it is higher there than anywhere before."""
+    generator, found, ascents = fixed_generator(), [], 0
     for _ in range(SEARCHES):
         x = torch.rand(STEEPEST * starts, dim, generator=generator, dtype=torch.float64)
-        ends, values = peaks_in_reach(slack, x, starts)
+        ends, values = peaks_in_reach(slack, x, starts, known)
         found.append(ends)
-        if not float(values.max()) > known:
+        ascents += starts
+        if not bool((values > known).any()):
             break
         known = float(values.max())
-    return Peaks(torch.cat(found), starts * len(found))
+    return Peaks(torch.cat(found), ascents)
 
 
 def climbed_from(function: Field, values: Tensor, states: Tensor, ascents: int) -> Extremum:

@@ -78,8 +78,9 @@ def closed_loop_bounds(
     plain, _, densities, fluxes = zip(*found, strict=True)
     whole = Terms.join(plain)
     own = LoweredSlack(loop, value, whole.samples, odd)
-    own.seek(ascents)
     how = own.climbed_lowest(whole, ascents)
+    if own.seek(how, ascents):
+        how = own.climbed_lowest(whole, ascents)
     eps_hi, eps_lo = own.extrema(how, ascents)
     slacks = own.sampled.of(how).split([len(samples) for samples in sets])
     columns = zip(plain, densities, slacks, strict=True)

@@ -155,15 +155,15 @@ class LoweredSlack:
         self._meet(slack_peaks(function, self.met.x, self.met.of(how), ascents, steps))
 
     @torch.no_grad()
-    def seek(self, ascents: int) -> None:
-        """Meet peaks of the slack of `V`, and of what it is below 0, in steep places too, which ascents from its smallest and
-        largest values miss."""
-        self.climb(UNCHANGED, ascents)
-        slack = slack_function(self.loop, self.value)
-        for function, known in ((slack, self.met.slack.max()), (lambda x: -slack(x), -self.met.slack.min())):
+    def seek(self, how: Lowering, ascents: int) -> bool:
+        """Meet the peaks of the slack of `W` in steep places, and of what it is below 0, by `STARTS` times as many ascents or
+        more, and say whether any is higher than what was met before."""
+        slack, met = slack_function(self.loop, Lowered(self.value, how)), self.met.of(how)
+        for function, known in ((slack, met.max()), (lambda x: -slack(x), -met.min())):
             peaks = steep_peaks(function, self.samples.x.shape[1], STARTS * ascents, float(known))
             self._meet(peaks.x)
             self.sought = max(self.sought, peaks.ascents)
+        return any(now > seen for now, seen in zip(self.suprema(how), _sides(met), strict=True))
 
     def extrema(self, how: Lowering, ascents: int) -> tuple[Extremum, Extremum]:
         """`suprema`, and where they were met: by so many ``ascents`` among others."""
