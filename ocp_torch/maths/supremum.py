@@ -107,7 +107,7 @@ def climb(
 def peaks_in_reach(
     function: Callable[[Tensor], Tensor], points: Tensor, starts: int, above: float = -math.inf
 ) -> tuple[Tensor, Tensor]:
-    """Where ascents of ``function`` end, ``(K, d)``, and the values there, from at most so many ``starts``: those of ``points``
+    """Where ascents of ``function`` end, ``(K, d)``, and the values there, from at most so many ``starts``: those ``points``
     ``(N, d)`` with the largest `f + REACH |grad f|`, which to first order is what is within reach, if it is ``above`` that.
 
     Ascents from the largest values miss narrow peaks that stand where ``function`` is low.
