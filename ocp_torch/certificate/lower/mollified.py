@@ -71,10 +71,7 @@ def mollified_shift(own: Shift) -> Shift:
 
     def averaged(radius: float, sets: list[Samples], ascents: int) -> Shift:
         W = Mollified(own.value, own.problem.dim, radius)
-        starts = own.starts / len(W.offsets)  # peaks are as wide as the radius, and a value takes so many times as long
-        return replace(
-            own, value=W, sets=W.fitting(sets), ascents=ascents, beside=[worst], radius=radius, starts=starts
-        )
+        return replace(own, value=W, sets=W.fitting(sets), ascents=ascents, beside=[worst], radius=radius)
 
     on_few = lambda radius: averaged(radius, few, min(own.ascents, FEW_ASCENTS)).looked.bound
     best, looks = own, {radius: on_few(radius) for radius in RADII}

@@ -42,8 +42,8 @@ class Scaling(NamedTuple):
 class Shift:
     """The shifted bound of the best multiple of a ``value`` `W` on ``sets`` of samples of ``problem``.
 
-    The supremum of the slack is climbed from the ``ascents`` worst states, and sought ``beside`` too, and where so many times
-    ``starts`` ascents end from where it is steep. `W` is what ``name`` says, averaged over neighbours at ``radius`` where
+    The supremum of the slack is climbed from the ``ascents`` worst states, and sought ``beside`` too, and where `STARTS`
+    times as many ascents end from where it is steep. `W` is what ``name`` says, averaged over neighbours at ``radius`` where
     that is not 0. All is computed when it is first asked for.
     """
 
@@ -54,7 +54,6 @@ class Shift:
     beside: list[Samples]
     name: str = "V"
     radius: float = 0.0
-    starts: float = STARTS
 
     @cached_property
     def parts(self) -> list[SlackParts]:
@@ -85,8 +84,9 @@ class Shift:
     @cached_property
     def found(self) -> "Scaling":
         """By what is sought in steep places too."""
-        slack, starts = slack_function(self.problem, self.value), max(1, int(self.starts * self.ascents))
-        peaks, best = steep_peaks(slack, self.problem.dim, starts, self._plain.value), self.looked
+        slack, starts = slack_function(self.problem, self.value), STARTS * self.ascents
+        best = self.looked
+        peaks = steep_peaks(slack, self.problem.dim, starts, self._plain.value, best.initial)
         if len(peaks.x):
             there = Samples.of(self.problem, peaks.x, divergences=False)
             everywhere = SlackParts.join([self._sampled, *self._parts_on([there])])
