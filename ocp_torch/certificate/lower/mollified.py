@@ -80,8 +80,9 @@ def mollified_shift(own: Shift) -> Shift:
         if radius == 0.0 or looks[radius] <= best.bound:
             break
         tried = averaged(radius, own.sets, own.ascents)
-        best = higher(best, tried)
-        spike = tried.looked.largest.x.unsqueeze(0)
+        known, best = best.bound, higher(best, tried)
+        searched = tried.found if tried.looked.bound > known else tried.looked
+        spike = searched.largest.x.unsqueeze(0)
         worst = Samples.concatenate([worst, own.problem.samples(spike, divergences=False)])
         looks = {r: on_few(r) for r, look in looks.items() if r != radius and look > best.bound}
     return best
