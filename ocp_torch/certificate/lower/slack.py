@@ -17,8 +17,9 @@ from ocp_torch.problems.samples import Samples
 # The largest theta that is tried.
 TOP = 1.5
 # A search for peaks in steep places: its ascents for each one from the largest values, and the states that are looked at for
-# each of its own. How many searches are made at most, and after how many in a row that found nothing no more: a peak of 1 %
-# of the bound in five coordinates was found by a third of them.
+# each of its own. How many searches are made at most, and after how many in a row that found nothing no more. Of hidden peaks
+# of .09 and .30 % of a bound, in three and two coordinates, 8 of 8 seeds found all, of one of 1.06 % in five .7 to 1.06, by 3
+# to 7 searches in 4 to 6 s.
 STARTS, STEEPEST = 64, 8
 SEARCHES, FRUITLESS = 8, 2
 NEGLIGIBLE = 1e-5  # higher peaks than that, relative to `E[V mu0]`, are sought
