@@ -196,3 +196,18 @@ def test_peaks_in_hollows_are_sought_on_both_sides_of_the_slack(side):
     assert found.ascents >= 32 + 2 * 32 * 64
     slack.climb(UNCHANGED, 32)
     assert not slack.seek(UNCHANGED, 32)
+
+
+def test_no_controller_is_asked_for_no_state():
+    """Nothing is within reach of a slack that is the same everywhere."""
+    problem, asked = Still(), []
+
+    def policy(x):
+        asked.append(len(x))
+        return torch.zeros_like(x)
+
+    loop = ClosedLoop(problem, policy)
+    slack = LoweredSlack(loop, problem.state_cost, Samples.of(loop, zoo.states(problem, 1000)))
+    assert not slack.seek(UNCHANGED, 8)
+    assert min(asked) > 0
+    assert slack.extrema(UNCHANGED, 8)[0].ascents == 8 + 8 * 64

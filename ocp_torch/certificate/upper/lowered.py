@@ -161,7 +161,8 @@ class LoweredSlack:
         slack, met = slack_function(self.loop, Lowered(self.value, how)), self.met.of(how)
         for function, known in ((slack, met.max()), (lambda x: -slack(x), -met.min())):
             peaks = steep_peaks(function, self.samples.x.shape[1], STARTS * ascents, float(known), self.unit)
-            self._meet(peaks.x)
+            if len(peaks.x):  # a controller of somebody else's may refuse to be asked for no state
+                self._meet(peaks.x)
             self.sought = max(self.sought, peaks.ascents)
         return any(now > seen for now, seen in zip(self.suprema(how), _sides(met), strict=True))
 
