@@ -49,10 +49,12 @@ def test_only_equal_shares_are_shares():
 
 def parted(count, play):
     """What ``play(ranks, rank)`` returns, or the kind of what it raises, in each of ``count`` processes."""
-    store, children = dist.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False), list[int]()
+    children, tell = list[int](), list[int]()
     for rank in range(count):
+        hear, say = os.pipe()
         if (child := os.fork()) == 0:
-            own = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": count, "MASTER_PORT": store.port}
+            port = int(os.read(hear, 16))
+            own = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": count, "MASTER_PORT": port}
             os.environ.update({name: str(value) for name, value in own.items()})
             os.environ.update(MASTER_ADDR="127.0.0.1", TORCHELASTIC_RUN_ID="tests", TORCHELASTIC_USE_AGENT_STORE="True")
             joined.cache_clear()
@@ -62,10 +64,17 @@ def parted(count, play):
             except BaseException as error:
                 told = type(error).__name__
             ranks.leave()
-            client = dist.TCPStore("127.0.0.1", store.port, is_master=False)
+            client = dist.TCPStore("127.0.0.1", port, is_master=False)
             client.set(f"told/{rank}", told)
             os._exit(0)
+        os.close(hear)
         children.append(child)
+        tell.append(say)
+    # Only now, as the store's thread may hold a lock of the resolver, which a child would then wait for to the end of time.
+    store = dist.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
+    for say in tell:
+        os.write(say, str(store.port).encode())
+        os.close(say)
     for child in children:
         os.waitpid(child, 0)
     return [store.get(f"told/{rank}").decode() if store.check([f"told/{rank}"]) else None for rank in range(count)]
