@@ -60,9 +60,7 @@ class CertificateSettings:
     points: int = 16384  # states per replicate for the integrals and sampled suprema
     replicates: int = 8  # independent randomised point sets behind each standard error
     trajectories: int = 256  # simulated starts per replicate; 0 skips every simulation
-    ascents: int = (
-        32  # local ascents from the worst sampled states, and 64 times as many or more from where a slack is steep
-    )
+    ascents: int = 32  # local ascents from the worst sampled states; 64 times as many start where a slack is steep
     mollify: bool | None = None  # train on and average V for the bound without M; None: where there is no M
     occupation_states: int = 144  # where the supremum of the occupation density is looked for; 0 skips it
     rigorous: bool = False  # a lower bound proved over cells, in one and two dimensions: a second, or up to two minutes

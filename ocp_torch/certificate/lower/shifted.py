@@ -81,12 +81,12 @@ class Shift:
         return climbed(self.problem, self.value, self._sampled, 1.0, self.ascents)
 
     @cached_property
-    def looked(self) -> "Scaling":
+    def looked(self) -> Scaling:
         """The best multiple by the sampled states and ascents from the largest slacks alone."""
         return self._scaled(self._sampled, self._plain)
 
     @cached_property
-    def found(self) -> "Scaling":
+    def found(self) -> Scaling:
         """By what is sought in steep places too."""
         slack, starts = slack_function(self.problem, self.value), STARTS * self.ascents
         if self.radius:  # its peaks are as wide as that, and every value is of many states
@@ -102,7 +102,7 @@ class Shift:
         ascents = min(self.ascents, len(self._sampled.x)) + peaks.ascents
         return best._replace(largest=replace(best.largest, points=len(self._sampled.x), ascents=ascents))
 
-    def _scaled(self, everywhere: SlackParts, plain: Extremum) -> "Scaling":
+    def _scaled(self, everywhere: SlackParts, plain: Extremum) -> Scaling:
         """The multiple 1, whose supremum is ``plain``, or that which maximises the bound over ``everywhere``.
 
         The supremum at the maximiser is searched for anew, and 1 stays where that shows no gain. Where `f < 0` is met the
