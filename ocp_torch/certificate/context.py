@@ -14,6 +14,7 @@ from ocp_torch.certificate.checks.tails import sharpened
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lower.sampled import SampledValue
+from ocp_torch.certificate.lower.slack import Peaks
 from ocp_torch.certificate.settings import CertificateSettings, Progress, Run, silent
 from ocp_torch.certificate.simulated.candidates import Candidate, simulate_candidates
 from ocp_torch.certificate.simulated.outside import time_outside
@@ -166,10 +167,17 @@ class Context:
     ) -> ClosedLoopBounds:
         """The bounds of the closed loop of ``policy`` by any ``value`` and ``log_occupation``, all in float64; ``initial`` is
         `E[V mu0]` per set, if that is known from more states."""
-        loop, ascents = ClosedLoop(self.problem, policy), self.settings.ascents
-        judge = lambda sets: closed_loop_bounds(
-            loop, value, log_occupation, loop.samples_of(sets), ascents, self.followed, initial, self.odd
-        )
+        loop, ascents, sought = ClosedLoop(self.problem, policy), self.settings.ascents, list[Peaks]()
+
+        def judge(sets: list[Samples]) -> ClosedLoopBounds:
+            before = sought[-1] if sought else None
+            at = loop.samples_of(sets)
+            found = closed_loop_bounds(
+                loop, value, log_occupation, at, ascents, self.followed, initial, self.odd, before
+            )
+            sought.append(found.sought)
+            return found
+
         return sharpened(judge, self.problem, self.few, self.seed)
 
     @property

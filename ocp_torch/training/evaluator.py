@@ -30,8 +30,6 @@ QUICK = QuickSettings(
     tolerance=5e-4,
     stage=StageSettings(steps=0),
 )
-# The same with averages of `V`, where the full certificate tries them.
-SEARCHED = replace(QUICK, mollify=None)
 
 
 @dataclass(eq=False)
@@ -44,12 +42,11 @@ class Evaluator:
     seconds: float | None = None  # how long the last one took
     latest: tuple[int, Constants, Certificate] | None = None  # with the step and constants it was made with
 
-    def quick(self, run: Run, settings: CertificateSettings, fields: Fields | None = None) -> Certificate:
+    def quick(self, run: Run, settings: CertificateSettings) -> Certificate:
         """A certificate on states that neither training nor the full one uses: these choose between fields, and on states of
         their own they cannot flatter the full certificate of their choice."""
         elsewhere = replace(run, seed=derive_seed(run.seed, Branch.VALIDATION))
-        trained = replace(self.trained, fields=fields or self.trained.fields)
-        return certify_fields(self.problem.validation_view, trained, self.state.constants, settings, elsewhere)
+        return certify_fields(self.problem.validation_view, self.trained, self.state.constants, settings, elsewhere)
 
     def evaluate(self, run: Run) -> Certificate:
         """A quick certificate of the averaged fields; made anew only once they have changed."""
@@ -59,6 +56,11 @@ class Evaluator:
             self.latest = (*now, self.quick(run, QUICK))
             self.seconds = time.perf_counter() - started
         return self.latest[2]
+
+    def evaluation(self, certificate: Certificate) -> Evaluation:
+        """What ``certificate``, of the present step, tells of its fields. Where there is no `M` that is their performance:
+        their slack is spikes that come and go from step to step, and for the bound the full certificate trains `V` on."""
+        return Evaluation.at(self.state.step, certificate, by_gap=not self.state.constants.needs_no_M)
 
     def reaches(self, gap: float, run: Run) -> bool:
         """Whether a quick certificate finds the averaged fields within ``gap``."""
@@ -74,14 +76,10 @@ class Evaluator:
         certificate = self.evaluate(run)
         if certificate.contradiction is not None:
             return self.trained.fields, None  # fields from before the contradiction was seen would only hide it
-        chosen, final = self.best_fields(), Evaluation.at(step, certificate)
-        if best.better_than(final, sure=True) and SEARCHED.searches(self.state.constants):
-            # Narrow spikes of the slack come and go from step to step, and averages of `V` do not see them.
-            best = Evaluation.at(best.step, self.quick(run, SEARCHED, chosen))
-            final = Evaluation.at(step, self.quick(run, SEARCHED))
+        final = self.evaluation(certificate)
         if not best.better_than(final, sure=True):
             return self.trained.fields, None
-        return chosen, (
+        return self.best_fields(), (
             f"handed out are the averaged fields of step {best.step}: those of step {step} are worse "
             f"({final.in_words()} against {best.in_words()})."
         )

@@ -40,14 +40,16 @@ class Evaluation:
     supposed: float | None = None
 
     @classmethod
-    def at(cls, step: int, certificate: Certificate) -> "Evaluation":
-        lower, perf, gap = certificate.best_lower, certificate.best_perf, certificate.gap["simulated"]
+    def at(cls, step: int, certificate: Certificate, by_gap: bool = True) -> "Evaluation":
+        """What ``certificate`` says; without the gaps where its lower bound decides nothing (not ``by_gap``)."""
+        lower, perf = certificate.best_lower, certificate.best_perf
+        gap, supposed = (certificate.gap["simulated"], certificate.supposed_gap) if by_gap else (None, None)
         ends = [certificate.lower[lower[0]]] if lower else []
         ends += [certificate.perf[perf[0]]] if perf else []
         errors = sum(e.half_width(certificate.confidence) for e in ends if e is not None)
         unit = lower[1] if lower and gap is not None else perf[1] if perf else 1.0
         noise = errors / abs(unit) if unit else 0.0
-        return cls(step, gap, perf[1] if perf else None, noise, certificate.supposed_gap)
+        return cls(step, gap, perf[1] if perf else None, noise, supposed)
 
     def better_than(self, other: "Evaluation | None", sure: bool = False) -> bool:
         """By the gap, or by the performance where neither has one; with ``sure``, by more than the noise of both, and not

@@ -19,7 +19,7 @@ from ocp_torch.problems.blame import blamed
 from ocp_torch.problems.constants import Constants
 from ocp_torch.training.checkpoint import BEST, load_checkpoint, save_checkpoint
 from ocp_torch.training.evaluator import Evaluator
-from ocp_torch.training.health import Evaluation, sanity_warnings
+from ocp_torch.training.health import sanity_warnings
 from ocp_torch.training.observer import Silent
 from ocp_torch.training.refinement import refine
 from ocp_torch.training.settings import TrainerSettings
@@ -190,7 +190,7 @@ class Trainer:
         self.state.require_finite()
         certificate = self.evaluator.evaluate(self.run)
         monitor.evaluated(self, certificate)
-        best = self.health.evaluated(Evaluation.at(self.step, certificate), self.averaged_fields, certificate)
+        best = self.health.evaluated(self.evaluator.evaluation(certificate), self.averaged_fields, certificate)
         # Early on, what is not learnt yet says nothing.
         tell = 2 * self.step >= self.settings.steps and not self.health.warned
         found = sanity_warnings(self.problem, self.constants, certificate, self.seed) if tell else []

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from ocp_torch.certificate import Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lower.mollified import DIRECTIONS, EVALUATIONS, Mollified
-from ocp_torch.certificate.lower.sampled import SampledValue, to_gain
-from ocp_torch.certificate.lower.shifted import Shift, climbed, higher, scaled_by
+from ocp_torch.certificate.lower.sampled import SampledValue, attainable
+from ocp_torch.certificate.lower.shifted import Shift, climbed, highest, scaled_by
 from ocp_torch.certificate.lower.slack import TOP, SlackParts, slack_function
 from ocp_torch.certificate.lower.tightened import tightened
 from ocp_torch.certificate.settings import CertificateSettings
@@ -66,7 +66,7 @@ def test_a_peak_of_the_slack_in_a_hollow_counts():
     assert searches == int(searches) >= 2  # again, as one has found something
     other = replace(shift, value=lambda x: problem.state_cost(x) + 0.065 * torch.cos(2.0 * math.pi * x[:, 1]))
     assert shift.bound < other.bound < shift.looked.bound
-    assert higher(shift, other) is higher(other, shift) is other
+    assert highest([shift, other]) is highest([other, shift]) is other
 
 
 @zoo.on(zoo.FEW)
@@ -316,7 +316,7 @@ def test_rounds_go_on_while_there_is_enough_to_gain(problem, heights, made, monk
     found = SampledValue(problem, V, sets, ascents=2, search=True)
     lost = exact.exact_optimum - found.own.bound
     # The mean of the tail has a part of the spike.
-    assert to_gain(found.own) == pytest.approx(lost, rel=0.4, abs=1e-4)
+    assert attainable(found.own) - found.own.bound == pytest.approx(lost, rel=0.4, abs=1e-4)
     assert found.best.value.height.item() == min(heights[: made + 1])
     assert asked == later[:made]
     # Its supremum is sought at the states that training found worst, too.

@@ -136,17 +136,24 @@ def test_fields_that_became_worse_are_not_handed_out(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("problem", "last", "handed"), [("arm", 0.09, False), ("arm", 0.3, True), ("circle", 0.09, True)]
+    ("problem", "lower", "perf", "handed"),
+    [
+        ("arm", 0.04, 0.055, False),
+        ("arm", 0.05, 0.06, True),
+        ("circle", 0.04, 0.055, True),
+        ("circle", 0.05, 0.055, False),
+    ],
 )
-def test_where_averages_are_certified_spikes_in_a_look_decide_nothing(monkeypatch, problem, last, handed):
-    """The last look is bad; averaged, it is as good as the best one, or it is not; without averages it counts as it is."""
+def test_where_v_is_trained_on_for_its_bound_a_look_decides_by_the_performance(
+    monkeypatch, problem, lower, perf, handed
+):
+    """After a look with a bound of 0.05 and a performance of 0.055 comes one with ``lower`` and ``perf``."""
     trainer = small(f"problem={problem}", *WAY)
+    trainer.state.step = 4
+    trainer.health.evaluated(trainer.evaluator.evaluation(certificate(trainer.run, 0.1)), trainer.averaged_fields)
     trainer.state.step = 20
-    trainer.health.evaluated(Evaluation(4, 0.1, 1.0, 0.0), trainer.averaged_fields)
-    with_gap = lambda gap: certificate(trainer.run, gap)
-    quick = lambda run, settings, fields=None: with_gap(last if fields is None else 0.1)
-    monkeypatch.setattr(trainer.evaluator, "evaluate", lambda run: with_gap(0.5))
-    monkeypatch.setattr(trainer.evaluator, "quick", quick)
+    monkeypatch.setattr("support.looks.LOWER", lower)
+    monkeypatch.setattr(trainer.evaluator, "evaluate", lambda run: certificate(run, perf / lower - 1.0))
     fields, sentence = trainer.evaluator.choose(trainer.run)
     assert (fields is not trainer.averaged_fields) == handed
     assert (sentence is not None) == handed

@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.lower.shifted import Shift, higher
+from ocp_torch.certificate.lower.shifted import Shift, highest
 from ocp_torch.certificate.lower.slack import SlackParts
 from ocp_torch.maths.jets import Field, Jet, jet
 from ocp_torch.maths.seeds import fixed_generator
@@ -80,7 +80,7 @@ def mollified_shift(own: Shift) -> Shift:
         if radius == 0.0 or looks[radius] <= best.bound:
             break
         tried = averaged(radius, own.sets, own.ascents)
-        known, best = best.bound, higher(best, tried)
+        known, best = best.bound, highest([best, tried])
         searched = tried.found if tried.looked.bound > known else tried.looked
         spike = searched.largest.x.unsqueeze(0)
         worst = Samples.concatenate([worst, own.problem.samples(spike, divergences=False)])

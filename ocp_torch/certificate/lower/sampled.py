@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ocp_torch.certificate.lower.levels import best_level
 from ocp_torch.certificate.lower.mollified import mollified_shift
-from ocp_torch.certificate.lower.shifted import Shift, higher
+from ocp_torch.certificate.lower.shifted import Shift, highest
 from ocp_torch.certificate.lower.slack import SlackParts
 from ocp_torch.certificate.lower.tightened import tightened
 from ocp_torch.maths.ahead import Ahead
@@ -80,22 +80,30 @@ class SampledValue:
     def _found(self) -> Generator[None, None, Shift]:
         if not self.search:
             return self.own
-        best, batch = self.own, len(self.sets[0])  # a small certificate is a quick one
-        worth = lambda: to_gain(best) > (NOISY_WORTH if self.problem.noisy else WORTH) * abs(best.bound)
-        for found in tightened(self.problem, self.value, self.seed, batch) if worth() else ():
+        tried, batch = [self.own], len(self.sets[0])  # a small certificate is a quick one
+        least = NOISY_WORTH if self.problem.noisy else WORTH
+        for found in tightened(self.problem, self.value, self.seed, batch) if worth(self.own, least) else ():
             yield
             if found is not None:
                 W, worst = found
-                tried = replace(self.own, value=W, name="V tightened", beside=[*self.own.beside, worst])
-                best = higher(best, tried)
-                if not worth():
+                beside = [*self.own.beside, worst]
+                tried.append(replace(self.own, value=W, name="V tightened", beside=beside))
+                if not worth(max(tried, key=lambda shift: shift.looked.bound), least):
                     break
+        best = highest(tried)
         return best if self.problem.noisy else mollified_shift(best)
 
 
-def to_gain(shift: Shift) -> float:
-    """By how much the bound with the mean of the largest slacks for their supremum, which is like what training maximises, is
-    above the bound: where that is nothing, no spike is left to take off."""
+def worth(shift: Shift, least: float) -> bool:
+    """Whether more than the part ``least`` of the bound is to gain up to what is `attainable`."""
+    most = attainable(shift)
+    lacks = lambda scaling: most - scaling.bound > least * abs(scaling.bound)
+    return lacks(shift.looked) or lacks(shift.found)  # what is found in steep places only adds to it
+
+
+def attainable(shift: Shift) -> float:
+    """The bound with the mean of the largest slacks for their supremum, which is like what training maximises: where the
+    bound is as high, no spike is left to take off."""
     weights = torch.cat([samples.weight for samples in shift.sets])
     mean = sum(shift.initial) / len(shift.initial)
-    return best_level(SlackParts.join(shift.parts), weights, mean, 1.0 / LARGEST_PART)[2] - shift.bound
+    return best_level(SlackParts.join(shift.parts), weights, mean, 1.0 / LARGEST_PART)[2]

@@ -6,6 +6,7 @@ every state, so the bound is concave in `theta`: its maximum is found by a searc
 changes nothing.) Where `V` has large slack, at kinks for instance, a `theta` below 1 trades a little of `E[V mu0]` for it.
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -142,9 +143,15 @@ class Shift:
         return f"sup Q of {self.theta:.4g} {self.name}{averaged}"
 
 
-def higher(best: Shift, other: Shift) -> Shift:
-    """The one with the higher bound. Steep places of ``other`` are only looked at where it is the higher one without them."""
-    return other if other.looked.bound > best.bound and other.bound > best.bound else best
+def highest(shifts: list[Shift]) -> Shift:
+    """The one with the highest bound. Steep places are only looked at where that decides: what is found there lowers it."""
+    looked = lambda shift: -math.inf if math.isnan(shift.looked.bound) else shift.looked.bound
+    best, *others = sorted(shifts, key=looked, reverse=True)
+    for other in others:
+        if other.looked.bound <= best.bound:
+            break
+        best = other if other.bound > best.bound else best
+    return best
 
 
 def climbed(problem: Problem, value: Field, parts: SlackParts, theta: float, ascents: int) -> Extremum:

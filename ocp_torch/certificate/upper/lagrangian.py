@@ -30,7 +30,7 @@ from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_searc
 from ocp_torch.certificate.checks.hidden import Hidden, hidden_divergence
 from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate, integral
-from ocp_torch.certificate.lower.slack import climbed_from
+from ocp_torch.certificate.lower.slack import Peaks, climbed_from
 from ocp_torch.certificate.upper.lowered import LoweredSlack, Lowering
 from ocp_torch.certificate.upper.multiples import Integrand, Terms, best_multiples, terms_on
 from ocp_torch.maths.jets import Field
@@ -60,6 +60,7 @@ class ClosedLoopBounds:
     sup_occupation: float  # the largest `mu` met
     occupation: Field  # `mu` itself
     how: Lowering  # the function of `V` that all this is of
+    sought: Peaks  # of its slack, in steep places
 
 
 def closed_loop_bounds(
@@ -71,15 +72,17 @@ def closed_loop_bounds(
     controller: str | None,
     initial: list[float] | None = None,
     odd: Tensor | None = None,
+    sought: Peaks | None = None,
 ) -> ClosedLoopBounds:
     """All bounds on ``sets`` of samples of ``loop``; suprema are climbed from the worst of them and of the states ``odd``
-    ``(K, d)``. ``initial``, if given, is `E[V mu0]` per set from more states: it carries nearly all of the variance."""
+    ``(K, d)``, and sought in steep places, unless they have been ``sought`` there for other sets. ``initial``, if given, is
+    `E[V mu0]` per set from more states: it carries nearly all of the variance."""
     found = [terms_on(Generator.of(loop, samples), value, log_occupation) for samples in sets]
     plain, _, densities, fluxes = zip(*found, strict=True)
     whole = Terms.join(plain)
-    own = LoweredSlack(loop, value, whole.samples, odd)
+    own = LoweredSlack(loop, value, whole.samples, odd, sought)
     how = own.climbed_lowest(whole, ascents)
-    if own.seek(how, ascents):
+    if sought is None and own.seek(how, ascents):
         how = own.climbed_lowest(whole, ascents)
     eps_hi, eps_lo = own.extrema(how, ascents)
     slacks = own.sampled.of(how).split([len(samples) for samples in sets])
@@ -117,7 +120,7 @@ def closed_loop_bounds(
     lagrangian = replace(lagrangian, controller=controller)
     densest = climbed_from(occupation, mu, states, ascents).value
     return ClosedLoopBounds(
-        lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions, densest, occupation, how
+        lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions, densest, occupation, how, own.sought
     )
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.estimate import integral
-from ocp_torch.certificate.lower.slack import STARTS, TOP, slack_function, slack_peaks, steep_peaks
+from ocp_torch.certificate.lower.slack import STARTS, TOP, Peaks, slack_function, slack_peaks, steep_peaks
 from ocp_torch.certificate.upper.multiples import Terms, best_multiple
 from ocp_torch.maths.jets import Field, Jet, jet
 from ocp_torch.maths.supremum import Extremum, minimiser
@@ -119,20 +119,23 @@ class Met(NamedTuple):
 
 
 class LoweredSlack:
-    """`Q_u` of any `W` on ``samples`` of ``loop``; its suprema are sought there, at the states ``odd`` ``(K, d)`` too, and
-    where ascents have ended (`climb`)."""
+    """`Q_u` of any `W` on ``samples`` of ``loop``; its suprema are sought there, at the states ``odd`` ``(K, d)`` too, where
+    ascents have ended (`climb`), and at the peaks that were ``sought`` before, on other samples."""
 
     @torch.no_grad()
-    def __init__(self, loop: ClosedLoop, value: Field, samples: Samples, odd: Tensor | None = None) -> None:
+    def __init__(
+        self, loop: ClosedLoop, value: Field, samples: Samples, odd: Tensor | None = None, sought: Peaks | None = None
+    ) -> None:
         self.loop, self.value, self.samples = loop, value, samples
         self.sampled = self.met = Met.at(Generator.of(loop, samples), value)
-        self.sought = 0  # ascents of `seek` for one of the suprema
+        self.sought = sought or Peaks(samples.x[:0], 0)
         self.initial = integral(samples, self.sampled.v * samples.mu0)
         low, high = (float(v) for v in self.sampled.v.aminmax())
         heights = [low + part * (high - low) for part in HEIGHTS] if high > low else []
         self.choices = [Above(), *(Above(height, BEND * (high - height)) for height in heights)]
-        if odd is not None and len(odd):
-            self._meet(odd)
+        for x in (self.sought.x, odd):
+            if x is not None and len(x):  # a controller of somebody else's may refuse to be asked for no state
+                self._meet(x)
 
     def _meet(self, x: Tensor) -> None:
         """From now on the states ``x`` count too."""
@@ -161,9 +164,9 @@ class LoweredSlack:
         slack, met = slack_function(self.loop, Lowered(self.value, how)), self.met.of(how)
         for function, known in ((slack, met.max()), (lambda x: -slack(x), -met.min())):
             peaks = steep_peaks(function, self.samples.x.shape[1], STARTS * ascents, float(known), self.unit)
-            if len(peaks.x):  # a controller of somebody else's may refuse to be asked for no state
+            if len(peaks.x):
                 self._meet(peaks.x)
-            self.sought = max(self.sought, peaks.ascents)
+            self.sought = Peaks(torch.cat([self.sought.x, peaks.x]), max(self.sought.ascents, peaks.ascents))
         return any(now > seen for now, seen in zip(self.suprema(how), _sides(met), strict=True))
 
     def extrema(self, how: Lowering, ascents: int) -> tuple[Extremum, Extremum]:
@@ -171,7 +174,7 @@ class LoweredSlack:
 
         def largest(side: Tensor) -> Extremum:
             top, seen = int(side.argmax()), len(self.sampled.x)
-            climbed = min(ascents, seen) + self.sought
+            climbed = min(ascents, seen) + self.sought.ascents
             return Extremum(max(float(side[top]), 0.0), self.met.x[top], seen, climbed)
 
         slack = self.met.of(how)
