@@ -7,10 +7,12 @@ import torch
 
 from ocp_torch.certificate.lower.slack import slack_function, slack_peaks
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
-from ocp_torch.certificate.upper.lowered import UNCHANGED, Above, Lowered, LoweredSlack, Lowering, Met
+from ocp_torch.certificate.upper.lowered import UNCHANGED, Above, LoweredSlack, Lowering, Met
 from ocp_torch.certificate.upper.multiples import terms_on
 from ocp_torch.certificate.upper.policy_evaluation import positive_weight
+from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.maths.jets import reverse_jet
+from ocp_torch.maths.supremum import value_and_gradient
 from ocp_torch.problems import Manufactured
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.generator import Generator
@@ -89,12 +91,27 @@ def test_slack_and_derivatives_of_a_function_of_v_are_those_of_that_function(who
     samples = Samples.of(loop, zoo.states(problem, 500))
     low, high = (float(V(samples.x).quantile(part)) for part in (0.3, 0.7))  # states below, on the bend and above
     how = Lowering(Above() if whole else Above(low, high - low), 0.3)
-    W, L = Lowered(V, how), Generator.of(loop, samples)
-    by_hand, own = reverse_jet(W, samples.x, samples.noise), W.jet(samples.x, samples.noise)
+    L = Generator.of(loop, samples)
+    by_hand, own = reverse_jet(lambda x: how(V(x)), samples.x, samples.noise), how.jet(L.jet(V), samples.noise)
     for part in ("value", "gradient", "curvature"):
         torch.testing.assert_close(getattr(own, part), getattr(by_hand, part), rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(Met.at(L, V).of(how), L.hjb_slack(by_hand), rtol=1e-9, atol=1e-9)
     assert bool((how(V(samples.x).sort().values).diff() >= 0.0).all())  # as C_V takes for granted
+
+
+@pytest.mark.parametrize("name", ["manufactured 2-d q=2", "noisy 2-d sigma(x)"])
+def test_of_the_controller_of_v_one_jet_gives_the_slack(name):
+    problem, x = zoo.build(name), torch.rand(50, 2, dtype=torch.float64)
+    V, how = zoo.rough_network(2, 3), Lowering(by=0.1)
+    found = []
+    for policy in (
+        ValuePolicy(problem, V),
+        lambda at: ValuePolicy(problem, V)(at),
+    ):  # the second does not say whose it is
+        loop = ClosedLoop(problem, policy)
+        slack = LoweredSlack(loop, V, Samples.of(loop, x))._slack_of(how, V)
+        found.append(torch.stack([slack(x), *value_and_gradient(slack, x)[1].T]))
+    torch.testing.assert_close(*found, rtol=1e-10, atol=1e-10)
 
 
 def test_what_is_too_large_at_the_top_alone_is_taken_off_there(optimal):

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ocp_torch.certificate.lower.shifted import Shift, highest
 from ocp_torch.certificate.lower.slack import SlackParts
+from ocp_torch.fields.rounded import rounded
 from ocp_torch.maths.jets import Field, Jet, jet
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.samples import Samples
@@ -31,12 +32,18 @@ class Mollified:
     where there are more. ``V`` is periodic; it is asked for states in the unit cell."""
 
     def __init__(self, value: Field, dim: int, radius: float) -> None:
+        self.dim = dim
         axes = torch.eye(dim, dtype=torch.float64)
         if dim > DIRECTIONS:
             mixed = torch.randn(dim, DIRECTIONS, generator=fixed_generator(), dtype=torch.float64)
             axes = torch.linalg.qr(mixed).Q.T
         self.value, self.radius = value, radius
         self.offsets = radius * torch.cat([torch.zeros_like(axes[:1]), axes, -axes])  # (2 k + 1, d)
+
+    @property
+    def rounded(self) -> "Mollified":
+        """The same in single precision."""
+        return Mollified(rounded(self.value), self.dim, self.radius)
 
     def neighbours(self, x: Tensor) -> Tensor:
         """All states that are averaged over, ``(N (2 k + 1), d)``."""

@@ -15,6 +15,7 @@ from ocp_torch.certificate.bound import LOWER, Bound, sentence_on
 from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
 from ocp_torch.certificate.estimate import Estimate, integrals
 from ocp_torch.certificate.lower.slack import STARTS, TOP, Scaled, SlackParts, climbed_from, slack_function, steep_peaks
+from ocp_torch.fields.rounded import rounded
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.supremum import Extremum, minimiser
 from ocp_torch.problems.generator import Generator
@@ -89,11 +90,12 @@ class Shift:
     @cached_property
     def found(self) -> Scaling:
         """By what is sought in steep places too."""
-        slack, starts = slack_function(self.problem, self.value), STARTS * self.ascents
+        slack, rough = (slack_function(self.problem, value) for value in (self.value, rounded(self.value)))
+        starts = STARTS * self.ascents
         if self.radius:  # its peaks are as wide as that, and every value is of many states
             starts = max(1, starts // AVERAGED)
         best = self.looked
-        peaks = steep_peaks(slack, self.problem.dim, starts, self._plain.value, best.initial)
+        peaks = steep_peaks(slack, rough, self.problem.dim, starts, self._plain.value, best.initial)
         if len(peaks.x):
             there = Samples.of(self.problem, peaks.x, divergences=False)
             everywhere = SlackParts.join([self._sampled, *self._parts_on([there])])

@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.estimate import integral
-from ocp_torch.certificate.lower.slack import STARTS, TOP, Peaks, slack_function, slack_peaks, steep_peaks
+from ocp_torch.certificate.lower.slack import STARTS, TOP, Peaks, slack_peaks, steep_peaks
 from ocp_torch.certificate.upper.multiples import Terms, best_multiple
-from ocp_torch.maths.jets import Field, Jet, jet
+from ocp_torch.control.policies import ValuePolicy
+from ocp_torch.fields.rounded import rounded
+from ocp_torch.maths.jets import Field, Jet
 from ocp_torch.maths.supremum import Extremum, minimiser
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.generator import Generator, pull_back
@@ -61,30 +63,19 @@ class Lowering(NamedTuple):
         """`W` at values ``v`` of `V`."""
         return v - self.by * self.above(v)[0]
 
+    def jet(self, V: Jet, sigma: Tensor | None = None) -> Jet:
+        """That of `W`, with its curvature along ``sigma`` ``(N, d, k)``, for that of `V`."""
+        h, slope, bend = self.above(V.value)
+        steep = 1.0 - self.by * slope
+        curvature = None if sigma is None else steep * V.curvature - self.by * bend * spread(sigma, V)
+        return Jet(V.value - self.by * h, steep.unsqueeze(-1) * V.gradient, curvature)
+
     def __str__(self) -> str:
         part = f"{1.0 - self.by:.4g}"
         return f"{part} V" if self.above.height is None else f"V, {part} of it above {self.above.height:.4g}"
 
 
 UNCHANGED = Lowering()
-
-
-@dataclass(frozen=True)
-class Lowered:
-    """`W`, for a ``value`` `V`."""
-
-    value: Field
-    how: Lowering
-
-    def __call__(self, x: Tensor) -> Tensor:
-        return self.how(self.value(x))
-
-    def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
-        V, by = jet(self.value, x, sigma), self.how.by
-        h, slope, bend = self.how.above(V.value)
-        steep = 1.0 - by * slope
-        curvature = None if sigma is None else steep * V.curvature - by * bend * spread(sigma, V)
-        return Jet(V.value - by * h, steep.unsqueeze(-1) * V.gradient, curvature)
 
 
 def spread(sigma: Tensor, V: Jet) -> Tensor:
@@ -151,19 +142,35 @@ class LoweredSlack:
         """`eps_hi` and `eps_lo` of `W`, as met."""
         return _sides(self.met.of(how))
 
+    def _slack_of(self, how: Lowering, value: Field) -> Field:
+        """`x -> Q_u(x)` of `W`, made of ``value``, which is `V` or nearly so."""
+        policy = self.loop.policy
+        own = policy if isinstance(policy, ValuePolicy) and policy.value is self.value else None
+
+        def slack(x: Tensor) -> Tensor:
+            problem = self.loop if own is None else self.loop.problem
+            generator = Generator.of(problem, Samples.live(problem, x))
+            V, data = generator.jet(value), generator.data
+            W = how.jet(V, data.noise)
+            # Of the controller of `V` one jet gives the control and the slack.
+            return generator.hjb_slack(W) if own is None else generator.bellman_slack(W, own.control(data.B, V))
+
+        return slack
+
     @torch.no_grad()
     def climb(self, how: Lowering, ascents: int, steps: int = 60) -> None:
         """Meet the ends of so many ``steps`` of ``ascents`` from where the slack of `W` is smallest and largest."""
-        function = slack_function(self.loop, Lowered(self.value, how))
-        self._meet(slack_peaks(function, self.met.x, self.met.of(how), ascents, steps))
+        self._meet(slack_peaks(self._slack_of(how, self.value), self.met.x, self.met.of(how), ascents, steps))
 
     @torch.no_grad()
     def seek(self, how: Lowering, ascents: int) -> bool:
         """Meet the peaks of the slack of `W` in steep places, and of what it is below 0, by `STARTS` times as many ascents or
         more, and say whether any is higher than what was met before."""
-        slack, met = slack_function(self.loop, Lowered(self.value, how)), self.met.of(how)
-        for function, known in ((slack, met.max()), (lambda x: -slack(x), -met.min())):
-            peaks = steep_peaks(function, self.samples.x.shape[1], STARTS * ascents, float(known), self.unit)
+        slack, rough = (self._slack_of(how, value) for value in (self.value, rounded(self.value)))
+        below, roughly_below = (lambda x: -slack(x)), (lambda x: -rough(x))
+        met, dim, starts = self.met.of(how), self.samples.x.shape[1], STARTS * ascents
+        for exact, near, known in ((slack, rough, met.max()), (below, roughly_below, -met.min())):
+            peaks = steep_peaks(exact, near, dim, starts, float(known), self.unit)
             if len(peaks.x):
                 self._meet(peaks.x)
             self.sought = Peaks(torch.cat([self.sought.x, peaks.x]), max(self.sought.ascents, peaks.ascents))
