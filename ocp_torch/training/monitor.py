@@ -28,9 +28,6 @@ from ocp_torch.training.trainer import Trainer
 log = logging.getLogger(__name__)
 # How the names of TensorBoard's files begin.
 EVENTS = "events.out.tfevents."
-# A full certificate has cost 5 to 10 times a quick one, beside its own fit (measured on the circle, the pendulum and a
-# manufactured problem in four dimensions).
-QUICK_CERTIFICATES = 6.0
 # One chart in which the bracket closes, of running estimates, and one of the looks.
 BRACKET = {
     "bracket": {
@@ -153,8 +150,7 @@ class Monitor(Silent):
 
     def stopped(self, trainer: Trainer, why: str, settings: CertificateSettings) -> None:
         """Training stopped, and the certificate is about to be made; says why, and about how long that takes."""
-        quick, per_step = trainer.evaluator.seconds, trainer.state.seconds / max(trainer.step, 1)
-        seconds = None if quick is None else QUICK_CERTIFICATES * quick + settings.stage.steps * per_step
+        seconds = trainer.evaluator.expected(settings)
         self.bar.clear()
         rest = f", in about {in_words(seconds)}" if seconds else ""
         log.info("%s; the certificate is next%s", why.rstrip("."), rest)

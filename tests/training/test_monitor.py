@@ -1,17 +1,21 @@
 """What TensorBoard shows of the game: both players, both constraint violations, whatever the method and its phase."""
 
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from ocp_torch.certificate import CertificateSettings, StageSettings
+from ocp_torch.certificate.upper.policy_evaluation import LARGER
 from ocp_torch.control.policies import occupation_density
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.finish import glimpse
 from ocp_torch.runs.run import run_to_end
+from ocp_torch.training.evaluator import TRAINED_ON
 from ocp_torch.training.monitor import Monitor, Stages, liouville_residual
 from ocp_torch.training.running import RunningEstimates
 from support.small import METHODS, small
@@ -137,3 +141,16 @@ def test_in_a_terminal_a_clock_shows_the_stage_and_how_long_all_take(capsys):
     shown = capsys.readouterr().err
     assert "certifying: simulation" in shown
     assert "about 2 min in all" in shown
+
+
+def test_the_time_that_is_told_counts_what_the_certificate_trains(monkeypatch):
+    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.ROUNDS", ((100.0, 10, 1e-3), (1000.0, 30, 1e-3)))
+    trainer = small("problem=arm", "method=dual")
+    evaluator, stage = trainer.evaluator, StageSettings(steps=100, rounds=1, batch=50)
+    plain = CertificateSettings(points=2048, mollify=False, stage=stage)
+    assert evaluator.expected(plain) is None  # nobody has looked yet
+    evaluator.seconds, trainer.state.seconds, trainer.state.samples = 2.0, 3.0, 1000
+    assert evaluator.expected(plain) == pytest.approx(6.0 * 2.0 + 5000 * 0.003)
+    searched = evaluator.expected(replace(plain, mollify=None))
+    assert searched == pytest.approx(6.0 * 2.0 + (LARGER * 5000 + TRAINED_ON * 40 * 2048) * 0.003)
+    assert evaluator.expected(replace(plain, mollify=None, points=1024)) < searched

@@ -41,6 +41,17 @@ BETAS = (0.9, 0.95)
 BATCH = 2048  # new states of a step, at most
 
 
+def rounds_of(problem: Problem) -> tuple[tuple[float, int, float], ...]:
+    """`ROUNDS`, or those with noise."""
+    return NOISY_ROUNDS if problem.noisy else ROUNDS
+
+
+def new_states(problem: Problem, batch: int) -> int:
+    """How many states `tightened` draws with up to ``batch`` a step, the worst that come again aside."""
+    states = min(batch, BATCH)
+    return sum(whole * states // BATCH for _, whole, _ in rounds_of(problem)) * states
+
+
 def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> Iterator[tuple[Field, Samples] | None]:
     """`W` for ``value`` `V`, and states where its slack is largest, both in float64, after each round of training in float32
     on up to ``batch`` states a step, and `None` after each step; nothing where `V` has no weights, nothing more where these
@@ -52,7 +63,7 @@ def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> 
     sampler = SobolSampler(problem.dim, derive_seed(seed, Branch.TIGHTENING), torch.float32)
     states = min(batch, BATCH)
     new = lambda: problem.samples(sampler.draw(states), divergences=False)
-    for k, (M, whole, rate) in enumerate(NOISY_ROUNDS if problem.noisy else ROUNDS):
+    for k, (M, whole, rate) in enumerate(rounds_of(problem)):
         steps = max(1, whole * states // BATCH)
         stepper, average = short_fit(fields, objective, rate, steps, unit, betas=BETAS)
         phase = Phase(Constants(M=M, C_V=1.0, C_u=1.0, sources={}))
