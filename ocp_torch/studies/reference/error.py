@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import batched, supremum
@@ -82,9 +83,9 @@ def extrapolate(
     return Extrapolation(optimum, error if settled or shown else None, order)
 
 
-def look_between(problem: Problem, grid: Grid) -> tuple[float, float, str | None]:
-    """Compare `f`, `a`, `B` and `D` with what the nodes of ``grid`` around give, at many states between and on ascents from
-    there, and the mass of `mu0` at the nodes with 1.
+def look_between(problem: Problem, grid: Grid, base: Field | None = None) -> tuple[float, float, str | None]:
+    """Compare `f`, `a`, `B`, `D` and a ``base`` with what the nodes of ``grid`` around give, at many states between and on
+    ascents from there, and the mass of `mu0` at the nodes with 1.
 
     How far `f` falls at most below what the nodes around show, by which `V` can be too high; how far the mass is from 1; and
     a sentence that says what makes the error unknown, and where, or `None`.
@@ -103,6 +104,9 @@ def look_between(problem: Problem, grid: Grid) -> tuple[float, float, str | None
     if problem.noisy:
         spread = lambda x: diffusion(problem, x).flatten(1)
         found += [("the noise is off", *_unseen(grid, spread, x, sign)) for sign in (-1.0, 1.0)]
+    if base is not None:
+        known = lambda x: base(x.remainder(1.0)).unsqueeze(-1)
+        found += [("the V that is begun with is off", *_unseen(grid, known, x, sign)) for sign in (-1.0, 1.0)]
     mean = float(batched(problem.initial_density, grid.nodes(), PIECE).mean())
     what, share, size, place = max(found, key=lambda f: f[1])
     sentence = None
