@@ -18,7 +18,7 @@ from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.runge_kutta import discounted_integral, refined
 from ocp_torch.maths.sampling import evaluation_points
 from ocp_torch.problems import Pendulum, Problem
-from ocp_torch.training.evaluator import QUICK, SEARCHED
+from ocp_torch.training.evaluator import QUICK
 from support import zoo
 
 TURN = 2.0 * math.pi
@@ -315,7 +315,6 @@ def test_what_rounds_is_audited_however_fine_the_steps_of_all_trajectories_are()
 def test_only_looks_go_without_audits():
     assert CertificateSettings().audited
     assert not QUICK.audited
-    assert not SEARCHED.audited
     with pytest.raises(InputError, match="audited"):
         call(CertificateSettings, "certificate", {"audited": False})
 
