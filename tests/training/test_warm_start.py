@@ -152,6 +152,7 @@ def test_a_run_that_is_killed_in_its_warm_start_goes_on_to_the_same_bits(way, tm
     assert differences(again.state_dict()["fields"], whole.state_dict()["fields"]) == []
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("little")
 def test_the_controller_of_the_warm_start_is_a_candidate_and_can_be_handed_out(tmp_path):
     trainer = small(*WARM, *FEW, "model.modes=3", "method=dual", "trainer.figures=false", "certificate.tolerance=0.05")
