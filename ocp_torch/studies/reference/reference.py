@@ -50,6 +50,7 @@ class Reference:
     unsettled: float
     solution: GridSolution
     unknown: str | None = None
+    based: bool = False  # whether the grids hold only what is to be added to a base
 
     @property
     def value(self) -> Tensor:
@@ -133,7 +134,19 @@ def _reference(
     elif unknown is None:
         unknown = "the three grids do not approach evenly"
     unsettled = max(s.residual for s in solutions)
-    return Reference(problem, result.optimum, error, result.order, sides, estimates, change, unsettled, whole, unknown)
+    return Reference(
+        problem,
+        result.optimum,
+        error,
+        result.order,
+        sides,
+        estimates,
+        change,
+        unsettled,
+        whole,
+        unknown,
+        base is not None,
+    )
 
 
 def _mean(problem: Problem, base: Field) -> float:

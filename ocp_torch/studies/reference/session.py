@@ -119,6 +119,8 @@ def reference_table(reference: Reference) -> str:
     order = "none (the three grids do not approach evenly)" if math.isnan(reference.order) else f"{reference.order:.2f}"
     change = f"changes by up to {reference.value_change:.2g} from the second grid to the finest"
     lines += [f"order    {order}", f"V        {change}"]
+    if reference.based:
+        lines.append("added to the V of the run, as grids alone do not settle: not independent of it")
     if reference.occupation is not None:
         lines.append(f"mu*      up to {float(reference.occupation.max()):.5g} at the nodes of the finest grid")
     if reference.error is None:
