@@ -61,9 +61,10 @@ FEWEST_STEPS = 100
 
 # Where no M is known the bound is decided by the worst state: that wants more states at once, and, without noise, longer.
 # Without noise `V` is trained on for its bound afterwards, on batches of its own, and half of the states will do: the bounds
-# of a unicycle, dubins, an arm and six oscillators with 1,024, 512 and 256 states were 1.294, 1.299, 1.298; 1.147, 1.151,
-# 1.150; .4609, .4606, .4606; .6486, .6482, .643 (a seed each), their performances 1.3086, 1.3091, 1.3102; 1.1615, 1.1616, 1.1623; .4629,
-# .4632, .4635; .6556, .6560, .6570, in 15, 10 and 7 ms a step. With noise a unicycle's certified gap was 4.4 % and 4.5 %.
+# of a unicycle, dubins, an arm and six oscillators (a seed each) with 1,024, 512 and 256 states were 1.294, 1.299, 1.298;
+# 1.147, 1.151, 1.150; .4609, .4606, .4606; .6486, .6482, .643, their performances 1.3086, 1.3091, 1.3102; 1.1615, 1.1616,
+# 1.1623; .4629, .4632, .4635; .6556, .6560, .6570, in 15, 10 and 7 ms a step. With noise a unicycle's certified gap was 4.4 %
+# with 1,024 and 4.5 % with 512.
 # With noise two and three coordinates want less: after rounds of 600 and 1,200 steps a pendulum's certified gap is .55 % and
 # an arm's 1.0 % at 1e-3, after 900 and 1,800 .45 and .85 %, for 25 s more of 145; dubins has 6.1 (simulated 1.33) after 900
 # and 1,800, 6.8 (1.40) after 1,200 and 2,400; a unicycle 3.0 (1.26) after 900 and
