@@ -8,7 +8,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import batched, supremum
@@ -17,8 +16,8 @@ from ocp_torch.problems.starts import start_distribution
 from ocp_torch.studies.reference.finite_differences import diffusion
 from ocp_torch.studies.reference.grid import Grid
 
-# Order of the scheme where V is smooth, by which the leading error is removed.
-ORDER = 2.0
+# Orders of the schemes where V is smooth, by which the leading error is removed; the second is that of linear interpolation.
+ORDER, LINEAR = 2.0, 1.0
 # Factor on the change of the extrapolated number from one pair of grids to the next: covers every order from 1 on.
 SAFETY = 3.0
 # What is removed by extrapolation counts as uncertain by this share at least, times SAFETY.
@@ -54,13 +53,18 @@ class Extrapolation(NamedTuple):
 
 
 def extrapolate(
-    spacings: Sequence[float], numbers: Sequence[float], noise: float = 0.0, even: bool = False
+    spacings: Sequence[float],
+    numbers: Sequence[float],
+    noise: float = 0.0,
+    even: bool = False,
+    order: float = ORDER,
 ) -> Extrapolation:
-    r"""Richardson's extrapolation of ``numbers`` on grids of ``spacings`` `h_1 > h_2 > h_3`, taken as `Q + C h^2`.
+    r"""Richardson's extrapolation of ``numbers`` on grids of ``spacings`` `h_1 > h_2 > h_3`, taken as `Q + C h^r` with the
+    ``order`` `r`.
 
     With `X_12`, `X_23` from the two pairs of grids and `Q_3` the finest number the stated error is
     `SAFETY max(|X_23 - X_12|, DOUBT |X_23 - Q_3|)`. If the error is `C h^p` instead, that of `X_23` is below it for every
-    `p` in [1, 2) and ratio of spacings from 4/3 on, and also for `p > 2`.
+    `p` from 1 on, whatever `r` is, where the ratio of spacings is 4/3 or more.
 
     Where the error is known to have an expansion in `h^2` (``even``) no more is in doubt than the order seen is off: an error
     `C h^p` leaves `|p - 2| C h^2` of it.
@@ -70,22 +74,22 @@ def extrapolate(
     from scipy.optimize import brentq
 
     (h1, h2, h3), (Q1, Q2, Q3) = spacings, numbers
-    pair = lambda coarse, fine, h, k: fine + (fine - coarse) / ((h / k) ** ORDER - 1.0)
+    pair = lambda coarse, fine, h, k: fine + (fine - coarse) / ((h / k) ** order - 1.0)
     earlier, optimum = pair(Q1, Q2, h1, h2), pair(Q2, Q3, h2, h3)
     settled = max(numbers) - min(numbers) <= noise + ROUNDING * max(map(abs, numbers))
     # At the order p this is (h_1^p - h_2^p) / (h_2^p - h_3^p), which increases in p; none has changes of opposite signs.
     ratio = (Q1 - Q2) / (Q2 - Q3) if Q2 != Q3 else math.nan
     excess = lambda p: (h1**p - h2**p) / (h2**p - h3**p) - ratio
     shown = ratio > 0.0 and excess(ORDERS[0]) < 0.0 < excess(ORDERS[1])
-    order = brentq(excess, *ORDERS) if shown else math.nan
-    doubt = min(DOUBT, abs(order - ORDER)) if even and shown else DOUBT
+    seen = brentq(excess, *ORDERS) if shown else math.nan
+    doubt = min(DOUBT, abs(seen - ORDER)) if even and shown else DOUBT
     error = SAFETY * max(abs(optimum - earlier), doubt * abs(optimum - Q3))
-    return Extrapolation(optimum, error if settled or shown else None, order)
+    return Extrapolation(optimum, error if settled or shown else None, seen)
 
 
-def look_between(problem: Problem, grid: Grid, base: Field | None = None) -> tuple[float, float, str | None]:
-    """Compare `f`, `a`, `B`, `D` and a ``base`` with what the nodes of ``grid`` around give, at many states between and on
-    ascents from there, and the mass of `mu0` at the nodes with 1.
+def look_between(problem: Problem, grid: Grid) -> tuple[float, float, str | None]:
+    """Compare `f`, `a`, `B` and `D` with what the nodes of ``grid`` around give, at many states between and on ascents from
+    there, and the mass of `mu0` at the nodes with 1.
 
     How far `f` falls at most below what the nodes around show, by which `V` can be too high; how far the mass is from 1; and
     a sentence that says what makes the error unknown, and where, or `None`.
@@ -104,9 +108,6 @@ def look_between(problem: Problem, grid: Grid, base: Field | None = None) -> tup
     if problem.noisy:
         spread = lambda x: diffusion(problem, x).flatten(1)
         found += [("the noise is off", *_unseen(grid, spread, x, sign)) for sign in (-1.0, 1.0)]
-    if base is not None:
-        known = lambda x: base(x.remainder(1.0)).unsqueeze(-1)
-        found += [("the V that is begun with is off", *_unseen(grid, known, x, sign)) for sign in (-1.0, 1.0)]
     mean = float(batched(problem.initial_density, grid.nodes(), PIECE).mean())
     what, share, size, place = max(found, key=lambda f: f[1])
     sentence = None

@@ -2,15 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.jets import Field
-from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
-from ocp_torch.studies.reference.error import extrapolate, look_between
+from ocp_torch.studies.reference.error import LINEAR, ORDER, extrapolate, look_between
 from ocp_torch.studies.reference.grid import PIECE, Grid, grid_sides, require_solvable
 from ocp_torch.studies.reference.policy_iteration import GridSolution, solve
 from ocp_torch.studies.reference.semi_lagrangian import CLIP, SemiLagrangian, minimiser
@@ -23,8 +21,6 @@ CELLS, LONGEST = 1.0, 0.25
 TOLERANCE, COARSE, ROUGH = 1e-7, 1e-4, 1e-3
 # What iterations stopped early leave is too much where it is more than that part of the stated error.
 SETTLED = 0.5
-# Nodes of the sum by which a base is integrated.
-SUMMED = 2**20
 # How fast a typical state moves is found on a grid of at most so many nodes per coordinate, by dimension. The optimal speed
 # depends on the step a little, so it is found again with the step it gave, so many times in all.
 SPEED_SIDE, SPEED_ROUNDS = {1: 64, 2: 32, 3: 16}, 3
@@ -50,7 +46,6 @@ class Reference:
     unsettled: float
     solution: GridSolution
     unknown: str | None = None
-    based: bool = False  # whether the grids hold only what is to be added to a base
 
     @property
     def value(self) -> Tensor:
@@ -84,28 +79,24 @@ class Reference:
         return torch.cat(values), torch.cat(controls)
 
 
-def solve_reference(
-    problem: Problem, side: int | None = None, memory: float = 4.0, base: Field | None = None
-) -> Reference:
+def solve_reference(problem: Problem, side: int | None = None, memory: float = 4.0) -> Reference:
     """Solve ``problem`` on three grids, the finest with ``side`` nodes per coordinate (None: 1024, 192, 40 by dimension,
     4096 in one with noise).
 
-    ``memory`` in gigabytes is what the finest may take. Where the iteration does not settle (and there is no noise) the grids
-    hold only what is to be added to ``base``, a function near `V*` such as the `V` of a run, if that says more. Raises
-    `InputError` for more than three dimensions, a grid that does not fit, functions that are not finite or not periodic, and
-    a control cost other than `|u|^q / q`.
+    ``memory`` in gigabytes is what the finest may take. Raises `InputError` for more than three dimensions, a grid that does
+    not fit, functions that are not finite or not periodic, and a control cost other than `|u|^q / q`.
     """
     sides = grid_sides(problem, side, memory)
     with torch.no_grad():
         require_solvable(problem, Grid(problem.dim, sides[0]))
         if problem.noisy:
             solutions, even = with_noise(problem, sides)
-            return _reference(problem, solutions, even, moved_numbers(problem, solutions[0]))
+            return _reference(problem, solutions, even, moved=moved_numbers(problem, solutions[0]))
         clipped = _reference(problem, _without_noise(problem, sides))
         if clipped.error is None or clipped.unsettled <= SETTLED * clipped.error:
             return clipped
         # The monotone scheme always settles; where V is smooth its error is larger.
-        monotone = _reference(problem, _monotone(problem, sides, base), base=base)
+        monotone = _reference(problem, _monotone(problem, sides), order=LINEAR)
         return min(clipped, monotone, key=lambda found: math.inf if found.error is None else found.error)
 
 
@@ -113,46 +104,26 @@ def _reference(
     problem: Problem,
     solutions: list[GridSolution],
     even: bool = False,
+    order: float = ORDER,
     moved: Sequence[float] = (),
-    base: Field | None = None,
 ) -> Reference:
-    """What the ``solutions`` on three grids say, beside ``base``; ``even`` is as `extrapolate` has it, ``moved`` are the
+    """What the ``solutions`` on three grids say; ``even`` and ``order`` are as `extrapolate` has them, ``moved`` are the
     numbers of the coarsest grid moved by parts of a cell."""
     start, sides = solutions[-1], tuple(s.grid.side for s in solutions)
-    common = 0.0 if base is None else _mean(problem, base)
-    estimates = tuple(common + s.mean(problem) for s in solutions)
-    fall, missing, unknown = look_between(problem, start.grid, base)
+    estimates = tuple(s.mean(problem) for s in solutions)
+    fall, missing, unknown = look_between(problem, start.grid)
     change = float((solutions[1].carried(start.grid)[0] - start.value).abs().max())
     noise = max(s.residual + s.defect for s in solutions)
-    result = extrapolate([1.0 / side for side in sides], estimates, noise, even)
-    whole = start if base is None else replace(start, value=start.value + batched(base, start.grid.nodes(), PIECE))
+    result = extrapolate([1.0 / n for n in sides], estimates, noise, even, order)
     error = result.error if unknown is None else None
     if error is not None:
-        error = error + noise + fall + missing * float(whole.value.abs().max())
+        error = error + noise + fall + missing * float(start.value.abs().max())
         if moved:
             error += error_of_jumps(sides, estimates[0], result.optimum, moved)
     elif unknown is None:
         unknown = "the three grids do not approach evenly"
     unsettled = max(s.residual for s in solutions)
-    return Reference(
-        problem,
-        result.optimum,
-        error,
-        result.order,
-        sides,
-        estimates,
-        change,
-        unsettled,
-        whole,
-        unknown,
-        base is not None,
-    )
-
-
-def _mean(problem: Problem, base: Field) -> float:
-    """`E[base mu0]`, by the rule of equal weights on `SUMMED` nodes or a few less."""
-    x = Grid(problem.dim, int(SUMMED ** (1.0 / problem.dim))).nodes()
-    return float((batched(base, x, PIECE) * batched(problem.initial_density, x, PIECE)).mean())
+    return Reference(problem, result.optimum, error, result.order, sides, estimates, change, unsettled, start, unknown)
 
 
 def _without_noise(problem: Problem, sides: Sequence[int]) -> list[GridSolution]:
@@ -171,14 +142,13 @@ def _without_noise(problem: Problem, sides: Sequence[int]) -> list[GridSolution]
     return solutions
 
 
-def _monotone(problem: Problem, sides: Sequence[int], base: Field | None) -> list[GridSolution]:
-    """Those of the monotone scheme for what is to be added to ``base``."""
+def _monotone(problem: Problem, sides: Sequence[int]) -> list[GridSolution]:
+    """Those of the monotone scheme."""
     start, pace = _speed(problem, sides[0])
-    start = start if base is None else replace(start, value=torch.zeros_like(start.value))
     solutions = []
     for n in sides:
         grid = Grid(problem.dim, n)
-        start = solve(SemiLagrangian(problem, grid, pace * grid.spacing, base=base), *start.carried(grid), COARSE)
+        start = solve(SemiLagrangian(problem, grid, pace * grid.spacing), *start.carried(grid), COARSE)
         solutions.append(start)
     return solutions
 

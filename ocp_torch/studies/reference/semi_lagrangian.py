@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.jets import Field, chunked_jet
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.problem import Problem
@@ -61,12 +60,9 @@ class SemiLagrangian:
     """The scheme for ``problem`` on ``grid``; ``step`` is `tau`, in units of time; ``rise`` is `osc V`, to which clipping is
     relative. At 0 all of the cubic correction is clipped: the scheme is monotone, and each policy lowers `V` whatever it
     starts from. In its methods ``nodes`` are indices or a slice of nodes, ``u`` ``(N, m)`` their controls, ``value``
-    ``(n,)`` is `V` and ``slope`` ``(n, d)`` its gradient at all nodes. ``pieces`` are all nodes, piece by piece.
+    ``(n,)`` is `V` and ``slope`` ``(n, d)`` its gradient at all nodes. ``pieces`` are all nodes, piece by piece."""
 
-    With a ``base``, any function that is known everywhere, they are those of `V` less the base: only that is interpolated,
-    and where the base is near `V` little is left to err by."""
-
-    def __init__(self, problem: Problem, grid: Grid, step: float, rise: float = 0.0, base: Field | None = None) -> None:
+    def __init__(self, problem: Problem, grid: Grid, step: float, rise: float = 0.0) -> None:
         self.problem, self.grid, self.step = problem, grid, step
         self.rho, self.q, self.limit = problem.discount, problem.exponent, problem.control_limit
         self.weights = discounted_weights(self.rho, step)
@@ -78,7 +74,6 @@ class SemiLagrangian:
         self.scale = float(self.f.max() - self.f.min())
         self.clip = CLIP * rise * grid.spacing**1.5
         self.monotone = rise == 0.0
-        self.base, self.known = base, None if base is None else batched(base, self.x, PIECE)
 
     def move(self, nodes: slice | Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """The midpoint and the end of the path from each of ``nodes`` under ``u``."""
@@ -99,16 +94,12 @@ class SemiLagrangian:
         first, second, third = self.weights
         paid = first * self.f[nodes] + second * f(middle) + third * f(end) + self.gain * running_cost(u, self.q)
         constant = paid + self.beta * constant
-        if self.base is not None and self.known is not None:
-            constant = constant + self.beta * batched(self.base, end, PIECE) - self.known[nodes]
         return constant + self.beta * (weights * value[stencil.index]).sum(dim=-1), stencil.index, weights, constant
 
     def pull(self, slope: Tensor, nodes: Tensor, u: Tensor) -> Tensor:
         """`-B^T grad V / rho`, ``(N, m)``, midway along the path under ``u``."""
         middle, _ = self.move(nodes, u)
         gradient = self.grid.interpolated(slope, middle)
-        if self.base is not None:
-            gradient = gradient + chunked_jet(self.base, middle).gradient
         return -torch.einsum("ndm,nd->nm", self.problem.control_matrix(middle), gradient) / self.rho
 
     def closed_form(self, slope: Tensor, nodes: Tensor, u: Tensor, otherwise: Tensor) -> Tensor:

@@ -9,13 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from ocp_torch.certificate import in_float64
 from ocp_torch.control.controller import Controller, problem_name
 from ocp_torch.errors import InputError, require_integer, require_section
-from ocp_torch.fields.rounded import rounded
 from ocp_torch.files.reading import FOLDER, kind, require_unlinked
 from ocp_torch.files.storage import write_atomically
-from ocp_torch.maths.jets import Field
 from ocp_torch.runs.build import build_problem
 from ocp_torch.runs.evaluate import load_run
 from ocp_torch.studies.reference.figure import draw
@@ -33,7 +30,6 @@ class ReferenceJob:
     def __init__(self, config: dict) -> None:
         section = require_section("problem", config["problem"])
         self.controller: Controller | None = None
-        self.base: Field | None = None  # the run's V
         if config["run"] is None:
             if not section:
                 raise InputError(
@@ -47,8 +43,6 @@ class ReferenceJob:
                 raise InputError("problem and run are both given, but the run names its problem; leave problem out.")
             self.controller = load_run({"run": config["run"], "problem": section})
             self.problem, path = self.controller.problem, Path(str(config["run"]))
-            value = self.controller.fields.value
-            self.base = None if value is None else rounded(in_float64(value))
             folder = path if path.is_dir() else path.parent
             require_unlinked(folder, ("figures",))
             self.figure = folder / "figures" / "reference.png"
@@ -62,7 +56,7 @@ class ReferenceJob:
         """Solve, print, and write what was asked for."""
         torch.set_num_threads(self.threads)
         started = time.process_time()
-        reference = solve_reference(self.problem, self.side, self.memory, self.base)
+        reference = solve_reference(self.problem, self.side, self.memory)
         log.info("%s\n%.1f s of CPU", reference_table(reference), time.process_time() - started)
         if self.file is not None:
             save_reference(self.file, reference)
@@ -119,8 +113,6 @@ def reference_table(reference: Reference) -> str:
     order = "none (the three grids do not approach evenly)" if math.isnan(reference.order) else f"{reference.order:.2f}"
     change = f"changes by up to {reference.value_change:.2g} from the second grid to the finest"
     lines += [f"order    {order}", f"V        {change}"]
-    if reference.based:
-        lines.append("added to the V of the run, as grids alone do not settle: not independent of it")
     if reference.occupation is not None:
         lines.append(f"mu*      up to {float(reference.occupation.max()):.5g} at the nodes of the finest grid")
     if reference.error is None:
