@@ -90,8 +90,9 @@ def shown(bound: Bound, context: Context) -> Estimate | None:
 
 
 def examined(certificate: Certificate) -> Certificate:
-    """``certificate``, where a lower bound on `OPT` is above an upper one by more than their errors without anything that
-    counts. A guess that is shown to be wrong in this way is dropped, with a warning, and the rest stands."""
+    """``certificate``, where a lower bound on `OPT` is above an upper one by more than their errors, or one on a performance
+    above what was simulated, without anything that counts. A guess that is shown to be wrong in this way is dropped, with a
+    warning, and the rest stands."""
     if not certificate.stands:
         return certificate
     truth = {} if certificate.exact is None else {"OPT": Estimate(certificate.exact, 0.0)}
@@ -101,6 +102,9 @@ def examined(certificate: Certificate) -> Certificate:
     lower = known_of(certificate.lower)
     below = {n: e for n, e in lower.items() if certificate.counts(n)}
     sound = [*product(below.items(), (above | truth).items()), *product(truth.items(), above.items())]
+    own = {f"Perf ({n})": e for n, e in known_of(certificate.perf).items() if n == certificate.controller}
+    least = {n: e for n, e in known_of(certificate.perf_lower).items() if certificate.counts(n)}
+    sound += product(least.items(), own.items())
     supposed = {n: e for n, e in lower.items() if certificate.conditional(n)}
     guessed = [*product(supposed.items(), (above | truth).items())]
     level = 1.0 - (1.0 - LEVEL) / max(1, len(sound) + len(guessed))

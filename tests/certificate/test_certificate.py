@@ -34,6 +34,7 @@ def certificate_of(problem, constants=None, settings=CHEAP):
     return certify_fields(problem, trained, constants or resolve_constants(problem), settings, Run("test", "dual"))
 
 
+@pytest.mark.nightly
 @zoo.on(["manufactured 1-d q=2", "manufactured 2-d q=1.5"])
 def test_the_lagrangian_bound_is_second_order_where_J_is_first(problem):
     bump_V, bump_mu = (zoo.rough_network(problem.dim, seed, size=1.0) for seed in (1, 2))
@@ -84,6 +85,7 @@ def test_what_nobody_knows_is_estimated_with_a_warning():
     assert (constants.basis("M"), constants.basis("C_V")) == (GUESSED, SEARCHED)
 
 
+@pytest.mark.nightly
 def test_a_guessed_M_makes_a_conditional_bound_that_enters_nothing_else():
     problem = Anonymous(dim=1, contrast=0.9, seed=3)
     certificate = certificate_of(problem)
@@ -136,6 +138,7 @@ def rounds_of(*overrides: str):
     return trainer
 
 
+@pytest.mark.nightly
 def test_another_round_twice_as_long_starts_only_while_the_gap_is_not_good():
     assert rounds_of().step == 8
     assert rounds_of("trainer.rounds=2", "trainer.good_gap=1e9").step == 8

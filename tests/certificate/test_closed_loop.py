@@ -99,6 +99,7 @@ def test_the_bounds_of_a_poor_controller_are_above_its_own_performance(problem):
         assert bound.value >= perf.value - perf.bias - 4.0 * (perf.se + bound.se)
 
 
+@pytest.mark.nightly
 def test_the_stage_takes_another_round_only_while_the_residual_costs_too_much(monkeypatch):
     monkeypatch.setattr(policy_evaluation, "STEEP", torch.inf)
     problem = zoo.build("manufactured 2-d q=2")
@@ -171,6 +172,7 @@ def test_the_first_round_ends_early_where_v_is_solved_so_well_that_any_density_w
     assert len(steps) == (100 if solved else 250)
 
 
+@pytest.mark.nightly
 def test_a_fit_whose_first_steps_lose_all_mass_is_begun_anew_more_slowly(monkeypatch):
     problem = zoo.build("manufactured 2-d q=2")
     network = partial(PeriodicMLP, modes=1, width=16, depth=2)

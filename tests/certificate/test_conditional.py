@@ -125,6 +125,7 @@ def test_a_density_that_is_far_too_small_enters_nothing_that_counts(solved, monk
     assert "mu*" not in sure[0]
 
 
+@pytest.mark.nightly
 @zoo.on(("circle rho=2", "noisy 2-d sigma(x)"))
 @pytest.mark.parametrize("M", [1.7, 1e9])
 def test_the_best_multiple_and_constant_are_found_and_leave_a_bound(problem, M):

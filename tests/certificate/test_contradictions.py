@@ -14,8 +14,8 @@ from support.looks import LOWER, certificate
 RUN = Run("circle", "dual")
 
 
-def with_errors(lower: Estimate, perf: Estimate, basis: str = "given", **rest):
-    plain = certificate(RUN, 0.1, **rest)
+def with_errors(lower: Estimate, perf: Estimate, basis: str = "given", perf_lower=None):
+    plain = certificate(RUN, 0.1)
     assumptions = replace(plain.assumptions, basis={"M": basis})
     shifted = Estimate(0.5 * LOWER, 0.0)
     return examined(
@@ -23,6 +23,7 @@ def with_errors(lower: Estimate, perf: Estimate, basis: str = "given", **rest):
             plain,
             lower={"F_M": lower, "shifted": shifted},
             perf={"value": perf, "density": None},
+            perf_lower=perf_lower or {},
             assumptions=assumptions,
         )
     )
@@ -63,6 +64,14 @@ def test_an_optimum_that_a_bound_excludes_is_a_contradiction(exact):
 
 def test_doing_nothing_cannot_be_better_than_a_lower_bound():
     assert "zero" in certificate(RUN, 0.1, zero=0.5 * LOWER).contradiction
+
+
+def test_a_bound_on_a_performance_from_below_is_held_against_what_was_simulated_of_it():
+    found = lambda least: with_errors(Estimate(0.5 * LOWER, 0.0), Estimate(LOWER, 0.0, 0.0), perf_lower=least)
+    assert found({"evaluation": Estimate(0.9 * LOWER, 0.0)}).contradiction is None
+    wrong = found({"evaluation": Estimate(1.1 * LOWER, 0.0)})
+    assert "evaluation" in wrong.contradiction
+    assert "Perf (value)" in wrong.contradiction
 
 
 def test_a_guess_that_is_refuted_is_dropped_and_the_rest_stands():

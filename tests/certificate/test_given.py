@@ -79,6 +79,7 @@ def test_without_a_value_function_there_is_no_lower_bound():
     assert certificate.perf["given"].value == pytest.approx(1.0 / 12.0, rel=0.1)
 
 
+@pytest.mark.nightly
 def test_a_value_function_is_trained_where_none_is_given():
     problem = Circle()
     certificate = certify(problem, lambda x: 0.0 * x, settings=UNFITTED, train_steps=40)

@@ -103,6 +103,7 @@ def test_steps_within_a_hold_are_halved_where_they_are_too_long():
     assert long.bias < 0.15 * long.se < 2e-3 * long.value
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_the_shorter_it_is_held_the_nearer_it_is_to_feedback(noise):
     problem = Circle(noise=noise)
@@ -132,6 +133,7 @@ def test_with_noise_it_is_what_a_plain_simulation_gives():
     assert error < 0.02 * perf.value
 
 
+@pytest.mark.nightly
 def test_beside_a_held_control_a_worse_controller_stays_rough_and_what_is_remembered_is_not_made_again(monkeypatch):
     problem = Circle()
     efforts = []
@@ -174,6 +176,7 @@ def test_paths_for_pictures_hold_it_too():
         assert path.times.tolist() == pytest.approx([i / steps for i in range(steps + 1)])
 
 
+@pytest.mark.nightly
 def test_time_outside_the_box_is_that_of_the_held_control():
     """It always moves right: a conveyor (see test_outside) that is moved by its control."""
     system = Conveyor(speed=0.0, start={"place": (0.0, 1.0)})

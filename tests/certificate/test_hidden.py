@@ -152,6 +152,7 @@ def test_a_drift_that_jumps_into_a_sink_has_no_upper_bound(width):
     assert any("the drift" in w for w in certificate.warnings)
 
 
+@pytest.mark.nightly
 def test_a_control_matrix_that_jumps_has_neither_J_nor_G():
     certificate = certified(JumpingMatrix(2), CLOSED)
     assert certificate.best_upper is None

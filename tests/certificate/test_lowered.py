@@ -46,6 +46,7 @@ def lagrangian(loop, value, log_mu, samples, ascents=1):
     return closed_loop_bounds(loop, value, log_mu, [samples, samples], ascents, "value")
 
 
+@pytest.mark.nightly
 def test_the_excess_is_what_the_bound_adds_to_its_integral(optimal):
     _, loop, samples = optimal
     value, log_mu = (zoo.rough_network(2, seed, size=0.1) for seed in (1, 2))
@@ -68,6 +69,7 @@ def test_the_multiple_of_v_is_found_that_makes_it_the_value_of_the_controller(fa
         assert bound.value == pytest.approx(exact, rel=2e-4)
 
 
+@pytest.mark.nightly
 def test_the_bounds_of_another_multiple_of_v_and_with_more_states_for_its_mean_are_the_same(optimal):
     problem, loop, samples = optimal
     log_mu, rough = zoo.rough_network(2, 3, size=0.1), zoo.rough_network(2, 4, size=0.02)
@@ -197,6 +199,7 @@ def test_spikes_are_sought_again_while_those_found_raise_the_bound(off, again, o
     assert (len(climbs) > 1) == again
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("side", [0, 1])
 def test_peaks_in_hollows_are_sought_on_both_sides_of_the_slack(side):
     problem, sign = Still(), 2 * side - 1

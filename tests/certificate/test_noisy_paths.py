@@ -17,6 +17,7 @@ from ocp_torch.training.evaluator import QUICK
 from support import zoo
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("noise", "efforts"), [(0.02, [4, 4, 16, 4]), pytest.param(0.0, [16, 16, 4], marks=pytest.mark.nightly)]
 )

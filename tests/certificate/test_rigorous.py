@@ -439,6 +439,42 @@ def test_the_certificate_carries_the_proved_bound_when_asked():
     assert alone.best_lower == ("rigorous", entry["value"])
 
 
+class Wavy(Problem):
+    """Its Lipschitz constant is true, and is inherited by a class with a narrow hole in the cost, for which it is not."""
+
+    def __init__(self):
+        super().__init__(dim=1)
+        self.lipschitz = Lipschitz(state_cost=0.5 * TURN)
+
+    def state_cost(self, x):
+        return 1.0 + 0.5 * torch.cos(TURN * x[:, 0])
+
+
+class Holed(Wavy):
+    def state_cost(self, x):
+        away = (x[:, 0] - 0.30371) - (x[:, 0] - 0.30371).round()
+        return super().state_cost(x) * (1.0 - (1.0 - (away / 0.003).square()).clamp_min(0.0).square())
+
+
+def test_a_lipschitz_constant_that_a_narrow_hole_refutes_proves_nothing(monkeypatch):
+    certificate = certificate_of(Holed(), network(1, 0), True)
+    assert certificate.lower["rigorous"] is None
+    assert any("enclosure does not hold its own state_cost" in w for w in certificate.warnings)
+    # And where nobody had looked there: what was met of the slack is more than what is proved of it.
+    monkeypatch.setattr("ocp_torch.certificate.proof.rigorous.obstacle", lambda *_: None)
+    certificate = certificate_of(Holed(), network(1, 0), True)
+    assert certificate.lower["rigorous"] is None
+    assert any("was met" in w for w in certificate.warnings)
+
+
+def test_what_somebody_declared_is_said_to_be_given():
+    takes = lambda problem: certificate_of(problem, network(1, 0), True).needs("rigorous")
+    assert [need.sentence for need in takes(Wavy())] == [
+        "the data are within their enclosure or Lipschitz constants, as given"
+    ]
+    assert takes(Circle()) == ()
+
+
 def test_without_it_the_certificate_is_as_before_and_where_there_is_none_it_says_so():
     assert "rigorous" not in certificate_of(Circle(), network(1, 0), False).to_dict()["lower"]
     none = certificate_of(Torus(3), network(3, 0), True)

@@ -49,6 +49,7 @@ def test_the_slack_of_a_multiple_is_that_of_the_scaled_network(problem):
         torch.testing.assert_close(parts.slack(theta), slack_function(problem, lambda x, s=theta: s * V(x))(parts.x))
 
 
+@pytest.mark.nightly
 def test_a_peak_of_the_slack_in_a_hollow_counts():
     """All sampled states and ascents from the largest slacks leave it out, and claim a bound too high by its height."""
     problem = Still()
@@ -139,6 +140,7 @@ def test_an_average_of_a_plane_wave_is_a_smaller_one(dim):
     assert wave.outside == 0
 
 
+@pytest.mark.nightly
 def test_a_narrow_spike_of_the_slack_is_averaged_out():
     problem = Circle()
     at = torch.tensor(0.3, dtype=torch.float64)
@@ -179,6 +181,7 @@ def test_large_sets_are_thinned_to_the_budget():
     torch.testing.assert_close(fewer[3].x, sets[3].x[: len(fewer[3])])
 
 
+@pytest.mark.nightly
 @zoo.on(zoo.FEW)
 def test_a_value_function_of_the_wrong_size_is_put_right(problem):
     sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)
@@ -232,7 +235,8 @@ def perturbed(problem, size=1e-3, seed=0):
     return Perturbed(problem, size).double().requires_grad_(False)
 
 
-@pytest.mark.parametrize("name", ["manufactured 2-d q=1.5", pytest.param("noisy 1-d", marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", ["manufactured 2-d q=1.5", "noisy 1-d"])
 def test_a_value_trained_on_for_the_bound_comes_closer_to_the_optimum_from_below(name, monkeypatch):
     for rounds in ("ROUNDS", "NOISY_ROUNDS"):
         monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{rounds}", ((100.0, 150, 2e-2),))

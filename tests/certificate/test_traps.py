@@ -50,6 +50,7 @@ def test_a_constant_value(constant):
         assert low <= 1.0 / 12.0 <= high
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("size", [1e-3, 0.1])
 @zoo.on(("circle rho=2", "manufactured 2-d q=1.5"))
 def test_the_optimal_value_with_noise(problem, size):
@@ -195,7 +196,10 @@ class Hidden(Circle):
         self.true_sup, self.occupation_bound = self.occupation_bound, None
 
 
-@pytest.mark.parametrize(("discount", "seed"), [(1.05, 0), pytest.param(1.2, 7, marks=pytest.mark.nightly), (2.0, 0)])
+@pytest.mark.parametrize(
+    ("discount", "seed"),
+    [pytest.param(1.05, 0, marks=pytest.mark.nightly), pytest.param(1.2, 7, marks=pytest.mark.nightly), (2.0, 0)],
+)
 def test_half_of_sup_mu_is_caught_on_a_problem_that_does_not_know_it(discount, seed):
     problem = Hidden(discount)
     half = resolve_constants(problem, occupation_bound=0.5 * problem.true_sup)
@@ -236,6 +240,7 @@ class TooLarge(Manufactured):
         return None
 
 
+@pytest.mark.nightly
 def test_a_declared_sup_mu_that_the_controller_exceeds_is_not_believed():
     problem = TooLarge(dim=1, contrast=0.9)
     assert not certified(problem, settings=LOOKING, value=problem.exact_value).assumptions.occupation_holds

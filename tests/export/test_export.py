@@ -140,6 +140,7 @@ def test_c(variant, tmp_path):
         )
 
 
+@pytest.mark.nightly
 @EACH
 def test_casadi(variant, tmp_path):
     casadi = pytest.importorskip("casadi")

@@ -124,6 +124,7 @@ class OneByOne(Asked):
     concurrent, scan_factor = False, 0
 
 
+@pytest.mark.nightly
 def test_networks_get_them_where_states_cost_little():
     waves = torch.tensor([[1.0, -1.0, 1.0, 2.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0]])
     problem, dear = Asked(waves), OneByOne(waves)

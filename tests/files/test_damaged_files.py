@@ -150,6 +150,7 @@ def little_room():
     resource.setrlimit(resource.RLIMIT_FSIZE, (12_000, 12_000))
 
 
+@pytest.mark.nightly
 def test_a_run_on_a_full_disk_stops_with_a_sentence_and_can_go_on_later(tmp_path):
     folder = tmp_path / "run"
     way = (*TINY, f"hydra.run.dir={folder}", "trainer.log_every=1000")

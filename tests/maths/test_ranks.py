@@ -175,6 +175,7 @@ def test_processes_on_one_machine_do_not_take_each_others_cores(monkeypatch):
     assert parted(2, play) == [str((4, 8))] * 2
 
 
+@pytest.mark.nightly
 def test_a_simulation_and_slopes_are_the_same_to_the_bit_however_many_processes_share_them():
     problem, value, x = Circle(), rough_network(1, 0).double(), torch.rand(9000, 1).double()
     problem.kept = threading.Lock()  # what cannot be sent stays where it is

@@ -190,6 +190,7 @@ def test_a_constant_is_worth_its_size_until_every_state_is_penalised(problem):
     assert 2.0 * F_M(0.5 * (free + penalised)) >= F_M(free) + F_M(penalised)
 
 
+@pytest.mark.nightly
 @zoo.on(zoo.FEW)
 def test_the_shifted_bound_undoes_a_constant_that_violates_the_constraint(problem):
     """The climbs are the same for every constant, up to rounding in which step is called better."""

@@ -66,6 +66,7 @@ def test_the_lowest_and_the_highest_state_of_all_are_found(seed, sign):
     assert float(found.max()) == pytest.approx(float(f.max()), abs=1e-6)
 
 
+@pytest.mark.nightly
 def test_a_supremum_that_only_a_scan_meets_is_used():
     problem = Needle("f", 2, 1e-3)
     V = lambda x: 1e-3 * (2.0 * math.pi * x).sin().sum(dim=-1)

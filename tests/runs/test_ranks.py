@@ -252,6 +252,7 @@ def dying():
         Ranks._attempted = lambda *_: os._exit(1)
 
 
+@pytest.mark.nightly
 def test_a_death_while_the_certificate_is_made_ends_the_run_with_a_sentence_and_a_resume_makes_it(tmp_path):
     folder = tmp_path / "run"
     way = (*TINY, "certificate.trajectories=1024", f"hydra.run.dir={folder}")

@@ -161,6 +161,7 @@ def test_steps_on_worst_states_that_give_no_number_or_are_told_to_stop_leave_all
     assert refined(start, slack_of(problem), draw, 4, worst=worst) is None
 
 
+@pytest.mark.nightly
 def test_the_best_of_all_rounds_on_worst_states_is_kept(monkeypatch):
     """Here the second, after which the mean is no worse than before and the largest slack much smaller."""
     problem, rounds = Manufactured(dim=1), []

@@ -399,6 +399,7 @@ def small(name):
     return dataclasses.replace(RECIPES[name], looks=(20, 60), drawn=(20, 60), known={60: {}})
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", RECIPES)
 def test_a_recipe_in_small_gives_its_numbers_and_figures(name, quick):
     ticks = []

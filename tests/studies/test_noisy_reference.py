@@ -66,6 +66,7 @@ def assert_true(make, side, close):
     assert "settled" not in reference_table(reference)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", EXACT)
 def test_noisy_problems_are_solved_within_the_stated_error(name):
     assert_true(*EXACT[name])

@@ -115,6 +115,7 @@ def test_the_error_has_the_order_of_the_theory_at_every_node(rise, order):
     assert orders == pytest.approx([order, order], abs=0.25)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("make", [Circle, partial(Manufactured, dim=1, exponent=1.5, seed=2)])
 def test_no_control_at_all_is_better_than_the_candidates(make):
     """Brute force over a fine set of controls, but for four cells at the kink, where cubic interpolation undershoots."""
@@ -128,6 +129,7 @@ def test_no_control_at_all_is_better_than_the_candidates(make):
     assert float((solution.value - best)[off].max()) <= 2e-4 * scheme.gain
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("policies", [1, 2])
 def test_an_iteration_that_is_stopped_early_says_so_and_states_what_it_leaves(policies, monkeypatch):
     monkeypatch.setattr(policy_iteration, "MOST_POLICIES", policies)

@@ -51,6 +51,7 @@ def test_the_game_is_shown_at_every_phase(way, tmp_path, monkeypatch):
     assert b"running/.*" in layout
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("method", "noise"),
     [("dual", "0.0"), pytest.param("primal", "0.0", marks=NIGHTLY), pytest.param("pd", "0.05", marks=NIGHTLY)],

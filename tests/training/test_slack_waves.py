@@ -75,6 +75,7 @@ def test_the_terms_that_are_missing_are_found_and_none_that_is_there(noise):
     assert not both(found) & both(problem.V0.waves[kept])
 
 
+@pytest.mark.nightly
 def test_terms_of_many_coordinates_are_found_when_they_are_asked_for():
     problem, left_out = Manufactured(dim=10, interaction=7, drift=0.0, seed=2), [0, 3]
     fields = Fields({VALUE: Lacking(problem, left_out)})

@@ -72,7 +72,8 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(way, tmp_path):
     assert differences(state_of(resumed), state_of(whole)) == []
 
 
-@pytest.mark.parametrize(("sampler", "seed"), [("uniform", 0), pytest.param("sobol", 1, marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize(("sampler", "seed"), [("uniform", 0), ("sobol", 1)])
 def test_no_state_of_a_training_batch_is_ever_used_for_evaluation(sampler, seed, monkeypatch):
     # Float64 throughout: rounding training states alone would make them differ.
     little = ("certificate.points=128", "certificate.trajectories=2", "certificate.ascents=1")

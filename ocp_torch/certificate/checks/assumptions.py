@@ -8,7 +8,7 @@ import torch
 from ocp_torch.certificate.checks.observed import Observed
 from ocp_torch.certificate.checks.wellposed import WellPosed
 from ocp_torch.problems.constants import FROM_DENSITY, FROM_PROBLEM, Constants
-from ocp_torch.problems.needs import GIVEN, GUESSED, SEARCHED, Need
+from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED, Need
 from ocp_torch.problems.problem import Problem
 
 # An estimated supremum may exceed a bound by so much, relative to it, before it contradicts it; and a simulated value by so
@@ -45,7 +45,7 @@ class Assumptions:
     largest_jump: float | None = None
     smallest_state_cost: float | None = None
     initial_mass: float | None = None
-    basis: dict[str, str] = field(default_factory=dict)  # of M and C_V (`ocp_torch.problems.needs`); given if absent
+    basis: dict[str, str] = field(default_factory=dict)  # of M, C_V and the data (`problems.needs`)
     M_is: str = ""  # how `M` was guessed, where there is more to say of it
     warnings: list[str] = field(default_factory=list)
 
@@ -75,6 +75,13 @@ class Assumptions:
     def regular(self) -> Need:
         """No jumps, where a divergence is used."""
         return Need("regular", SEARCHED, "neither a, B nor the controller jumps", self.regular_holds)
+
+    @property
+    def data_are_enclosed(self) -> Need:
+        """What a proof over cells takes the data to be between states."""
+        return Need(
+            "data", self.basis.get("data", PROVED), "the data are within their enclosure or Lipschitz constants"
+        )
 
     def with_value_bound(self, C_V: float) -> "Assumptions":
         """With the `C_V` that the suprema found of `V` and its slack prove for the controller at hand."""
@@ -149,7 +156,11 @@ def check_assumptions(
         largest_jump=jump.size if jump else None,
         smallest_state_cost=posed.smallest_cost,
         initial_mass=posed.mass,
-        basis={"M": constants.basis("M"), "C_V": constants.basis("C_V")},
+        basis={
+            "M": constants.basis("M"),
+            "C_V": constants.basis("C_V"),
+            "data": PROVED if problem.lipschitz is None and not hasattr(problem, "enclosure") else GIVEN,
+        },
         M_is=M_is,
         warnings=warnings,
     )

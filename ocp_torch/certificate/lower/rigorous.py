@@ -4,7 +4,10 @@ from ocp_torch.certificate.bound import LOWER, Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.problems.needs import Need
+from ocp_torch.problems.needs import GIVEN, Need
+
+# How far rounding may take a slack in float64 above what holds in real arithmetic, relative to 1 + its size.
+ROUNDING = 1e-9
 
 
 class Rigorous(Bound):
@@ -13,7 +16,7 @@ class Rigorous(Bound):
     name, side, label = "rigorous", LOWER, "rigorous"
 
     def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
-        return ()
+        return (assumptions.data_are_enclosed,) if assumptions.basis.get("data") == GIVEN else ()
 
     def applies(self, context: Context) -> bool:
         return context.settings.rigorous and not context.external
@@ -42,10 +45,18 @@ def _proved(context: Context) -> tuple[Estimate | None, list[str], list[str]]:
     from ocp_torch.certificate.proof.rigorous import obstacle, rigorous_lower_bound  # only where it is asked for
 
     context.progress("proof")
-    why, own = obstacle(context.problem, V.value), V.own
+    why, own = obstacle(context.problem, V.value, context.odd), V.own
     if why is not None:
         return None, [f"no rigorous lower bound: {why}."], []
     bound = rigorous_lower_bound(context.problem, V.value, theta=own.theta, sampled_slack=own.largest.value)
     if bound is None:
         return None, ["no rigorous lower bound: nothing finite was proved within the budget of cells."], []
+    met = own.largest.value
+    if met > bound.slack + ROUNDING * (1.0 + abs(met)):
+        wrong = f"sup Q <= {bound.slack:.4g} would be proved, but {met:.4g} was met"
+        return (
+            None,
+            [f"no rigorous lower bound: {wrong}; the problem's enclosure or Lipschitz constants are wrong."],
+            [],
+        )
     return Estimate(bound.value, 0.0), [], [bound.sentence]  # nothing in it is random

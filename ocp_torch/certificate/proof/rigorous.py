@@ -29,8 +29,8 @@ from ocp_torch.problems.problem import Problem
 # The number of cells that a tolerance takes grows exponentially with the dimension.
 MOST_DIMENSIONS = 2
 # An enclosure is held against the data in so many cells per coordinate, whole and shrunk to 2^-8 of their size, where a wrong
-# value is not hidden by the radius.
-SPOT_CELLS, SPOT_SIZES = 16, (1.0, 2.0**-8)
+# value is not hidden by the radius; and in cells of so many sizes that hold states where the data are narrow.
+SPOT_CELLS, SPOT_SIZES, ODD_CELLS = 16, (1.0, 2.0**-8), (16, 128, 1024)
 # Cells a side to start with, by dimension, and cells evaluated at once, which bounds the memory.
 FIRST_CELLS, CHUNK = {1: 64, 2: 32}, 256
 # How close to the sampled supremum, relative to the size of `theta V mu0`, by dimension; and the part of that which the
@@ -62,8 +62,9 @@ class RigorousBound:
         return f"proved: {within}, over {self.cells:,} cells"
 
 
-def obstacle(problem: Problem, value: Field) -> str | None:
-    """Why there can be no rigorous bound for ``value`` on ``problem``; `None` where there can."""
+def obstacle(problem: Problem, value: Field, odd: Tensor | None = None) -> str | None:
+    """Why there can be no rigorous bound for ``value`` on ``problem``; `None` where there can. Its enclosure is held against
+    its data in a few cells, and at the states ``odd`` ``(K, d)``, where a search found them narrow."""
     if problem.dim > MOST_DIMENSIONS:
         return f"cells cover the torus in at most {MOST_DIMENSIONS} dimensions, and this problem has {problem.dim}"
     if not is_known(value):
@@ -85,6 +86,13 @@ def obstacle(problem: Problem, value: Field) -> str | None:
         wrong = contradiction(problem, small, enclosure(problem, small), t)
         if wrong is not None:
             return f"the problem's enclosure does not hold its own {wrong}"
+    odd = box.centre[:0] if odd is None else odd
+    for cells in ODD_CELLS if len(odd) else ():
+        half = odd.new_full(odd.shape, 0.5 / cells)
+        around = Box((2.0 * (cells * odd).floor() + 1.0) * half, half, box.degree)
+        wrong = contradiction(problem, around, enclosure(problem, around), (odd - around.centre) / half)
+        if wrong is not None:
+            return f"the problem's enclosure does not hold its own {wrong}, which changes faster somewhere"
     return None
 
 
