@@ -44,7 +44,8 @@ def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -
         field = getattr(error, "full_key", None) or missing.group(1)
         return f"{field} is missing; give {field}=... on the command line."
     if isinstance(error, OverrideParseException):
-        return f"{error.override!r} cannot be read; write field=value, and quote a value that holds signs of its own."
+        quoted = "quote a value that holds signs of its own, within the quotes of the shell, as in \"run='my runs/1'\""
+        return f"{error.override!r} cannot be read; write field=value, and {quoted}."
     return " ".join(text.split()).rstrip(".") + "."
 
 

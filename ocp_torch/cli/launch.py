@@ -19,7 +19,7 @@ from ocp_torch.cli.compose import composed, configuration, parsed, register_reso
 from ocp_torch.cli.explain import CHECKOUT, CONFIGS, explain, is_choice, known_fields
 from ocp_torch.cli.help import help_text
 from ocp_torch.cli.job import isolated, job
-from ocp_torch.cli.outcome import INTERRUPTED, Record, fail, failures, typed
+from ocp_torch.cli.outcome import BROKEN_PIPE, INTERRUPTED, Record, fail, failures, typed
 from ocp_torch.cli.single import carry_out, checked, require_places_to_write
 from ocp_torch.errors import InputError, require_flag, require_section, shown
 from ocp_torch.files.reading import require_unlinked
@@ -31,6 +31,8 @@ __all__ = ["CHECKOUT", "CONFIGS", "composed", "fail", "isolated", "job", "known_
 
 HELP = ("--help", "-h")
 ASKS = ("--info", "-i", "--cfg", "-c", "--hydra-help", "--version", "--shell-completion", "-sc")
+# Options of Hydra's that take a value.
+HYDRAS = ("--info", "--cfg", "--package", "--config-path", "--config-name", "--config-dir", "--experimental-rerun")
 SWEEPS = ("-m", "--multirun", "hydra.mode=MULTIRUN")
 SHARED = ("train",)  # what the processes of torchrun can do together
 ONE_RUN = (
@@ -70,8 +72,9 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
     if not ranks.first:
         assist(ranks, lambda: checked(overrides, config_name, check), work)
     try:
+        require_no_dashes(options)
         if any(option in HELP for option in options):
-            print(help_text(config_name, " ".join(typed(sys.argv[0])), overrides))
+            print(help_text(config_name, " ".join(typed(sys.argv[0])), overrides), flush=True)
         elif any(option.split("=")[0] in ASKS for option in options):
             entry()
         elif ranks.size > 1 and (config_name not in SHARED or options or any(a in SWEEPS for a in overrides)):
@@ -91,6 +94,9 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
         sys.exit(stop.status)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+    except BrokenPipeError:  # whoever reads, as `head` does, has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(BROKEN_PIPE)
     finally:
         ranks.leave()
 
@@ -163,6 +169,14 @@ def require_kinds(data: Any, default: Any, name: str = "") -> None:
         require_flag(name, data)
     elif isinstance(default, int | float) and not (isinstance(data, int | float) and not isinstance(data, bool)):
         raise InputError(f"{name} is {shown(data)}, but must be a number.")
+
+
+def require_no_dashes(options: list[str]) -> None:
+    """Raise `InputError` where a field is written as an option."""
+    for option in options:
+        name = option.split("=")[0]
+        if "=" in option and name not in HYDRAS:
+            raise InputError(f"{option} is no option; write {option.lstrip('-')}, without the dashes.")
 
 
 def spare_imports() -> None:

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from ocp_torch.errors import InputError, visible
 
 log = logging.getLogger(__name__)
-FAILED_INPUT, INTERRUPTED = 2, 130
+FAILED_INPUT, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
 # Jobs of a sweep may run in processes of their own; this file, named in the environment, collects which failed.
 FAILURES = "OCP_TORCH_FAILURES"
 # A table with its warnings has fewer characters.

@@ -70,6 +70,8 @@ def train(
     """
     if joined().size > 1:
         raise InputError("torchrun shares the runs of scripts/train.py alone among processes; call train() without it.")
+    if not (callback is None or callable(callback)):
+        raise InputError(f"callback is {shown(callback)}, but must be a function of one Moment, or None.")
     short = {"method": method, "trainer.steps": steps, "seed": seed, "resume": resume, "trainer.progress": progress}
     fields = {name: value for name, value in short.items() if value is not None}
     changed = flat(settings or {})

@@ -36,7 +36,7 @@ FIELDS = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION, TRAJECTORY_VALUE)
 States = TypeVar("States", Tensor, np.ndarray)
 
 
-@dataclass
+@dataclass(repr=False)
 class Controller:
     """`u(x)` with all it came from.
 
@@ -60,6 +60,13 @@ class Controller:
         self._exact = copy.deepcopy(self.fields).double()
         how = self.occupation, self.problem, self._exact, self.constants
         self._policy = trained_policies(*how, every=True)[self.kind]
+
+    def __repr__(self) -> str:
+        gap = (self.certificate.get("gap") or {}).get("simulated")
+        sizes = f"d = {self.problem.dim}, m = {self.problem.control_dim}"
+        return (
+            f"Controller({problem_name(self.problem)}, {self.kind}, {sizes}{'' if gap is None else f', gap {gap:.2%}'})"
+        )
 
     def __call__(self, x: States) -> States:
         """Controls ``(N, m)`` at states ``(N, d)``: any reals, wrapped to the torus; NumPy in gives NumPy out, and floats of

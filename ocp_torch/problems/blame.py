@@ -74,6 +74,8 @@ def words(error: BaseException) -> str:
     """The last line of its own traceback: kind and message, without line breaks and what a terminal would obey."""
     text = " ".join(str(error).split()) if not isinstance(error, SyntaxError) else str(error.msg)
     text = "".join(c if c.isprintable() else "?" for c in text).rstrip(".")
+    if "tensor.detach().numpy()" in text:  # PyTorch's advice would lose the derivatives
+        text = "NumPy was given a tensor; use the functions of torch, or problem=callable for a simulator in NumPy"
     if len(text) > LONGEST:
         text = f"{text[: LONGEST // 2]} .. {text[-LONGEST // 2 :]}"
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -147,13 +147,13 @@ def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
     total = 2.0 * conjugate * state_cost_supremum(problem)
     beside = ", which noise may take the control beyond" if problem.noisy else ""
     if problem.driftless:
-        return total ** (1.0 / q), f"Proposition 2 of the paper with a sampled sup f{beside}"
+        return total ** (1.0 / q), f"what Proposition 2 of the paper gives with a sampled sup f{beside}"
     B, a = problem.probe(PROBED_MATRICES, 1, "B", "a")
     alpha = (torch.linalg.pinv(B) @ a.unsqueeze(-1)).squeeze(-1)
     largest = float(alpha.norm(dim=-1).max())
     return (total + 2.0**q * (conjugate - 1.0) * largest) ** (
         1.0 / q
-    ), f"Proposition 2 with a least-squares alpha{beside}"
+    ), f"what Proposition 2 of the paper gives with a least-squares alpha{beside}"
 
 
 def _estimate_occupation_bound(problem: Problem) -> tuple[float, str]:

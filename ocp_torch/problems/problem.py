@@ -80,7 +80,7 @@ class Problem(Reproducible, Placed, Played):
         controls = self.dim if control_dim is None else control_dim
         self.control_dim = require_integer("problem.control_dim", controls, 1, maximum=MOST_COORDINATES)
         within = dict(at_least=LEAST_DISCOUNT, at_most=LARGEST_DISCOUNT)
-        self.discount = require_number("problem.discount", discount, above=0.0, **within)
+        self.discount = require_number("problem.discount", discount, **within)
         self.exponent = require_number("problem.exponent", exponent, above=1.0, at_most=2.0)
         self.control_cost = control_cost(self.exponent, control_limit, self.control_dim)
         self.control_limit = self.control_cost.limit

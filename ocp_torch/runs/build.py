@@ -60,6 +60,8 @@ def problem_class(target: object) -> type[Problem]:
     known = [n for n, c in vars(module).items() if inspect.isclass(c) and issubclass(c, Problem) and c is not Problem]
     if class_name not in known:
         hint = nearest(class_name, known)
+        if not hasattr(module, class_name):
+            raise InputError(f"problem._target_ = {target}, but {module_name} has no class {class_name}{hint}.")
         raise InputError(f"problem._target_ = {target} is not a Problem subclass in that module{hint}.")
     return getattr(module, class_name)
 

@@ -132,6 +132,11 @@ def test_a_callback_stops_the_run_which_is_certified_and_goes_on_to_the_same_bit
     assert (again.certificate, again.history.steps) == (whole.certificate, [])
 
 
+def test_a_callback_is_a_function():
+    with pytest.raises(InputError, match="callback is 3, but must be a function of one Moment, or None"):
+        train("circle", callback=3)
+
+
 def test_what_a_callback_raises_is_raised():
     with pytest.raises(ZeroDivisionError):
         train("circle", settings=SHORT, callback=lambda moment: 1 / 0)

@@ -1,5 +1,6 @@
 """Mistakes in a system are told in one sentence, with the method's name and the state in the user's own units."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -78,6 +79,26 @@ MISTAKES = {
     "divergences": (
         dict(divergences=lambda self, s: (s[:, 0], torch.zeros_like(s[:, :1]))),
         r"drift_divergence of my_module.Mistaken is \S+ at pole = .*, but by differences of drift it is 0",
+    ),
+    "lost derivative": (
+        dict(dynamics=pushed(a=lambda s: torch.stack([s[:, 1], -0.05 * s[:, 1].detach()], dim=-1))),
+        r"drift_divergence of my_module.Mistaken is 0 at pole = .*, but by differences of drift it is -0.05",
+    ),
+    "in place": (
+        dict(cost=lambda self, s: s[:, 1].mul_(2.0).square()),
+        r"cost of my_module.Mistaken changes its argument s in place; .* \(s = s.clone\(\) first\)",
+    ),
+    "dynamics in place": (
+        dict(dynamics=pushed(a=lambda s: s[:, 1:].mul_(2.0).sin().expand(-1, 2))),
+        "dynamics of my_module.Mistaken changes its argument s in place",
+    ),
+    "NumPy": (
+        dict(cost=lambda self, s: np.square(s[:, 1])),
+        "cost of my_module.Mistaken raised RuntimeError: NumPy was given a tensor; use the functions of torch",
+    ),
+    "nothing made": (
+        dict(__init__=lambda self: None),
+        r"its __init__ must call super\(\).__init__\(coordinates, controls, ..\)",
     ),
     "random": (
         dict(cost=lambda self, s: torch.rand(len(s), dtype=s.dtype)),

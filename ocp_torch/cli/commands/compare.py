@@ -22,6 +22,7 @@ def compared(arguments: list[str]) -> None:
         print(__doc__)
         return
     options = dict(a.split("=", 1) for a in arguments if "=" in a and kind(a) is None)
+    options = {name: value.strip("'\"") for name, value in options.items()}  # quoted, as other commands want it
     for name, value in options.items():
         if name not in OPTIONS:
             told = f"{name} is not an option{nearest(name, OPTIONS)}"
@@ -44,6 +45,9 @@ def compared(arguments: list[str]) -> None:
         save_trend(comparison, options["against"], Path(options["plot"]))
     elif "plot" in options:
         comparison.save_plot(Path(options["plot"]))
+    for name in ("csv", "html", "plot"):
+        if name in options:
+            print(f"wrote {options[name]}")
 
 
 def main() -> None:

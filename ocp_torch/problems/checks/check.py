@@ -95,8 +95,9 @@ def require_made(problem: Problem) -> None:
     """What `Problem.__init__` sets is there, and still what it was."""
     missing = [name for name in SET_BY_INIT if not _has(problem, name)]
     if missing:
+        call = "coordinates, controls, .." if isinstance(problem, System) else "dim=.."
         raise ProblemError(
-            f"{named(problem)} has no {missing[0]}: its __init__ must call super().__init__(dim=..), which sets it."
+            f"{named(problem)} has no {missing[0]}: its __init__ must call super().__init__({call}), which sets it."
         )
     if not callable(problem.noise):
         raise ProblemError(

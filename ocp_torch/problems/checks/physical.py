@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from ocp_torch.errors import ProblemError
@@ -28,8 +29,17 @@ class SystemFunctions(Functions):
         super().__init__(system, simulator=False)
 
     def function(self, name: str) -> Callable[[Tensor], Any]:
-        physical = self.physical(name)
-        return lambda x: physical(self.system.from_torus(x))
+        physical, whose = self.physical(name), "dynamics" if name in (DRIFT, MATRIX) else name
+
+        def asked(x: Tensor) -> Any:
+            answer = physical(given := (s := self.system.from_torus(x)).clone())
+            if not torch.equal(given, s):
+                raise ProblemError(
+                    f"{whose} of {self.name} changes its argument s in place; it must leave it (s = s.clone() first)."
+                )
+            return answer
+
+        return asked
 
     def physical(self, name: str) -> Callable[[Tensor], Any]:
         """The function ``name`` of physical states."""

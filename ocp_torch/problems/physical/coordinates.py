@@ -67,7 +67,7 @@ class Interval:
         if self.low >= self.high:
             hint = " (swapped?)" if self.low > self.high else ""
             raise InputError(f"{self.name} goes from {self.low:g} to {self.high:g}, but low must be below high{hint}.")
-        margin = require_number(f"the margin of {self.name}", self.margin, above=0.0, at_least=1e-6, at_most=1e3)
+        margin = require_number(f"the margin of {self.name}", self.margin, at_least=1e-6, at_most=1e3)
         object.__setattr__(self, "margin", margin)
 
     @property
