@@ -143,6 +143,15 @@ class Generator:
             carried = carried - self._spread(mu.value, mu.gradient, mu.curvature)
         return mu.value, carried, self._flux(mu.value, mu.gradient)
 
+    def liouville_residual(
+        self, control_density: Field, occupation: Field, still: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """`w` ``(N, m)``, `mu` and `r = mu0 - mu - (div(a mu + B w) - div div(D mu)) / rho` ``(N,)``, of `mu` itself, which
+        may be 0; ``still`` says that there is neither drift nor noise."""
+        w, inflow = self.control_inflow(control_density)
+        mu, drifted = (occupation(self.data.x), 0.0) if still else self.drift_flux(occupation)[:2]
+        return w, mu, inflow - mu - drifted / self.rho
+
     def _flux(self, value: Tensor, gradient: Tensor) -> Tensor:
         """`a mu - div(D mu)`, ``(N, d)``."""
         flux, sigma = value.unsqueeze(-1) * self.data.a, self.data.noise

@@ -49,9 +49,8 @@ def liouville_residual(trainer: Trainer, batch: Samples) -> dict[str, Tensor]:
         return {}
     form = (trainer.objective.occupation, problem, trainer.fields, trainer.constants)
     generator, density = Generator.of(problem, samples), occupation_density(*form)
-    _, inflow = generator.control_inflow(admissible_density(*form))
-    mu, drifted = (density(samples.x), 0.0) if problem.still else generator.drift_flux(density)[:2]
-    return {"residual_mean_absolute": samples.mean((inflow - (mu + drifted / problem.discount)).abs())}
+    *_, residual = generator.liouville_residual(admissible_density(*form), density, problem.still)
+    return {"residual_mean_absolute": samples.mean(residual.abs())}
 
 
 class Monitor(Silent):

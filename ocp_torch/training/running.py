@@ -75,9 +75,7 @@ class RunningEstimates:
         """`J(w, mu)`."""
         form = self.trained.occupation, self.problem, self.trained.fields, constants
         generator, density = Generator.of(self.problem, self._few), occupation_density(*form)
-        w, inflow = generator.control_inflow(admissible_density(*form))
-        mu, drifted = (density(self._few.x), 0.0) if self.problem.still else generator.drift_flux(density)[:2]
-        residual = inflow - mu - drifted / self.problem.discount
+        w, mu, residual = generator.liouville_residual(admissible_density(*form), density, self.problem.still)
         return float(self._few.mean(generator.primal_integrand(w, mu, residual, constants.C_V)))
 
     def _simulated(self, constants: Constants) -> float:

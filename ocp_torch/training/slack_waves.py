@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 # Steps of a round after which they are sought. With 32 coordinates one of 64 terms is missing at first, with 64 coordinates
 # 18 of 127; all are found after 200 steps, and F_M ends .026 and .021 % below OPT after 600 (with 32 .174 % without), on a
-# torus in three dimensions, with kinks, .041 for .074 %. Sought after 100 as well, F_M is .109 % below in 64 coordinates
-# where it was 1.06 after 165 steps; a torus and eight coordinates end as before. The last time, which comes where no
+# torus in three dimensions, with kinks, .041 for .074 %. Sought after 100 steps too, F_M is .109 % below OPT in 64 dimensions
+# after 165, and 1.06 % if not; a torus and eight coordinates end the same. The last time, which comes where no
 # Gauss-Newton steps have ended training, takes seconds: waves of many coordinates too.
 SOUGHT_AT = (100, 200, 300)
 # A slack below so much of the state cost's standard deviation is rounding in single precision.

@@ -95,8 +95,8 @@ class Trainer:
         """Train until there is a reason to stop, and return it; save to ``checkpoint`` on the way and at the end.
 
         The reasons: `steps` (all rounds that `settings` allow), `solved` (see `refine`), `max_seconds`, `callback` (it was
-        ``asked`` to), and `target_gap`, when a quick certificate is good enough that a full one should decide: where it
-        decides against, `postpone` and call again. A signal that ``signals`` caught raises `Preempted` after the step in
+        ``asked`` to), and `target_gap`: a quick certificate is good enough for a full one to decide. Where the full one is
+        not, `postpone` the end and call this again. A signal that ``signals`` caught raises `Preempted` after the step in
         hand, with the state saved. Raises `NonFiniteError` before an update that is not finite.
 
         Of several processes each calls this; the first saves, and makes warm starts and looks while the others wait. Raises

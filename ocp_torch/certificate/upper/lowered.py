@@ -2,8 +2,9 @@ r"""The slack of functions made of `V` along one closed loop, and the one for wh
 
 The bound holds for each `W = V - s h(V)`, and is convex in `s` as `Q_u` is linear in `V`. Here `h(V)` is `V` itself, so that
 `W` is a multiple of it, or what of `V` lies above some height. Where `V` is a little too large at its maxima, where kinks
-cross, `sup Q_u` is all there: on a torus in two dimensions it was .004 of `V` and .0001 of .987 `V`, and the bound .067 and
-.031 % above the optimum. A multiple has its price wherever `V` is not 0: with .98 of what is above half of `V` it was .015 %.
+cross, `sup Q_u` is all there: on a torus in two dimensions `sup Q_u` was .004 for `W = V` and .0001 for `W = .987 V`, and the
+bound .067 and .031 % above the optimum. A multiple has its price wherever `V` is not 0: where `W` had .98 of only what of `V`
+is above half of its largest, the bound was .015 % above.
 """
 
 from collections.abc import Callable

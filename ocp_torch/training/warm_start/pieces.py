@@ -20,11 +20,11 @@ from ocp_torch.training.warm_start.settings import WarmStartSettings
 from ocp_torch.training.warm_start.targets import Targets
 
 # Parts of the pieces that start uniformly, where earlier pieces ended, and about a state of rest, where there is one; the
-# others start as `mu0` says. A pendubot that never came to rest upright took `V` to be .13 there, where it is 0, and stayed
-# leaning by 22 degrees for ever.
+# others start as `mu0` says. Without the last a pendubot never came to rest upright, where its `V` was .13 in place of 0, and
+# stayed leaning by 22 degrees for ever.
 UNIFORM, GOING_ON, RESTING = 0.125, 0.5, 0.125
 # Those about a state of rest start where the quadratic `V` has risen by so many of its units: from next to nothing to a
-# standard deviation of the cost. Neither this nor that part was compared with others.
+# standard deviation of the cost. Neither these heights nor `RESTING` were compared with other numbers.
 RISEN = (0.1, 100.0)
 # Along directions in which it is as good as flat, and in turns at most.
 FLAT, TINY, FARTHEST = 1e-6, 1e-300, 0.25
