@@ -127,7 +127,7 @@ MISTAKES = {
     "trainer.steps=abc": ("trainer.steps", "'abc'", "whole number"),
     "problem=manufactured problem.exponent=3": ("problem.exponent", "3", "at most 2"),
     "method=primal problem=manufactured method.occupation=closed": ("method.occupation", "closed", "drift"),
-    "problem.discount=-1": ("problem.discount", "-1", "above 0"),
+    "problem.discount=-1": ("problem.discount", "-1", "at least 1e-06"),
 }
 
 

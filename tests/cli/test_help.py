@@ -114,5 +114,5 @@ def test_help_shows_what_a_class_of_ones_own_is_made_from(tmp_path, monkeypatch)
     assert "  problem.load=...\n" in text
     assert "  problem.radius=0.25\n" in text
     assert "  problem.walls=[1,2]\n" in text
-    with pytest.raises(InputError, match="winches.Wench is not a Problem"):
+    with pytest.raises(InputError, match="winches has no class Wench"):
         typed("problem._target_=winches.Wench")

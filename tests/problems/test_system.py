@@ -221,7 +221,7 @@ def test_every_kind_of_start_has_mass_1(start):
 SAYS = {
     "swapped": (lambda: Interval("v", 8, -8), r"v goes from 8 to -8, but low must be below high \(swapped\?\)"),
     "not finite": (lambda: Interval("v", -math.inf, 8), "the low end of v is -inf, but must be a finite number"),
-    "margin": (lambda: Interval("v", -8, 8, margin=0.0), "the margin of v is 0, but must be above 0"),
+    "margin": (lambda: Interval("v", -8, 8, margin=0.0), "the margin of v is 0, but must be at least 1e-06"),
     "unit": (lambda: Interval("v", -8, 8, "furlongs/s"), "of which 'furlongs' is no unit known here"),
     "unit of an angle": (lambda: Angle("v", unit="m"), "the period of v is missing; give it, in m"),
     "unit of a control": (

@@ -224,7 +224,7 @@ REFUSED = {
     "V* a column": (lambda: with_(exact_value=lambda self, x: x[:, :1]), r"exact_value .* \(N,\)"),
     "arrays": (lambda: with_(state_cost=lambda self, x: np.ones(len(x))), "gave a numpy.ndarray .* torch tensor"),
     "arrays inside": (lambda: with_(state_cost=lambda self, x: torch.from_numpy(1.0 + np.cos(TURN * x.numpy()[:, 0]))),
-                      "state_cost .* raised RuntimeError: Can't call numpy"),
+                      "state_cost .* raised RuntimeError: NumPy was given a tensor; use the functions of torch"),
     "a float": (lambda: with_(state_cost=lambda self, x: 1.0), "gave a float"),
     "nothing": (lambda: with_(drift=lambda self, x: None), "drift .* gave a NoneType"),
     "always double": (lambda: with_(state_cost=lambda self, x: 1.0 + torch.cos(TURN * x[:, 0].double())),
