@@ -16,7 +16,7 @@ from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import fits
 
-# A part of the time above this is worth a warning; and how exact the part of one trajectory has to be.
+# A part of the time above this is worth a warning; and how exact the part of one trajectory has to be, or as rough as costs.
 MUCH, TOLERANCE = 0.01, 2e-3
 # Fewer trajectories of a set leave an interval as wide as the part itself.
 FEWEST = 8
@@ -54,7 +54,7 @@ def time_outside(problem: Problem, policy: Policy, settings: CertificateSettings
         lambda x: torch.full_like(x[:, 0], LEVEL),
         [LEVEL],
         settings.horizon,
-        TOLERANCE,
+        max(TOLERANCE, settings.tolerance),
     )
     return replace(found.perf, value=max(0.0, found.perf.value - 1.0))
 
