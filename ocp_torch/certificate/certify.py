@@ -12,6 +12,7 @@ from ocp_torch.certificate.bounds import BOUNDS
 from ocp_torch.certificate.certificate import Certificate
 from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate, known_of
+from ocp_torch.certificate.external.black_box import BlackBox
 from ocp_torch.certificate.external.controller import ControllerContext
 from ocp_torch.certificate.external.dataset import RecordedContext
 from ocp_torch.certificate.settings import CERTIFIED, CertificateSettings, Progress, Run, silent
@@ -158,4 +159,7 @@ def certify_policy(
     """The certificate of any ``policy``; with ``value`` (float64), any `V`, also how far from optimal it is at most.
     ``network`` makes the networks for `V^u` and `mu^u`. Raises `InputError` where the policy fails."""
     shared = problem, constants, settings, run, progress
-    return certify(ControllerContext(*shared, policy=policy, value=value, network=network))
+    certificate = certify(ControllerContext(*shared, policy=policy, value=value, network=network))
+    if isinstance(policy, BlackBox):  # now that it was asked for many states
+        policy.require_still()
+    return certificate

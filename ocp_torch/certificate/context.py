@@ -127,7 +127,7 @@ class Context:
     @cached_property
     def posed(self) -> WellPosed:
         """Whether the problem is one."""
-        return check_problem(self.problem, self.wide)
+        return check_problem(self.problem, self.wide, lambda: self.odd)
 
     @cached_property
     def sampled_value(self) -> SampledValue | None:

@@ -103,7 +103,7 @@ class TrainedContext(FieldsContext):
 
     @cached_property
     def posed(self) -> WellPosed:
-        return check_problem(self.problem, self.few if self.value is None else self.wide)
+        return check_problem(self.problem, self.few if self.value is None else self.wide, lambda: self.odd)
 
     @cached_property
     def candidates(self) -> dict[str, Candidate]:

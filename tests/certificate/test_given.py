@@ -111,6 +111,17 @@ class Counter:
         return torch.full_like(x, 0.1 * self.calls)
 
 
+class Tired:
+    """A constant control that drops once it was asked often enough."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def __call__(self, x):
+        self.calls += 1
+        return torch.full_like(x, 0.1 if self.calls < 40 else 0.0)
+
+
 def fails(x):
     raise KeyError("no table")
 
@@ -122,6 +133,8 @@ REFUSED = {
     "infinite somewhere": (lambda x: 1.0 / (x < 0.01).double(), "not finite"),
     "memory": (Counter(), "function of x"),
     "the batch": (lambda x: x - x.mean(), "other states"),
+    "a large batch": (lambda x: 0.0 * x + 0.5 * (len(x) > 512), "batch \\(of 1024 here\\)"),
+    "a memory": (Tired(), "what it was asked before"),
     "an error": (fails, "raised KeyError"),
     "no function": (0.3, "must be a function"),
 }

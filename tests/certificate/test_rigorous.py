@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp_torch.certificate import CertificateSettings, Run, Trained, certify_fields, table
+from ocp_torch.certificate.lower.rigorous import refuted
 from ocp_torch.certificate.lower.slack import slack_function
 from ocp_torch.certificate.proof.activated import activate
 from ocp_torch.certificate.proof.activations import SERIES
@@ -465,6 +467,16 @@ def test_a_lipschitz_constant_that_a_narrow_hole_refutes_proves_nothing(monkeypa
     certificate = certificate_of(Holed(), network(1, 0), True)
     assert certificate.lower["rigorous"] is None
     assert any("was met" in w for w in certificate.warnings)
+
+
+@pytest.mark.parametrize(
+    ("slack", "integral", "told"),
+    [(0.2, (0.49, 0.51), None), (0.05, (0.49, 0.51), "but 0.1 was met"), (0.2, (0.6, 0.7), "but sampling says 0.5 +-")],
+)
+def test_what_sampling_says_refutes_a_proof(slack, integral, told):
+    own = SimpleNamespace(largest=SimpleNamespace(value=0.1), theta=0.5, initial=[1.0, 1.002, 0.998, 1.0])
+    found = refuted(own, SimpleNamespace(slack=slack, integral=integral))
+    assert found is None if told is None else told in found
 
 
 def test_what_somebody_declared_is_said_to_be_given():

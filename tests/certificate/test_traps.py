@@ -149,6 +149,20 @@ def test_a_cost_that_jumps_at_the_seam_is_said_and_allowed():
     assert any("passes from 1 to 0" in w for w in certificate.warnings)
 
 
+class Dipped(Circle):
+    """Costs less than nothing in a hole that no sampled state meets."""
+
+    def state_cost(self, x):
+        away = (x[:, 0] - 0.37) - (x[:, 0] - 0.37).round()
+        return 0.5 + super().state_cost(x) - 3.0 * (1.0 - (away / 1e-5).square()).clamp_min(0.0).square()
+
+
+def test_a_narrow_hole_below_zero_is_met_by_the_scan():
+    certificate = certified(Dipped(), value=lambda x: 0.0 * x[:, 0])
+    assert not certificate.assumptions.cost_holds
+    assert any("the state cost falls to -" in w for w in certificate.warnings)
+
+
 class Odd(Circle):
     """A drift that is 0 at the seam, as smooth as can be."""
 

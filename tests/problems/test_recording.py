@@ -145,6 +145,11 @@ def arrays_of(path) -> dict[str, np.ndarray]:
         return {name: file[name] for name in file.files}
 
 
+def banded(x):
+    """Each coordinate is uniform, their difference is not."""
+    return np.stack([x[:, 0], (x[:, 0] + 0.5 * x[:, 1]) % 1.0], axis=1)
+
+
 def dented(**changes):
     """A change of arrays: a function of the old one, a new value, or `None` to leave it out."""
 
@@ -191,7 +196,8 @@ WRONG = {
     "a discount of 0": (dented(discount=np.float64(0.0)), "problem.discount is 0"),
     "a NaN exponent": (dented(exponent=np.float64(np.nan)), "exponent has shape"),
     "few samples": (lambda arrays: {k: v[:50] if v.ndim else v for k, v in arrays.items()}, "holds 50 samples"),
-    "one half of the torus": (dented(x=lambda x: 0.5 * x), "coordinate 0 of x does not follow the uniform law"),
+    "one half of the torus": (dented(x=lambda x: 0.5 * x), r"coordinate \d of x does not follow the uniform law"),
+    "a band": (dented(x=banded), r"coordinates \[0, 1\] of x together do not follow the uniform law"),
 }
 
 
@@ -511,3 +517,29 @@ def test_twenty_thousand_samples_certify_the_optimum(tmp_path):
     (_, low), (_, high) = certificate.best_lower, certificate.best_upper
     assert low <= problem.exact_optimum <= high
     assert certificate.gap["certified"] <= 0.06
+
+
+def test_copies_among_the_samples_are_told(tmp_path, plain):
+    arrays = dict(np.load(plain))
+    twice = {name: np.concatenate([a, a[:50]]) if a.ndim else a for name, a in arrays.items()}
+    np.savez(tmp_path / "twice.npz", **twice)
+    assert any(
+        "50 samples of twice.npz are at the same state" in note for note in recording.read(tmp_path / "twice.npz").notes
+    )
+
+
+def test_a_violation_that_only_trained_samples_show_is_in_the_interval(tmp_path):
+    """`f` is 1, and 0 in a hole that no held-out sample met: `OPT` is .999, and `V = 1` has no slack elsewhere."""
+    for seed in range(20):
+        x = np.random.default_rng(seed).random((4000, 1))
+        f = np.where(np.abs(x[:, 0] - 0.37) < 5e-4, 0.0, 1.0)
+        np.savez(tmp_path / "hole.npz", x=x, f=f, a=0.0 * x, B=np.full((4000, 1, 1), 1e-9), discount=2.0)
+        problem = Dataset(str(tmp_path / "hole.npz"))
+        if bool((problem.held_out.f > 0.5).all()) and not bool((problem.training.f > 0.5).all()):
+            break
+    settings = CertificateSettings(stage=StageSettings(steps=0))
+    trained = Trained(Fields({"value": Exactly(lambda x: torch.ones_like(x[:, 0]))}), None, PeriodicMLP)
+    constants = resolve_constants(problem, occupation_bound=1.25)
+    found = certify_fields(problem, trained, constants, settings, Run("dataset", "dual")).lower["F_M"]
+    assert found.value == 1.0
+    assert found.interval(0.95)[0] <= 0.999

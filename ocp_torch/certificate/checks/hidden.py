@@ -12,11 +12,9 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.estimate import t_factor
-from ocp_torch.maths.seeds import fixed_generator
+from ocp_torch.maths.plane_waves import plane_waves
 
 TURN = 2.0 * math.pi
-# Waves along each of the first axes, and in random directions.
-ALONG, MOST_AXES, RANDOM, LARGEST = (1, 2, 3, 4, 6, 8, 12), 8, 24, 4
 # Groups of states whose scatter gives the standard error, at least; how rarely all tests together may err.
 GROUPS, LEVEL = 32, 1e-4
 # Differences below that part of the mean size of what is added up come from rounding and difference quotients.
@@ -52,7 +50,7 @@ class Hidden:
 @torch.no_grad()
 def hidden_divergence(fluxes: list[Flux]) -> Hidden | None:
     """What the sets of ``fluxes`` together do not see, if it is more than chance and rounding explain."""
-    waves = _waves(fluxes[0].x.shape[1])
+    waves = plane_waves(fluxes[0].x.shape[1])
     parts = max(1, math.ceil(GROUPS / len(fluxes)))
     # Consecutive points of a Sobol sequence are spread evenly, every other one of them is not.
     groups = [
@@ -81,10 +79,3 @@ def _against(waves: Tensor, f: Flux) -> Tensor:
     phi = torch.polar(torch.ones(()).to(f.x), -TURN * f.x @ waves.T)
     terms = phi * torch.complex(f.divergence.unsqueeze(-1).expand(-1, len(waves)), -TURN * f.flux @ waves.T)
     return (f.weight.unsqueeze(-1) * terms).mean(dim=0)
-
-
-def _waves(dim: int) -> Tensor:
-    """Whole vectors ``(K, d)``: 0, some along the axes, some at random."""
-    axes = torch.eye(dim, dtype=torch.float64)[:MOST_AXES]
-    draw = torch.randint(-LARGEST, LARGEST + 1, (RANDOM, dim), generator=fixed_generator()).to(axes)
-    return torch.cat([torch.zeros_like(draw[:1]), *(k * axes for k in ALONG), draw]).unique(dim=0)

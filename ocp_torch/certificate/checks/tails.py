@@ -28,6 +28,12 @@ FEW, KURTOSIS = 30.0, 30.0
 MATERIAL, ROUNDS = 1e-3, 3
 
 
+def unmet(size: float, draws: int) -> float:
+    """What a contribution of that ``size`` adds at most to the mean of ``draws`` that showed none: the probability of what
+    they do not show is `3 / N` at most, 95 % sure (the rule of three)."""
+    return 3.0 / draws * size
+
+
 def rarity(contributions: Tensor, size: float) -> float:
     """By how much the mean of ``contributions`` ``(N,)`` may be off because a few carry it; 0 where many do, or where what
     they carry is small beside ``size``, the answer's."""

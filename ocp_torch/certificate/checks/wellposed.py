@@ -1,5 +1,6 @@
 """Is the problem what every bound takes it for? Periodic, with `f >= 0` and a probability density `mu0`."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -43,8 +44,9 @@ class WellPosed:
 
 
 @torch.no_grad()
-def check_problem(problem: Problem, sets: list[Samples]) -> WellPosed:
-    """Compare values a period apart, on both sides of the seam, and against 0 and 1; on ``sets`` and climbed from there.
+def check_problem(problem: Problem, sets: list[Samples], odd: Callable[[], Tensor | None] = lambda: None) -> WellPosed:
+    """Compare values a period apart, on both sides of the seam, and against 0 and 1; on ``sets`` and climbed from there, and
+    at the states ``odd()`` ``(K, d)``, which are asked for once all is known to be finite.
 
     Raises `InputError` where a function is not finite.
     """
@@ -67,12 +69,13 @@ def check_problem(problem: Problem, sets: list[Samples]) -> WellPosed:
     for name in (n for n in seams if n not in shifted):
         cost = ": bounds that take its divergence are not used" if name in ("a", "B") else ", as a function may"
         warnings.append(f"{NAMES[name]} jumps by {seams[name]:.3g} where a coordinate passes from 1 to 0{cost}.")
-    smallest = _smallest(problem.state_cost, sets, "f")
+    narrow = odd()
+    smallest = _smallest(problem.state_cost, sets, "f", narrow)
     nonnegative = smallest >= -ROUNDING * sizes["f"]
     if not nonnegative:
         warnings.append(f"J and G are not used: the state cost falls to {smallest:.3g}, but they need f >= 0.")
     mass = Estimate.of([integral(samples, samples.mu0) for samples in sets])
-    least = _smallest(problem.initial_density, sets, "mu0")
+    least = _smallest(problem.initial_density, sets, "mu0", narrow)
     positive = least >= -ROUNDING * abs(mass.value)
     if not positive:
         warnings.append(f"no bound is used: the initial density falls to {least:.3g}, but must not be negative.")
@@ -117,9 +120,11 @@ def _seams(problem: Problem, sizes: dict[str, float]) -> dict[str, float]:
     return found
 
 
-def _smallest(function, sets: list[Samples], name: str) -> float:
-    """The smallest value of ``function``: on ``sets``, and downhill from the lowest of those states."""
+def _smallest(function, sets: list[Samples], name: str, odd: Tensor | None) -> float:
+    """The smallest value of ``function``: on ``sets``, at ``odd`` states, and downhill from the lowest of all."""
     values, states = torch.cat([getattr(s, name) for s in sets]), torch.cat([s.x for s in sets])
+    if odd is not None and len(odd):
+        values, states = torch.cat([values, function(odd)]), torch.cat([states, odd])
     lowest = states[values.topk(min(DESCENTS, len(values)), largest=False).indices]
     found = supremum(lambda x: -function(x), lowest, DESCENTS, DESCENT_STEPS, differentiable=False)
     return min(-found.value, float(values.min()))

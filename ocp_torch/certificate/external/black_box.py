@@ -12,8 +12,8 @@ from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.problem import Problem
 
-# States a controller is tried on before anything is computed with it.
-PROBES = 7
+# States a controller is tried on before anything is computed with it, and sizes of batches among whose states some are again.
+PROBES, BATCHES = 7, (16, 64, 1024)
 # Two calls may differ by so much, relative to the control, and still be a function of the state; and a control may be longer
 # than the limit by so much, relative to it, as it was clipped in single precision: it is cut back.
 SAME, BEYOND = 1e-4, 1e-5
@@ -32,7 +32,9 @@ class BlackBox:
             raise InputError(f"controller is {function!r}, but must be a function of states (N, {problem.dim}).")
         self.function, self.control_dim = function, problem.control_dim
         self.cost = problem.control_cost
-        self._convert, self.precision = self._understood(scrambled_sobol(PROBES, problem.dim, 0, torch.float64))
+        self._states = scrambled_sobol(max(BATCHES), problem.dim, 0, torch.float64)
+        self._convert, self.precision, self._first = self._understood(self._states[:PROBES])
+        self.require_still()
         self.step = STEPS[self.precision]
 
     def __call__(self, x: Tensor) -> Tensor:
@@ -41,16 +43,19 @@ class BlackBox:
     def evaluate(self, x: Tensor) -> Tensor:
         """The controls at ``x`` in the precision of ``x``; raises `InputError` as above."""
         wrapped = x.detach().double().remainder(1.0)
-        try:
-            out = self._ask(self._convert, wrapped)
-        except Exception as error:  # whatever a stranger's code may raise
-            raise _refusal(error) from None
+        out = self._answered(wrapped)
         bad = ~torch.isfinite(out).all(dim=-1)
         if bool(bad.any()):
             raise InputError(f"the controller is not finite at x = {wrapped[bad][0].tolist()}.")
         out = out.to(x)
         require_limit(out, wrapped, self.cost)
         return self.cost.within(out, torch.ones_like(out[:, 0]))
+
+    def _answered(self, x: Tensor) -> Tensor:
+        try:
+            return self._ask(self._convert, x)
+        except Exception as error:  # whatever a stranger's code may raise
+            raise _refusal(error) from None
 
     def _ask(self, convert: Callable[[Tensor], object], x: Tensor) -> Tensor:
         with torch.no_grad():
@@ -68,8 +73,18 @@ class BlackBox:
             raise InputError("the controller gave complex numbers, but a control is real.")
         return out if out.is_floating_point() else out.double()
 
-    def _understood(self, x: Tensor) -> tuple[Callable[[Tensor], object], torch.dtype]:
-        """The form of states the controller takes, tensors or arrays, and the precision it answers in."""
+    def require_still(self) -> None:
+        """Raise `InputError` where it now answers otherwise than at first, or in batches of other sizes."""
+        for size in BATCHES:
+            out = self._answered(self._states[:size])[:PROBES]
+            if float((out - self._first).abs().max()) > _rounding(self._first):
+                raise InputError(
+                    "the controller's answer for a state changes with what it was asked before, or with the other states of "
+                    f"the batch (of {size} here); it must be a function of x."
+                )
+
+    def _understood(self, x: Tensor) -> tuple[Callable[[Tensor], object], torch.dtype, Tensor]:
+        """The form of states the controller takes, tensors or arrays, the precision it answers in, and its answers."""
         forms = (lambda x: x, lambda x: x.float(), lambda x: x.numpy())
         complaints = []
         for convert in forms:
@@ -78,7 +93,7 @@ class BlackBox:
             except Exception as error:  # whatever a stranger's code may raise
                 complaints.append(error)
                 continue
-            size = SAME * float(out.abs().max().nan_to_num(nan=1.0)) + 1e-12
+            size = _rounding(out)
             if float((again - out).abs().max()) > size:
                 raise InputError(
                     "the controller gave different controls for the same states; it must be a function of x."
@@ -86,13 +101,18 @@ class BlackBox:
             if float((alone[0] - out[2]).abs().max()) > size:
                 raise InputError("the controller's answer for a state depends on the other states of the batch.")
             coarse = out.dtype in (torch.float32, torch.float16, torch.bfloat16) or convert is forms[1]
-            return convert, torch.float32 if coarse else torch.float64
+            return convert, torch.float32 if coarse else torch.float64, out
         own = [e for e in complaints if not isinstance(e, _WantsArrays)]
         raise _refusal(next((e for e in own if isinstance(e, InputError)), own[0])) from None
 
 
 class _WantsArrays(Exception):
     """Tensors went in and an array came out."""
+
+
+def _rounding(out: Tensor) -> float:
+    """By how much two answers ``(N, m)`` may differ and be the same."""
+    return SAME * float(out.abs().max().nan_to_num(nan=1.0)) + 1e-12
 
 
 def _refusal(error: Exception) -> InputError:

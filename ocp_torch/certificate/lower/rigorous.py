@@ -1,13 +1,20 @@
 """The shifted bound of a multiple of `V`, proved over cells that cover the torus (`ocp_torch.certificate.proof`)."""
 
+from typing import TYPE_CHECKING
+
 from ocp_torch.certificate.bound import LOWER, Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.problems.needs import GIVEN, Need
 
-# How far rounding may take a slack in float64 above what holds in real arithmetic, relative to 1 + its size.
-ROUNDING = 1e-9
+if TYPE_CHECKING:
+    from ocp_torch.certificate.lower.shifted import Shift
+    from ocp_torch.certificate.proof.rigorous import RigorousBound
+
+# How far rounding may take a number in float64 from what holds in real arithmetic, relative to 1 + its size; and the level at
+# which a sampled mean must be elsewhere than what was proved of it.
+ROUNDING, SURE = 1e-9, 0.9999
 
 
 class Rigorous(Bound):
@@ -51,12 +58,20 @@ def _proved(context: Context) -> tuple[Estimate | None, list[str], list[str]]:
     bound = rigorous_lower_bound(context.problem, V.value, theta=own.theta, sampled_slack=own.largest.value)
     if bound is None:
         return None, ["no rigorous lower bound: nothing finite was proved within the budget of cells."], []
-    met = own.largest.value
-    if met > bound.slack + ROUNDING * (1.0 + abs(met)):
-        wrong = f"sup Q <= {bound.slack:.4g} would be proved, but {met:.4g} was met"
-        return (
-            None,
-            [f"no rigorous lower bound: {wrong}; the problem's enclosure or Lipschitz constants are wrong."],
-            [],
-        )
+    if (wrong := refuted(own, bound)) is not None:
+        told = f"no rigorous lower bound: {wrong}; the problem's enclosure or Lipschitz constants are wrong."
+        return None, [told], []
     return Estimate(bound.value, 0.0), [], [bound.sentence]  # nothing in it is random
+
+
+def refuted(own: "Shift", bound: "RigorousBound") -> str | None:
+    """Where ``own``, the same bound by sampling, shows that what was enclosed for ``bound`` is not the problem: in words."""
+    met, mean = own.largest.value, Estimate.of([own.theta * mean for mean in own.initial])
+    if met > bound.slack + ROUNDING * (1.0 + abs(met)):
+        return f"sup Q <= {bound.slack:.4g} would be proved, but {met:.4g} was met"
+    (low, high), (least, most) = mean.interval(SURE), bound.integral
+    room = ROUNDING * (1.0 + abs(mean.value))
+    if low > most + room or high < least - room:
+        sampled = f"{mean.value:.6g} +- {0.5 * (high - low):.2g}"
+        return f"E[W mu0] would be in [{least:.6g}, {most:.6g}], but sampling says {sampled}"
+    return None

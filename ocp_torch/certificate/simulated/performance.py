@@ -11,7 +11,7 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.checks.tails import widened
+from ocp_torch.certificate.checks.tails import unmet, widened
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
 from ocp_torch.certificate.simulated.held import held_integrals
@@ -46,9 +46,9 @@ TAIL_PART, SMALLEST_TAIL, LARGEST_TAIL, LEAST = 0.04, 2e-5, 0.02, 0.1
 # States to which the starts' mean cost is compared, how many standard errors apart the two must be, and by how many times
 # that the interval is widened: trajectories may stay where no start was.
 COMPARED, UNLIKELY, UNSEEN_ROOM = 2**15, 2.5, 2.0
-# What no draw of `N` shows has a probability of `3 / N` at most, 95 % sure. States that cost so much more than all that was
-# met count with that, where it makes that part of the answer: with 2,048 paths where they cost 70 times the answer.
-RULE_OF_THREE, MET, MATERIAL = 3.0, 0.01, 0.1
+# States that cost so much more than all that was met count with what no path showed (`unmet`), where that makes this part of
+# the answer: with 2,048 paths where they cost 70 times the answer.
+MET, MATERIAL = 0.01, 0.1
 # How far the rates of networks in single precision may be off at the starts in the mean, as a part of what the steps of a
 # trajectory may be off by: 2e-7 of the answer on the circle and on dubins, a twenty-fifth of this at the default tolerance.
 ROUNDED = 0.1
@@ -100,7 +100,7 @@ def unmet_cost(loop: Loop, problem: Problem, met: float, draws: int, size: float
         return 0.0
     x = scrambled_sobol(COMPARED, problem.dim, 0, torch.float64)
     dearest = float(batched(lambda at: loop(loop.start(at))[1].reshape(len(at), -1)[:, 0].abs(), x).max())
-    added = RULE_OF_THREE / draws * dearest
+    added = unmet(dearest, draws)
     return added if met < MET * dearest and added > MATERIAL * size else 0.0
 
 

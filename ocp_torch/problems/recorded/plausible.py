@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError
+from ocp_torch.maths.plane_waves import plane_waves
 from ocp_torch.problems.samples import Samples
 
 # Standard errors that a mean may be from what it must be: a normal variable is further off once in 5e8 times.
@@ -15,8 +16,6 @@ SURE = 6.0
 FORGIVEN = 1e-3
 # Rounding of states and costs, relative to their size: files may be in single precision.
 ROUNDING = 1e-6
-# The frequencies of each coordinate by which the distribution of x is held against the density it is said to have.
-FREQUENCIES = (1, 2, 3)
 
 
 def samples_of(path: Path, arrays: dict[str, np.ndarray], wrap: bool) -> Samples:
@@ -69,17 +68,25 @@ def _require_distribution(path: Path, samples: Samples, given: bool) -> None:
                 raise InputError(
                     f"{path}: {name} has mean {mean:.4g} over the torus, but a divergence must have mean 0."
                 )
-    for i in range(samples.x.shape[1]):
-        for k in FREQUENCIES:
-            angle = 2.0 * torch.pi * k * samples.x[:, i]
-            if max(off(angle.cos(), 0.0), off(angle.sin(), 0.0)) > SURE:
-                uniform = "the uniform law; give the density of the law it was drawn from"
-                law = "the density it comes with; density must be that of x" if given else uniform
-                raise InputError(f"{path}: coordinate {i} of x does not follow {law}.")
+    waves = plane_waves(samples.x.shape[1])
+    for k in waves[(waves != 0.0).sum(dim=1).argsort(stable=True)]:  # those of a single coordinate say most
+        angle = 2.0 * torch.pi * samples.x @ k
+        if bool(k.any()) and max(off(angle.cos(), 0.0), off(angle.sin(), 0.0)) > SURE:
+            uniform = "the uniform law; give the density of the law it was drawn from"
+            law = "the density it comes with; density must be that of x" if given else uniform
+            which = k.nonzero().squeeze(-1).tolist()
+            together = f"coordinates {which} of x together do" if len(which) > 1 else f"coordinate {which[0]} of x does"
+            raise InputError(f"{path}: {together} not follow {law}.")
 
 
 def dependence_notes(path: Path, samples: Samples) -> tuple[str, ...]:
-    """Signs that the samples are no independent draws: the correlation of consecutive state costs."""
+    """Signs that the samples are no independent draws: copies, and the correlation of consecutive state costs."""
+    copies = len(samples) - len(samples.x.unique(dim=0))
+    if copies:
+        return (
+            f"{copies:,} samples of {path.name} are at the same state as another: they are no independent draws, some are "
+            "trained on and held out, and bounds may be wrong by more than their intervals.",
+        )
     centred = samples.f - samples.f.mean()
     spread = float(centred.square().sum())
     if spread <= 0.0:
