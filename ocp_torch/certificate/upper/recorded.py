@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ocp_torch.certificate.bound import recorded
 from ocp_torch.certificate.checks.hidden import Hidden, hidden_divergence
+from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate, integral
 from ocp_torch.certificate.trained import in_float64
 from ocp_torch.certificate.upper.multiples import best_multiples, terms_on
@@ -109,7 +110,8 @@ def fit_recorded(context: "RecordedContext", kind: str) -> RecordedFit:
     excess = best_multiples(terms, lambda t, s: t.J(s, C_V))
     J = [integral(t.samples, t.v * t.samples.mu0) + e for t, e in zip(terms, excess, strict=True)]
     highest = highest_occupation(torch.cat(densities), Samples.concatenate(loops), rho)
-    return RecordedFit(Estimate.of(J, controller=kind), C_V, highest, hidden_divergence(list(fluxes)))
+    estimate = widened(Estimate.of(J, controller=kind), [t.samples.weight * t.J(1.0, C_V) for t in terms])
+    return RecordedFit(estimate, C_V, highest, hidden_divergence(list(fluxes)))
 
 
 def highest_occupation(mu: Tensor, loop: Samples, rho: float) -> float:
