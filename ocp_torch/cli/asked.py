@@ -23,6 +23,8 @@ from ocp_torch.problems.commands import LONGEST, PACKAGE, as_typed
 # A problem, or the name of one, as in circle or my_module.MyProblem.
 Asked = Problem | str
 FIELD = re.compile(r"[A-Za-z_]\w*([./][A-Za-z_]\w*)*")
+# The advice for a command line that adds an argument.
+ADDED = re.compile(r"; write \+\S+=\.\.\. to add an argument of your own")
 # What Hydra keeps in a process of the application it is in.
 APPLICATION = (GlobalHydra, HydraConfig, VersionBase)
 
@@ -45,7 +47,12 @@ def data_of(config_name: str, problem: Asked, parameters: Mapping[str, Any], set
     overrides = [f"{name}={as_typed(plain(name, value))}" for name, value in fields.items()]
     with own_hydra():
         overrides = with_own_defaults(config_name, overrides)
-        data = configuration(config_name, overrides)[1]
+        try:
+            data = configuration(config_name, overrides)[1]
+        except InputError as error:
+            raise InputError(
+                ADDED.sub("; keywords that the call itself has not go to the problem", str(error))
+            ) from None
         if isinstance(problem, Problem):
             data, overrides = {**data, "problem": section_of(problem)}, [*overrides, "problem=given"]
         return run_data(data, overrides)

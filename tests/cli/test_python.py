@@ -132,6 +132,11 @@ def test_a_callback_stops_the_run_which_is_certified_and_goes_on_to_the_same_bit
     assert (again.certificate, again.history.steps) == (whole.certificate, [])
 
 
+def test_a_keyword_that_nobody_has_is_said_to_have_gone_to_the_problem():
+    with pytest.raises(InputError, match=r"problem.stepz is not a field .*keywords that the call itself has not go to"):
+        train("circle", stepz=3)
+
+
 def test_a_callback_is_a_function():
     with pytest.raises(InputError, match="callback is 3, but must be a function of one Moment, or None"):
         train("circle", callback=3)
