@@ -52,6 +52,7 @@ class BlackBox:
         return self.cost.within(out, torch.ones_like(out[:, 0]))
 
     def _answered(self, x: Tensor) -> Tensor:
+        """The answer at states ``x`` ``(N, d)`` of the unit cell, ``(N, m)``; whatever goes wrong is an `InputError`."""
         try:
             return self._ask(self._convert, x)
         except Exception as error:  # whatever a stranger's code may raise

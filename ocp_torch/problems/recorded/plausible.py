@@ -81,18 +81,16 @@ def _require_distribution(path: Path, samples: Samples, given: bool) -> None:
 
 def dependence_notes(path: Path, samples: Samples) -> tuple[str, ...]:
     """Signs that the samples are no independent draws: copies, and the correlation of consecutive state costs."""
-    copies = len(samples) - len(samples.x.unique(dim=0))
+    notes, copies = list[str](), len(samples) - len(samples.x.unique(dim=0))
     if copies:
-        return (
+        notes.append(
             f"{copies:,} samples of {path.name} are at the same state as another: they are no independent draws, some are "
-            "trained on and held out, and bounds may be wrong by more than their intervals.",
+            "trained on and held out, and bounds may be wrong by more than their intervals."
         )
     centred = samples.f - samples.f.mean()
     spread = float(centred.square().sum())
-    if spread <= 0.0:
-        return ()
-    correlation = float((centred[1:] * centred[:-1]).sum()) / spread
-    alike = (
-        f"consecutive samples of {path.name} are alike (correlation {correlation:.2g}): they are no independent draws, "
-    )
-    return (f"{alike}and errors and intervals are too small.",) if correlation * len(centred) ** 0.5 > SURE else ()
+    correlation = float((centred[1:] * centred[:-1]).sum()) / spread if spread > 0.0 else 0.0
+    if correlation * len(centred) ** 0.5 > SURE:
+        alike = f"consecutive samples of {path.name} are alike (correlation {correlation:.2g})"
+        notes.append(f"{alike}: they are no independent draws, and errors and intervals are too small.")
+    return tuple(notes)
