@@ -74,7 +74,7 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
     try:
         require_no_dashes(options)
         if any(option in HELP for option in options):
-            print(help_text(config_name, " ".join(typed(sys.argv[0])), overrides), flush=True)
+            show(help_text(config_name, " ".join(typed(sys.argv[0])), overrides))
         elif any(option.split("=")[0] in ASKS for option in options):
             entry()
         elif ranks.size > 1 and (config_name not in SHARED or options or any(a in SWEEPS for a in overrides)):
@@ -94,9 +94,6 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
         sys.exit(stop.status)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
-    except BrokenPipeError:  # whoever reads, as `head` does, has enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(BROKEN_PIPE)
     finally:
         ranks.leave()
 
@@ -169,6 +166,15 @@ def require_kinds(data: Any, default: Any, name: str = "") -> None:
         require_flag(name, data)
     elif isinstance(default, int | float) and not (isinstance(data, int | float) and not isinstance(data, bool)):
         raise InputError(f"{name} is {shown(data)}, but must be a number.")
+
+
+def show(text: str) -> None:
+    """Print ``text``, as far as it is read: `head` has enough at some point."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(BROKEN_PIPE)
 
 
 def require_no_dashes(options: list[str]) -> None:
