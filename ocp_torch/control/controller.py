@@ -65,7 +65,8 @@ class Controller:
         said = self.certificate.get("gap")  # as the file has it, which may be anything
         gap = said.get("simulated") if isinstance(said, dict) else None
         sizes = f"d = {self.problem.dim}, m = {self.problem.control_dim}"
-        return f"Controller({problem_name(self.problem)}, {self.kind}, {sizes}{f', gap {gap:.2%}' if isinstance(gap, float) else ''})"
+        known = f", gap {gap:.2%}" if isinstance(gap, float) else ""
+        return f"Controller({problem_name(self.problem)}, {self.kind}, {sizes}{known})"
 
     def __call__(self, x: States) -> States:
         """Controls ``(N, m)`` at states ``(N, d)``: any reals, wrapped to the torus; NumPy in gives NumPy out, and floats of
