@@ -163,7 +163,8 @@ def test_a_mistake_is_told_as_on_the_command_line(asked, override):
     told = outcome(override)
     with pytest.raises(InputError) as error:
         asked()
-    assert str(error.value) == told
+    said, hint, _ = told.partition("; write +")  # the hint how to add a field is for the command line alone
+    assert str(error.value) == told or (hint and str(error.value).startswith(f"{said}; keywords that"))
 
 
 @pytest.mark.parametrize(
