@@ -2,6 +2,7 @@
 
 import copy
 import math
+import time
 from collections import Counter
 from dataclasses import replace
 
@@ -22,6 +23,22 @@ settings.load_profile("repeatable")
 
 # Files that take longest: begun first, so that of several processes none waits for another at the end.
 LONGEST = ("test_readme.py", "test_killed.py", "test_adversarial.py", "test_warm_start.py", "test_export.py")
+
+
+BEGUN = time.monotonic()
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--minutes", type=float, help="skip the tests that would begin later than so many minutes from now"
+    )
+
+
+@pytest.hookimpl(tryfirst=True)  # before what a test needs is made
+def pytest_runtest_setup(item):
+    minutes = item.config.getoption("minutes")
+    if minutes is not None and time.monotonic() - BEGUN > 60.0 * minutes:
+        pytest.skip(f"it would begin after the {minutes:g} minutes that --minutes allows")
 
 
 def pytest_collection_modifyitems(items):

@@ -164,6 +164,7 @@ def test_recorded_samples_are_certified_truly(tmp_path, name, value):
     assert faults(certificate, problem) == []
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("any_variate")
 @pytest.mark.parametrize("horizon", [pytest.param("truncated", marks=pytest.mark.nightly), "random"])
 @pytest.mark.parametrize("tilt", [1.3, pytest.param(1.0, marks=pytest.mark.nightly)])
@@ -193,6 +194,7 @@ def test_a_bound_of_the_cost_that_is_too_small_is_not_believed():
     assert resolve_constants(problem).C_V > 30.0
 
 
+@pytest.mark.nightly
 def test_an_M_that_is_too_small_is_refuted_by_a_controller_that_gathers_mass():
     problem = Lines(Line(dip(0.4, 0.1)), occupation_bound=1.5)
     valley = lambda x: 0.5 - 0.2 * (2.0 * torch.pi * (x[:, 0] - 0.4)).cos()

@@ -128,6 +128,7 @@ def test_what_its_need_says_decides_whether_it_counts(listed):
     assert "not used" in row(found, "a toy")
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("part", [0.9999, 2.0])
 def test_one_that_rests_on_a_guess_is_conditional_until_another_refutes_it(listed, part):
     listed(Toy(LOWER, part, basis=GUESSED))
@@ -143,6 +144,7 @@ def test_one_that_rests_on_a_guess_is_conditional_until_another_refutes_it(liste
     assert any("it is not so that the toy is right" in w for w in found.warnings) == (part > 1.0)
 
 
+@pytest.mark.nightly
 def test_one_that_is_wrong_contradicts_the_others_and_is_named(listed):
     listed(Toy(LOWER, 2.0))
     found = certificate()
@@ -152,6 +154,7 @@ def test_one_that_is_wrong_contradicts_the_others_and_is_named(listed):
     assert not found.hold
 
 
+@pytest.mark.nightly
 def test_a_given_controller_has_it_too_and_one_on_its_performance_from_below(listed):
     listed(Toy(LOWER, 0.9999))
     listed(Toy(PERFORMANCE, 0.5, name="toy below"))

@@ -53,6 +53,7 @@ def test_the_lagrangian_bound_is_second_order_where_J_is_first(problem):
     assert 0.0 < small < J_small
 
 
+@pytest.mark.nightly
 def test_an_M_below_sup_mu_is_noticed_and_its_bound_left_out():
     problem = Manufactured(dim=1)
     certificate = certificate_of(problem, resolve_constants(problem, occupation_bound=0.5 * problem.occupation_bound))

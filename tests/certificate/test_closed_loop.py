@@ -71,6 +71,7 @@ def test_any_density_gives_the_performance_once_the_value_of_its_residual_is_add
     assert found.se < 1e-2 * problem.exact_optimum
 
 
+@pytest.mark.nightly
 @zoo.on(zoo.QUIET)
 def test_the_value_differs_from_that_of_the_loop_by_the_slack_met_along_its_trajectories(problem):
     """`V(x) - V^u(x) = rho int e^{-rho t} Q_u(x_t) dt`, state by state."""
@@ -116,6 +117,7 @@ def test_the_stage_takes_another_round_only_while_the_residual_costs_too_much(mo
     assert not torch.equal(weights(fit(good_excess=1e-12)), once)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("rounds", "good", "steps"), [(1, 1e-12, 30), (2, 1e-12, 60), (3, 1e-12, 120), (3, 1e12, 100)])
 def test_where_the_slack_is_steep_one_long_round_is_made_until_the_excess_is_good(rounds, good, steps, monkeypatch):
     problem, made = zoo.build("manufactured 2-d q=2"), []
@@ -159,6 +161,7 @@ def test_a_pool_makes_what_is_drawn_and_gives_the_same_states_again_only_after_a
     assert torch.equal(pool.draw(6).x, SobolSampler(2, 1, torch.float32).draw(30)[24:])
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("solved", [False, True])
 def test_the_first_round_ends_early_where_v_is_solved_so_well_that_any_density_will_do(solved, monkeypatch):
     problem, steps = zoo.build("manufactured 2-d q=2"), []

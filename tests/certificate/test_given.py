@@ -140,6 +140,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_is_no_controller_is_refused_in_one_sentence(name):
     controller, words = REFUSED[name]

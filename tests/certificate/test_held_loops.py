@@ -42,6 +42,7 @@ def held_cost(problem: Circle, step: float) -> float:
     return float(hold) / (1.0 - math.exp(-rho * step) * (1.0 - k * step) ** 2) / 12.0
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("step", [0.02, 0.2, 0.9])
 @pytest.mark.parametrize("variate", [False, True], ids=["plain", "with V"])
 def test_on_the_circle_it_costs_what_sampled_feedback_costs(step, variate):

@@ -117,6 +117,7 @@ def test_a_jump_of_the_optimal_controller_is_seen_twice(problem):
     assert closed_loop_bounds(loop, problem.exact_value, log_density(problem.dim), sets, 1, "value").hidden is not None
 
 
+@pytest.mark.nightly
 def test_chance_alone_raises_no_alarm():
     """Two hundred random smooth fields at independent uniform states, where errors are largest."""
     alarms = 0
@@ -143,6 +144,7 @@ def certified(problem, occupation, settings=CHEAP):
     return certify_fields(problem, trained, resolve_constants(problem), settings, Run("jump", "primal"))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("width", [0.0, 1e-6])
 def test_a_drift_that_jumps_into_a_sink_has_no_upper_bound(width):
     certificate = certified(JumpSink(width=width), NETWORK)

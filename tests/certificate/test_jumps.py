@@ -62,6 +62,7 @@ def test_the_optimal_jumps_cost_no_accuracy(problem):
     assert perf.bias <= 1e-4 * problem.exact_optimum
 
 
+@pytest.mark.nightly
 @zoo.on(("circle rho=2", "torus 2-d chain", "manufactured 2-d mu0"))
 def test_the_random_horizon_agrees_with_the_truncated_one(problem):
     kinds = ("truncated", "random")

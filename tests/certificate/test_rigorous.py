@@ -458,6 +458,7 @@ class Holed(Wavy):
         return super().state_cost(x) * (1.0 - (1.0 - (away / 0.003).square()).clamp_min(0.0).square())
 
 
+@pytest.mark.nightly
 def test_a_lipschitz_constant_that_a_narrow_hole_refutes_proves_nothing(monkeypatch):
     certificate = certificate_of(Holed(), network(1, 0), True)
     assert certificate.lower["rigorous"] is None
@@ -479,6 +480,7 @@ def test_what_sampling_says_refutes_a_proof(slack, integral, told):
     assert found is None if told is None else told in found
 
 
+@pytest.mark.nightly
 def test_what_somebody_declared_is_said_to_be_given():
     takes = lambda problem: certificate_of(problem, network(1, 0), True).needs("rigorous")
     assert [need.sentence for need in takes(Wavy())] == [

@@ -190,6 +190,7 @@ def test_a_value_function_of_the_wrong_size_is_put_right(problem):
     assert found.best.estimate.value == pytest.approx(problem.exact_optimum, rel=5e-3, abs=6.0 * found.best.estimate.se)
 
 
+@pytest.mark.nightly
 @zoo.on(zoo.FEW)
 def test_a_subsolution_with_room_is_shifted_up(problem):
     sets = replicated_samples(problem, 512, 8, seed=0, divergences=False)

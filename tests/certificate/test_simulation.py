@@ -319,6 +319,7 @@ def test_only_looks_go_without_audits():
         call(CertificateSettings, "certificate", {"audited": False})
 
 
+@pytest.mark.nightly
 def test_rounding_is_in_the_bias_of_a_look_too():
     problem, error = zoo.Manufactured(dim=1), 1e-6
     rounded = lambda x: problem.exact_control(x) * (1.0 + error)
@@ -352,6 +353,7 @@ def test_a_rounded_controller_takes_the_place_of_one_that_it_agrees_with(noise):
     assert single.bias < 1.2 * double.bias + 1e-6
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("noise", [0.0, pytest.param(0.02, marks=pytest.mark.nightly)])
 def test_where_it_differs_along_the_way_the_bias_says_by_how_much(noise):
     """It is another controller wherever no trajectory starts."""
@@ -408,6 +410,7 @@ def test_with_noise_the_estimated_density_is_a_number_where_paths_scatter_widely
     assert bool((found >= 0.0).all())
 
 
+@pytest.mark.nightly
 @zoo.on(("manufactured 2-d mu0", "noisy 1-d"))
 @pytest.mark.parametrize(("size", "used"), [(0.003, True), (3.0, False)])
 def test_a_value_whose_slack_is_as_large_as_the_cost_is_no_control_variate(problem, size, used):

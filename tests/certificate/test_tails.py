@@ -45,6 +45,7 @@ def assert_covers(estimate: Estimate, truth: float, most: float = 0.05):
     assert high - low <= most * truth
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", SPIKES)
 def test_bounds_of_a_closed_loop_know_a_spike_of_the_cost(name):
     """Doing nothing keeps the uniform law: `J` and the Lagrangian bound are the mean cost."""
@@ -57,6 +58,7 @@ def test_bounds_of_a_closed_loop_know_a_spike_of_the_cost(name):
         assert_covers(estimate, problem.idle)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("name", "speed"),
     [("1-d needle", 0.0), ("2-d", 0.0), pytest.param("2-d", 0.05, marks=pytest.mark.nightly), ("3-d", 0.0)],

@@ -59,12 +59,14 @@ def test_the_optimal_value_with_noise(problem, size):
     assert_true(certificate, problem.exact_optimum)
 
 
+@pytest.mark.nightly
 def test_an_untrained_network():
     problem = Manufactured(dim=2)
     fields = Fields.build(problem, ("value", "control_density", "log_occupation"), partial(PeriodicMLP, width=8), 3)
     assert_true(certified(problem, NETWORK, **fields.networks), problem.exact_optimum)
 
 
+@pytest.mark.nightly
 def test_no_flux_at_all():
     problem = Manufactured(dim=1)
     certificate = certified(problem, NETWORK, control_density=lambda x: 0.0 * x, log_occupation=lambda x: 0.0 * x[:, 0])
@@ -101,6 +103,7 @@ class Negative(Manufactured):
         return super().state_cost(x) - self.taken
 
 
+@pytest.mark.nightly
 def test_a_cost_that_is_negative_somewhere():
     problem = Negative(dim=1)
     fields = Fields.build(problem, ("control_density", "log_occupation"), partial(PeriodicMLP, width=8), 3)
@@ -235,6 +238,7 @@ def test_twice_sup_mu_is_believed():
     assert certificate.assumptions.estimated_sup_occupation == pytest.approx(problem.true_sup, rel=0.02)
 
 
+@pytest.mark.nightly
 def test_an_unbounded_density_is_caught_without_being_told():
     problem = Hidden(0.8)
     constants = resolve_constants(problem, occupation_bound=50.0)

@@ -70,6 +70,7 @@ def test_without_a_configuration_beside_it_the_checkpoint_is_read_once_more_for_
     assert counted(f"resume={run}", "trainer.steps=62", cwd=tmp_path) == {"composed": 1, "built": 1, "read": 2}
 
 
+@pytest.mark.nightly
 def test_a_start_imports_nothing_that_it_does_not_use(tmp_path):
     program = (
         "import runpy, sys\n"

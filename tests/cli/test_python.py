@@ -121,6 +121,7 @@ def test_a_callback_hears_of_steps_and_looks_as_the_history_keeps_them():
     assert np.isfinite(run.history.steps[0]["loss/value"])
 
 
+@pytest.mark.nightly
 def test_a_callback_stops_the_run_which_is_certified_and_goes_on_to_the_same_bits(here, tmp_path):
     stopped = train("circle", seed=4, folder=tmp_path / "run", settings=SETTINGS, callback=lambda m: m.step >= 15)
     assert (stopped.certificate["step"], stopped.certificate["stopped"]) == (15, "callback")
@@ -192,6 +193,7 @@ def test_a_folder_that_holds_a_run_is_not_written_to(here):
         train("circle", folder=here.folder, settings=SETTINGS)
 
 
+@pytest.mark.nightly
 def test_a_problem_of_ones_own_is_trained_as_it_is_and_its_controller_is_loaded_with_it(tmp_path):
     run = train(Hill(0.3), folder=tmp_path / "run", settings=SHORT)
     assert run.controller.config["problem"]["height"] == 0.3

@@ -31,6 +31,7 @@ def paid(problem, V, pace, x, u):
     return problem.control_cost.cost(u) + after
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("problem", [SWING, Pendulum(), Pendulum(exponent=1.5)], ids=["limit", "free", "q = 1.5"])
 def test_it_beats_the_control_for_an_instant_and_comes_near_to_the_best_of_all(problem, seed):

@@ -175,6 +175,7 @@ def test_derivatives_of_casadi_are_exact(tmp_path):
     torch.testing.assert_close(bent, differences, rtol=1e-6, atol=1e-5)
 
 
+@pytest.mark.nightly
 @EACH
 def test_onnx(variant, tmp_path):
     onnxruntime = pytest.importorskip("onnxruntime")

@@ -175,6 +175,7 @@ def test_a_name_in_a_figure_is_no_formula(run, tmp_path):
     compare([tmp_path / "runs"]).save_plot(tmp_path / "runs.png")
 
 
+@pytest.mark.nightly
 def test_notes_of_a_checkpoint_and_of_a_controller_are_printed_escaped(run):
     path = run / "checkpoints" / "last.pt"
     changed(path, "bounds/warnings", [ESCAPE])
@@ -245,6 +246,7 @@ YAMLS = {
 HARMLESS = {"many anchors"}
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("what", YAMLS)
 def test_a_crafted_configuration_costs_little(what, run):
     file = run / ".hydra" / "config.yaml"
@@ -333,6 +335,7 @@ STATES = {
 }
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("what", STATES)
 def test_a_crafted_checkpoint_costs_little(what, run):
     where, value = STATES[what]
@@ -374,6 +377,7 @@ PICKLES = {
 CAPITALS = [pytest.param(w, "DATA.PKL", marks=[] if w == "an allocation" else pytest.mark.nightly) for w in PICKLES]
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("what", "name"), [*((w, "data.pkl") for w in PICKLES), *CAPITALS])
 def test_a_crafted_list_of_parts_makes_little(what, name, run):
     path, packed = run / "checkpoints" / "last.pt", io.BytesIO()

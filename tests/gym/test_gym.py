@@ -51,6 +51,7 @@ def test_a_state_is_drawn_as_clocks():
 SIMULABLE = sorted(name for name, c in PROBLEMS.items() if c.has_simulator)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "name", [n if k % 4 == 0 else pytest.param(n, marks=pytest.mark.nightly) for k, n in enumerate(SIMULABLE)]
 )

@@ -101,6 +101,7 @@ def test_who_fails_is_told_of_by_the_first_and_the_others_leave():
     assert parted(3, play) == [ProblemError.__name__, "None", Left.__name__]
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("dies", [0, pytest.param(2, marks=pytest.mark.nightly)])
 def test_a_death_is_known_to_all_at_once(dies):
     def play(ranks, rank):

@@ -66,6 +66,7 @@ def test_no_value_function_gives_a_penalised_bound_above_the_optimum(name, seed,
     assert F_M.value <= problem.exact_optimum + ERRORS * F_M.se + 1e-9
 
 
+@pytest.mark.nightly
 @settings(max_examples=6)
 @given(**case)
 def test_no_value_function_gives_a_shifted_bound_above_the_optimum(name, seed, size, near):
@@ -91,6 +92,7 @@ def test_no_densities_give_an_upper_bound_below_the_optimum(name, seed, size, ne
         assert problem.exact_optimum - ERRORS * G.se - 1e-9 <= G.value <= J.value * (1.0 + 1e-12)
 
 
+@pytest.mark.nightly
 @settings(max_examples=4)
 @given(**{**case, "name": st.sampled_from((*zoo.SMOOTH, *zoo.EXACT_NOISY))})
 def test_no_value_and_density_give_a_closed_loop_bound_below_the_optimum(name, seed, size, near):
@@ -148,6 +150,7 @@ def test_the_primal_takes_the_closed_form_exactly_where_there_is_no_drift():
         assert type(primal(zoo.build(name))) is kind
 
 
+@pytest.mark.nightly
 @settings(max_examples=40)
 @given(name=st.sampled_from(zoo.ALL), seed=st.integers(0, 10**6), size=st.sampled_from([0.1, 1.0, 5.0]))
 def test_the_saddle_is_never_below_the_dual_and_meets_it_at_the_best_response(name, seed, size):

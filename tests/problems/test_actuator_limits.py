@@ -73,6 +73,7 @@ def test_the_formula_is_that_of_the_circle():
     assert float((reference.value - torus_value(tight, reference.solution.grid.nodes())).abs().max()) < 1e-4
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("shear", "limit"), [("none", BOTH), pytest.param("chain", ONE, marks=pytest.mark.nightly)])
 def test_the_optima_on_the_grid_add_up(shear, limit):
     problem = Torus(shear=shear, control_limit=limit)

@@ -96,6 +96,7 @@ def test_a_mirrored_cart_does_the_mirrored_thing():
     torch.testing.assert_close(cart.state_cost(mirrored), cart.state_cost(x), **ROUNDING)
 
 
+@pytest.mark.nightly
 def test_the_balance_near_upright_is_that_of_the_linear_system():
     """By difference quotients; and what balancing costs in all is the quadratic form."""
     cart = CartPole(control_limit=None)

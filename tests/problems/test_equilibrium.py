@@ -44,6 +44,7 @@ def test_the_value_near_it_is_that_of_the_riccati_equation():
     assert found.gathers == (problem.plane.contraction >= problem.discount)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ["cart_pole", pytest.param("pendubot", marks=pytest.mark.nightly)])
 def test_the_linear_controller_costs_what_it_says(name):
     problem = PROBLEMS[name]()

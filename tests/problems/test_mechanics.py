@@ -53,6 +53,7 @@ def lagrangian(problem, q, w):
     return kinetic - problem.gravity * (m1 * at[1] + m2 * at[3])
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("cls", [Acrobot, pytest.param(Pendubot, marks=pytest.mark.nightly)])
 def test_the_links_move_as_lagranges_equations_say(cls):
     problem = cls(damping=[0.02, 0.05])
@@ -196,6 +197,7 @@ RESTS = {
 }
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.nightly) if n in ("acrobot", "pendubot") else n for n in RESTS]
 )

@@ -125,6 +125,7 @@ def test_a_noisy_torque_turns_the_pendulum_as_a_torque_does():
     torch.testing.assert_close(problem.noise(x), pushed)
 
 
+@pytest.mark.nightly
 def test_a_noisy_torque_does_not_take_the_pendulum_across_the_seam():
     problem = Pendulum(torque_noise=2.0)
     speeds = problem.seam * 2.0 * ends(problem, [0.3, 0.45], 2.0, steps=2000)[:, 1]

@@ -403,6 +403,7 @@ def test_its_cost_is_gymnasiums_near_upright_up_to_a_factor():
     torch.testing.assert_close(total / pendulum._scale, theirs, rtol=1e-5, atol=0.0)
 
 
+@pytest.mark.nightly
 def test_the_pendulum_keeps_its_energy_without_control_also_beyond_the_cut_off():
     pendulum = Pendulum()
     start = torch.tensor([[3.0, 0.5], [0.3, 2.0], [1.0, 6.0], [2.0, 8.7]], dtype=torch.float64)
@@ -552,6 +553,7 @@ def test_every_system_takes_a_control_limit_and_pays_infinitely_beyond_it(proble
         type(problem)(control_limit=0.0)
 
 
+@pytest.mark.nightly
 def test_a_limit_makes_the_optimum_dearer_but_changes_nothing_near_the_state_of_rest():
     """Why the criterion for an unbounded `mu*` needs no limit: there `V*` is that of the discounted Riccati equation."""
     two = dict(oscillators=2, spread=0.0, coupling=0.2)

@@ -463,6 +463,7 @@ def test_runs_on_recorded_samples_leave_all_their_files(tmp_path, method, varyin
         certify_saved(u, CertificateSettings(stage=StageSettings(steps=1)))
 
 
+@pytest.mark.nightly
 def test_a_saved_run_is_certified_again_from_its_file(tmp_path, plain):
     trainer = small(*RUN, f"problem.path={plain}", "method=dual")
     first = session(trainer, tmp_path / "run")

@@ -35,6 +35,7 @@ class Needle(Problem):
         return torch.diag_embed(1.0 + 0.5 * (2.0 * math.pi * x).sin() + self.needle(x, "B").unsqueeze(-1))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("where", ["f", "a", "B"])
 @pytest.mark.parametrize(("dim", "radius"), [(1, 1e-4), (2, 4e-3), (4, 0.06)])
 def test_a_needle_within_the_usual_range_of_the_data_is_found(where, dim, radius):

@@ -45,6 +45,7 @@ def assert_near(estimate: Estimate, truth: float, most: float):
     assert high - low <= most * abs(truth)
 
 
+@pytest.mark.nightly
 def test_doing_nothing_from_a_narrow_start_costs_what_it_costs(narrow):
     perf = simulate_performance(narrow, zero_policy(narrow), 64, 8, seed=0).perf
     assert_near(perf, narrow.idle, 0.4)

@@ -55,6 +55,7 @@ def test_one_evaluation_gives_what_the_methods_and_autograd_through_them_do(make
         torch.testing.assert_close(found, expected, **CLOSE)
 
 
+@pytest.mark.nightly
 def test_the_flow_on_the_torus_is_the_flow_in_physical_units():
     """The same controls take the same states as far, by Runge and Kutta's method in either, as long as the box holds them."""
     system = Cart(noisy=False)
@@ -192,6 +193,7 @@ def test_starts_in_ranges_have_mass_1_and_none_of_it_outside(parts, named):
     assert float(found[chart.outside(s)].max()) == 0.0
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "start",
     [

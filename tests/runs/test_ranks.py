@@ -61,6 +61,7 @@ def assert_same(folder, whole):
                 assert certificate_in(folder)[side][name]["value"] == pytest.approx(estimate["value"], rel=1e-6)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("way", "count"),
     [

@@ -58,6 +58,7 @@ class Recorder(Silent):
             trainer.save(self.folder / f"{trainer.step}.pt")
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "way", [pytest.param(w, marks=pytest.mark.nightly) if w in NIGHTLY else w for w in WAYS], ids=" ".join
 )

@@ -42,6 +42,7 @@ def agrees(config: dict, made: dict) -> bool:
     return config is None or config == made
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("lost", [".hydra", ".hydra/config.yaml"])
 def test_a_folder_without_configuration_goes_on_with_that_of_its_checkpoint(lost, run, tmp_path):
     shutil.rmtree(run / lost) if (run / lost).is_dir() else (run / lost).unlink()

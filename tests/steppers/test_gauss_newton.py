@@ -74,6 +74,7 @@ def fitted(problem):
     return made
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.nightly)])
 def test_a_smooth_solution_is_found_to_many_digits(seed):
     problem = Manufactured(dim=1, seed=seed)

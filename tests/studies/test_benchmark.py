@@ -82,6 +82,7 @@ def test_the_judge_agrees_with_quadrature_on_a_dense_grid():
     assert min(numbers["value"], numbers["density"]) > problem.exact_optimum
 
 
+@pytest.mark.nightly
 def test_the_judge_knows_no_bound_by_a_guessed_M():
     problem = PROBLEMS["pendulum"](noise=1e-3)
     constants = resolve_constants(problem)
@@ -91,6 +92,7 @@ def test_the_judge_knows_no_bound_by_a_guessed_M():
     assert "F_M" in Judge(problem, resolve_constants(problem, occupation_bound=9.0))(fields, None, perf=False)
 
 
+@pytest.mark.nightly
 def test_the_judge_finds_the_optimum_of_the_optimal_controller():
     """Simulated from a table of the policy; without drift, and with."""
     problem = zoo.build("circle rho=2")
@@ -222,6 +224,7 @@ def test_the_cost_of_dimensions_has_an_exponent_where_there_are_three():
     assert by_dimension([*three[:2], family(16, reached(1.0), never)], 0.01) == {}
 
 
+@pytest.mark.nightly
 def test_what_was_measured_before_is_drawn_beside(tmp_path):
     for dim in (1, 2, 8):
         family(dim, curve("mlp dual", 0, [1.5, 0.9008]), problem="manufactured").write(tmp_path / str(dim))

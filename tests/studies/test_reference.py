@@ -140,6 +140,7 @@ def test_an_iteration_that_is_stopped_early_says_so_and_states_what_it_leaves(po
     assert "stopped before it settled" in reference_table(reference)
 
 
+@pytest.mark.nightly
 def test_where_the_clipped_scheme_goes_in_circles_the_monotone_one_settles():
     """A pendulum with limited torque, whose `OPT` is 3.03 to 3.10 by a certificate: the stated error was 10 and more."""
     reference = solve_reference(Pendulum(control_limit=1.0, discount=0.5), 64)
@@ -148,6 +149,7 @@ def test_where_the_clipped_scheme_goes_in_circles_the_monotone_one_settles():
     assert reference.unsettled < 0.01 * reference.error
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("make", "sides"), [(Circle, (16, 32, 64)), (Torus, (12, 24, 48))])
 def test_beside_kinks_the_monotone_scheme_is_extrapolated_as_one_of_first_order(make, sides):
     problem = make()
@@ -270,6 +272,7 @@ FEATURES = {
 }
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", FEATURES)
 def test_what_no_node_sees_is_named_with_its_place(name):
     options = {"f": wave, **FEATURES[name]}

@@ -71,6 +71,7 @@ class Ripples(nn.Module):
         return out.squeeze(-1) if self.scalar else out
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("problem", "count"), [("circle", 6), pytest.param("arm", 10, marks=pytest.mark.nightly)])
 def test_an_architecture_of_ones_own_brings_its_sizes_and_leaves_all_that_a_run_leaves(
     problem, count, monkeypatch, tmp_path

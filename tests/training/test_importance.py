@@ -76,6 +76,7 @@ def test_scores_are_proportional_to_the_gradients_of_single_states(way, monkeypa
     assert all(torch.equal(p, q) for p, q in zip(before, batches.fields.parameters(), strict=True))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("way", WAYS)
 def test_losses_and_gradients_are_unbiased(way):
     """Means over batches against a batch of many even states: all entries together, in units of their standard errors."""
@@ -98,6 +99,7 @@ def test_losses_and_gradients_are_unbiased(way):
         assert float(error) < 3.0 * float(expected) + 1e-3 * float(truth.norm())
 
 
+@pytest.mark.nightly
 def test_visited_states_keep_their_part():
     batches, phase = build("dual, drift", visited=0.25)
     means = []

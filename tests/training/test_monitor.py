@@ -27,6 +27,7 @@ DRIFTING = ("problem=manufactured", "problem.dim=2")
 WAYS = {**METHODS, "saddle with drift": ("method=pd", "method.augmentation=0", *DRIFTING), "pd with drift": DRIFTING}
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "way", [pytest.param(w, marks=NIGHTLY) if w in METHODS and k % 2 else w for k, w in enumerate(WAYS)]
 )

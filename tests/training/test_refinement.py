@@ -100,6 +100,7 @@ def test_those_that_make_the_bound_worse_are_not_taken(halved, monkeypatch):
     assert torch.equal(weights(trainer.averaged_fields), weights(plain.averaged_fields))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "how",
     [
