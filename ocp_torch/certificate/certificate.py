@@ -11,6 +11,7 @@ from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.estimate import CONFIDENCE, Estimate, known, known_of
 from ocp_torch.certificate.report import to_dict
 from ocp_torch.certificate.settings import Run
+from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.needs import GUESSED, Need
 
@@ -30,6 +31,7 @@ class Certificate:
     names of guesses that another bound excludes. ``outside`` is the part of the discounted time that the controller spends
     outside the box of a system in physical units. ``held_for`` is the time for which it holds each control, `None` where it
     acts at every instant; ``followed`` is the one whose closed loop was fitted, by the density ``occupation``, to draw.
+    ``subsolution`` is what the shifted bound is of, where that is not the `V` that was certified.
     """
 
     run: Run
@@ -51,6 +53,7 @@ class Certificate:
     held_for: float | None = None
     followed: str | None = None
     occupation: Field | None = field(default=None, compare=False)
+    subsolution: Subsolution | None = field(default=None, compare=False)
 
     def needs(self, name: str) -> tuple[Need, ...]:
         """What the bound ``name`` rests on; nothing for simulations, the truth, and names that nobody listed."""

@@ -20,6 +20,7 @@ from ocp_torch.certificate.simulated.outside import outside_note
 from ocp_torch.certificate.trained import FieldsContext, Trained, TrainedContext
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import InputError
+from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.needs import GUESSED
@@ -71,6 +72,7 @@ def certify(context: Context) -> Certificate:
         perf_lower=perf_lower,
         followed=context.followed,
         occupation=None if context.closed_loop is None else context.closed_loop.occupation,
+        subsolution=None if context.sampled_value is None else context.sampled_value.subsolution,
     )
     return handed_out(examined(certificate), context)
 
@@ -155,11 +157,13 @@ def certify_policy(
     settings: CertificateSettings,
     run: Run,
     progress: Progress = silent,
+    kept: Subsolution | None = None,
 ) -> Certificate:
-    """The certificate of any ``policy``; with ``value`` (float64), any `V`, also how far from optimal it is at most.
-    ``network`` makes the networks for `V^u` and `mu^u`. Raises `InputError` where the policy fails."""
+    """The certificate of any ``policy``; with ``value`` (float64), any `V`, also how far from optimal it is at most, for
+    which ``kept`` was trained before. ``network`` makes the networks for `V^u` and `mu^u`. Raises `InputError` where the
+    policy fails."""
     shared = problem, constants, settings, run, progress
-    certificate = certify(ControllerContext(*shared, policy=policy, value=value, network=network))
+    certificate = certify(ControllerContext(*shared, policy=policy, value=value, network=network, kept=kept))
     if isinstance(policy, BlackBox):  # now that it was asked for many states
         policy.require_still()
     return certificate

@@ -22,6 +22,7 @@ from ocp_torch.certificate.simulated.performance import Simulated
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.upper.penalised import DensityBounds
 from ocp_torch.control.policies import DENSITY, Policy
+from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import Constants
@@ -86,6 +87,11 @@ class Context:
         return found is None or value_holds(found.largest_value, self.constants)
 
     @property
+    def kept(self) -> Subsolution | None:
+        """What the lower bound was of before: `V` need not be trained on for it again."""
+        return None
+
+    @property
     def notes(self) -> list[str]:
         return []
 
@@ -135,7 +141,8 @@ class Context:
         if self.value is None:
             return None
         search = self.settings.searches(self.constants)
-        return SampledValue(self.problem, self.value, self.wide, self.settings.ascents, search, self.seed, self.odd)
+        how = self.settings.ascents, search, self.seed, self.odd, self.kept
+        return SampledValue(self.problem, self.value, self.wide, *how)
 
     @property
     def ahead(self) -> contextlib.AbstractContextManager[None]:

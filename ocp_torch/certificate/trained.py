@@ -35,6 +35,7 @@ from ocp_torch.control.policies import (
     trained_policies,
 )
 from ocp_torch.fields.fields import Fields
+from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.samples import Samples
 
@@ -83,6 +84,10 @@ class FieldsContext(Context):
     @property
     def value(self) -> Field | None:
         return self.fields.value
+
+    @property
+    def kept(self) -> Subsolution | None:
+        return self.fields.subsolution
 
     def policies_of(self, fields: Fields) -> dict[str, Policy]:
         """The controllers that the trained ``fields`` give, in their precision, by name."""

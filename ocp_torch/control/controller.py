@@ -17,7 +17,7 @@ from ocp_torch.control.pace import Pace
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, TRAJECTORIES, Policy, trained_policies
 from ocp_torch.errors import InputError, notes, require_number
 from ocp_torch.export import export
-from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, MODELS, TRAJECTORY_VALUE, VALUE, Fields, made
+from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, MODELS, SUBSOLUTION, TRAJECTORY_VALUE, VALUE, Fields, made
 from ocp_torch.files.limits import require_held, require_modest_problem
 from ocp_torch.files.reading import FILE, FOLDER, kind
 from ocp_torch.files.storage import load_tensors, save_tensors
@@ -28,10 +28,12 @@ from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.physical.system import System
 
 # What a run calls the file of its controller, and its schema, raised when an older version could not read what is written.
-FILE_NAME, SCHEMA = "controller.safetensors", 1
+FILE_NAME, SCHEMA = "controller.safetensors", 2
 # What the file holds of a controller just as it is.
 PLAIN = ("model", "occupation", "kind", "certificate", "config")
-FIELDS = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION, TRAJECTORY_VALUE)
+FIELDS = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION, TRAJECTORY_VALUE, SUBSOLUTION)
+# The states that come with a subsolution, as many as the file has.
+WORST = f"networks.{SUBSOLUTION}.worst"
 # Controls are given as what the states are.
 States = TypeVar("States", Tensor, np.ndarray)
 
@@ -202,7 +204,8 @@ def _rebuilt(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
         raise InputError(f"{path} names the unknown model {model['name']!r}; known are {', '.join(MODELS)}.")
     network, options = MODELS[model["name"]], {k: v for k, v in model.items() if k != "name"}
     outputs = {CONTROL_DENSITY: problem.control_dim}  # the other fields are scalar
-    form = lambda name: dict(dim=problem.dim, outputs=outputs.get(name), **options)
+    states = {SUBSOLUTION: {"states": len(tensors[WORST])}} if SUBSOLUTION in names else {}
+    form = lambda name: dict(dim=problem.dim, outputs=outputs.get(name), **states.get(name, {}), **options)
     build = lambda: Fields({name: made(name, network, **form(name)) for name in names})
     with torch.device("meta"):
         # Shapes first, without memory: a crafted size must not be allocated before it is refused.

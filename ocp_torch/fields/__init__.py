@@ -7,9 +7,10 @@ represents, ``centred``, whether it may resolve a state of rest, and from argume
 
 from typing import Any
 
-from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, TRAJECTORY_VALUE, VALUE, Fields, made
+from ocp_torch.fields.fields import CONTROL_DENSITY, LOG_OCCUPATION, SUBSOLUTION, TRAJECTORY_VALUE, VALUE, Fields, made
 from ocp_torch.fields.mlp import PeriodicMLP
 from ocp_torch.fields.sobolev import SobolevField
+from ocp_torch.fields.subsolution import Subsolution
 
 MODELS: dict[str, Any] = {"mlp": PeriodicMLP, "sobolev": SobolevField}
 
@@ -17,10 +18,12 @@ __all__ = [
     "CONTROL_DENSITY",
     "LOG_OCCUPATION",
     "MODELS",
+    "SUBSOLUTION",
     "TRAJECTORY_VALUE",
     "VALUE",
     "Fields",
     "PeriodicMLP",
     "SobolevField",
+    "Subsolution",
     "made",
 ]

@@ -14,6 +14,7 @@ from ocp_torch.fields.coupled_waves import coupled_waves, may_be_coupled
 from ocp_torch.fields.embedding import FourierEmbedding
 from ocp_torch.fields.logarithmic import Logarithmic
 from ocp_torch.fields.rounded import Rounded
+from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.fields.waves import STATES, prominent_waves
 from ocp_torch.problems.equilibrium import equilibrium
 from ocp_torch.problems.problem import Problem
@@ -21,6 +22,8 @@ from ocp_torch.problems.problem import Problem
 VALUE, CONTROL_DENSITY, LOG_OCCUPATION = "value", "control_density", "log_occupation"
 # A second `V`, from values of trajectories or of a grid: what controls best and what bounds best differ. No player moves it.
 TRAJECTORY_VALUE = "trajectory_value"
+# A third, `V` trained on for the lower bound alone: it proves how good a controller is, and gives none.
+SUBSOLUTION = "subsolution"
 # Builds a network from (dim, outputs, shift, scale); outputs None means a scalar field.
 NetworkFactory = Callable[..., nn.Module]
 
@@ -81,6 +84,11 @@ class Fields(nn.Module):
         return self._get(TRAJECTORY_VALUE)
 
     @property
+    def subsolution(self) -> Any:
+        """What the lower bound is of, where that is not `V`: a `Subsolution`."""
+        return self._get(SUBSOLUTION)
+
+    @property
     def rounded(self) -> "Fields":
         """The fields at float64 states, computed in float32."""
         return Fields({name: Rounded(network) for name, network in self.networks.items()})
@@ -95,7 +103,8 @@ class Fields(nn.Module):
 
 def made(name: str, network: NetworkFactory, **form: Any) -> nn.Module:
     """The network of the field ``name``, of the given ``form``."""
-    return Logarithmic.of(network, **form) if name == TRAJECTORY_VALUE else network(**form)
+    special: dict[str, Callable[..., nn.Module]] = {TRAJECTORY_VALUE: Logarithmic.of, SUBSOLUTION: Subsolution.of}
+    return special[name](network, **form) if name in special else network(**form)
 
 
 # A state cost whose mean is within this factor of 1 is of an ordinary size.

@@ -10,10 +10,11 @@ from torch import Tensor, nn
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, certify_policy, in_float64, table
 from ocp_torch.certificate.external.black_box import BlackBox, require_limit
 from ocp_torch.certificate.settings import require_possible
-from ocp_torch.control.controller import Controller, problem_name
+from ocp_torch.control.controller import Controller
+from ocp_torch.control.described import described, problem_name
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import InputError, require_flag, require_integer
-from ocp_torch.fields import Fields
+from ocp_torch.fields import Fields, Subsolution
 from ocp_torch.fields.fields import VALUE, cost_unit
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import SAMPLERS, scrambled_sobol
@@ -63,13 +64,13 @@ def certify(
     network = build_network(defaults["model"])
     policy = policy_of(controller, problem)
     steps = defaults["trainer"]["steps"] if train_steps is None else require_integer("train_steps", train_steps, 0)
-    steps = 0 if value is not None else steps
+    steps, kept = 0 if value is not None else steps, None
     if steps:
         value = in_float64(train_value(problem, constants, network, steps, defaults, seed)).value
     elif value is not None:
-        value = value_of(value, problem)
+        value, kept = value_of(value, problem), kept_of(value, problem)
     run = Run(problem_name(problem), "given", seed, steps, steps * defaults["trainer"]["batch"])
-    return certify_policy(problem, policy, value, network, constants, settings, run)
+    return certify_policy(problem, policy, value, network, constants, settings, run, kept=kept)
 
 
 def _defaults(problem: Problem, certificate: dict) -> dict:
@@ -127,6 +128,13 @@ def value_of(value: Field | Controller, problem: Problem) -> Field:
         shape = tuple(getattr(out, "shape", ()))
         raise InputError(f"value gave {shape} for states (2, {problem.dim}), but must give finite numbers (N,).")
     return value
+
+
+def kept_of(value: Field | Controller, problem: Problem) -> Subsolution | None:
+    """What the lower bound of ``value``, a controller's, is of, where that was trained for this very ``problem``."""
+    if not isinstance(value, Controller) or value.fields.subsolution is None:
+        return None
+    return in_float64(value.fields.subsolution) if described(value.problem) == described(problem) else None
 
 
 def arguments(config: dict) -> dict:

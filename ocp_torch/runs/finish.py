@@ -1,6 +1,7 @@
 """The end of a run: what it hands out, also where it could not go on, and whether all of that is there."""
 
 import contextlib
+import copy
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 from ocp_torch.certificate import Certificate, CertificateSettings
 from ocp_torch.control.controller import FILE_NAME, Controller
 from ocp_torch.errors import InputError, StorageError
-from ocp_torch.fields import Fields
+from ocp_torch.fields import SUBSOLUTION, Fields
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.maths.seeds import generators_kept
 from ocp_torch.problems.blame import blamed
@@ -127,10 +128,13 @@ def glimpse(trainer: Trainer) -> dict[str, np.ndarray]:
 
 
 def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields: Fields) -> Controller:
-    """The controller of policy ``kind`` that ``trainer`` hands out, from its averaged ``fields``."""
+    """The controller of policy ``kind`` that ``trainer`` hands out, from its averaged ``fields``, with what the lower bound
+    of ``certificate`` is of."""
+    proof, like = certificate.subsolution, next(fields.parameters())
+    beside = {} if proof is None else {SUBSOLUTION: copy.deepcopy(proof).to(like)}
     return Controller(
         problem=trainer.problem,
-        fields=fields,
+        fields=Fields({**fields.networks, **beside}),
         constants=trainer.constants,
         occupation=trainer.objective.occupation,
         kind=kind,

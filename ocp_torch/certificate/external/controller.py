@@ -22,6 +22,7 @@ from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
 from ocp_torch.control.policies import Policy, ValuePolicy
 from ocp_torch.fields.fields import Fields
+from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.maths.jets import Field
 
 # The name under which its performance stands in a certificate.
@@ -30,12 +31,13 @@ GIVEN = "given"
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ControllerContext(Context):
-    """``policy`` is the controller; ``value`` (float64), any `V`, says how far from optimal it is at most; ``network`` makes
-    the networks for `V^u` and `mu^u`. Raises `InputError` where the policy fails."""
+    """``policy`` is the controller; ``value`` (float64), any `V`, says how far from optimal it is at most, for which ``kept``
+    was trained before; ``network`` makes the networks for `V^u` and `mu^u`. Raises `InputError` where the policy fails."""
 
     policy: Policy
     value: Field | None
     network: Callable[..., nn.Module]
+    kept: Subsolution | None = None
 
     external = True
     kind = GIVEN

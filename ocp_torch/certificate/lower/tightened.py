@@ -18,6 +18,7 @@ from torch import nn
 
 from ocp_torch.certificate.lower.worst import WorstStates
 from ocp_torch.fields.fields import VALUE, Fields, cost_unit
+from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import SobolSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
@@ -25,7 +26,6 @@ from ocp_torch.objectives.levelled import LevelledDual
 from ocp_torch.objectives.objective import Phase
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
-from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import advance, short_fit
 from ocp_torch.steppers.nonfinite import NonFiniteError
 
@@ -52,10 +52,10 @@ def new_states(problem: Problem, batch: int) -> int:
     return sum(whole * states // BATCH for _, whole, _ in rounds_of(problem)) * states
 
 
-def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> Iterator[tuple[Field, Samples] | None]:
-    """`W` for ``value`` `V`, and states where its slack is largest, both in float64, after each round of training in float32
-    on up to ``batch`` states a step, and `None` after each step; nothing where `V` has no weights, nothing more where these
-    do not stay finite. Fewer states than `BATCH` are for a quick certificate, with as many times fewer steps."""
+def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> Iterator[Subsolution | None]:
+    """`W` for ``value`` `V`, in float64, after each round of training in float32 on up to ``batch`` states a step, and `None`
+    after each step; nothing where `V` has no weights, nothing more where these do not stay finite. Fewer states than `BATCH`
+    are for a quick certificate, with as many times fewer steps."""
     if not isinstance(value, nn.Module) or not any(True for _ in value.parameters()):
         return
     objective, unit = LevelledDual(problem), cost_unit(problem)
@@ -77,5 +77,4 @@ def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> 
         except NonFiniteError:
             return
         fields.load_state_dict(average.module.state_dict())
-        W = copy.deepcopy(fields.value).requires_grad_(False).double()
-        yield W, problem.samples(draw.worst.x.double(), divergences=False)
+        yield Subsolution(copy.deepcopy(fields.value), draw.worst.x).requires_grad_(False).double()
