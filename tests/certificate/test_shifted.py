@@ -19,7 +19,7 @@ from ocp_torch.certificate.lower.shifted import Shift, climbed, highest, scaled_
 from ocp_torch.certificate.lower.slack import TOP, SlackParts, slack_function
 from ocp_torch.certificate.lower.tightened import tightened
 from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.fields import Fields, PeriodicMLP
+from ocp_torch.fields import Fields, PeriodicMLP, Subsolution
 from ocp_torch.maths.ahead import Ahead
 from ocp_torch.maths.jets import jet
 from ocp_torch.problems import Circle, Simulator
@@ -312,7 +312,7 @@ def test_v_is_trained_on_where_there_is_enough_to_gain(problem, heights, trained
     def rounds(*_):
         for W in later:
             asked.append(W)
-            yield W, sets[0].take(slice(0, 4))
+            yield Subsolution(W, sets[0].x[:4])
 
     monkeypatch.setattr("ocp_torch.certificate.lower.sampled.tightened", rounds)
     monkeypatch.setattr("ocp_torch.certificate.lower.sampled.mollified_shift", lambda best: best)
@@ -324,6 +324,8 @@ def test_v_is_trained_on_where_there_is_enough_to_gain(problem, heights, trained
     assert asked == (later if trained else [])
     # Its supremum is sought at the states that training found worst, too.
     assert len(found.best.beside) == (found.best.value is not V)
+    # And it is kept, where the bound is of it.
+    assert (found.subsolution is None) == (found.best.value is V)
 
 
 @pytest.mark.nightly
