@@ -23,8 +23,6 @@ settings.load_profile("repeatable")
 
 # Files that take longest: begun first, so that of several processes none waits for another at the end.
 LONGEST = ("test_readme.py", "test_killed.py", "test_adversarial.py", "test_warm_start.py", "test_export.py")
-
-
 BEGUN = time.monotonic()
 
 
@@ -42,10 +40,12 @@ def pytest_runtest_setup(item):
 
 
 def pytest_collection_modifyitems(items):
-    """The longest files, then those with most tests: what is begun last is short."""
+    """The longest files, with those of most tests in between: what is begun last is short."""
     many = Counter(item.path for item in items)
-    place = lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST)
-    items.sort(key=lambda item: (place(item), -many[item.path], item.path))
+    others = sorted((path for path in many if path.name not in LONGEST), key=lambda path: (-many[path], path))
+    place = {path: 2 * k + 1 for k, path in enumerate(others)}
+    place |= {path: 2 * LONGEST.index(path.name) for path in many if path.name in LONGEST}
+    items.sort(key=lambda item: place[item.path])
 
 
 @pytest.fixture(autouse=True, scope="session")
