@@ -100,7 +100,7 @@ def hand_out(
     write_atomically(folder / MARK, lambda path: path.write_text("a resume makes what is missing\n"))
     named = certificate.controller or certificate.subject
     kind = named or ("value" if fields.value is not None else "density")
-    controller = controller_of(trainer, certificate, kind, fields)
+    controller = controller_of(trainer, certificate, kind, with_subsolution(fields, certificate))
     controller.save(folder / FILE_NAME)
     write_atomically(folder / "certificate.json", certificate.save)
     drawn: dict = {}
@@ -127,14 +127,18 @@ def glimpse(trainer: Trainer) -> dict[str, np.ndarray]:
         return canvas.drawn(Shown(trainer.problem, trainer.averaged_fields, *how, quick=True).figures())
 
 
+def with_subsolution(fields: Fields, certificate: Certificate) -> Fields:
+    """``fields``, and what the lower bound of ``certificate`` is of, where that is none of them."""
+    if certificate.subsolution is None:
+        return fields
+    return Fields({**fields.networks, SUBSOLUTION: copy.deepcopy(certificate.subsolution).to(next(fields.parameters()))})
+
+
 def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields: Fields) -> Controller:
-    """The controller of policy ``kind`` that ``trainer`` hands out, from its averaged ``fields``, with what the lower bound
-    of ``certificate`` is of."""
-    proof, like = certificate.subsolution, next(fields.parameters())
-    beside = {} if proof is None else {SUBSOLUTION: copy.deepcopy(proof).to(like)}
+    """The controller of policy ``kind`` that ``trainer`` hands out, from its averaged ``fields``."""
     return Controller(
         problem=trainer.problem,
-        fields=Fields({**fields.networks, **beside}),
+        fields=fields,
         constants=trainer.constants,
         occupation=trainer.objective.occupation,
         kind=kind,
