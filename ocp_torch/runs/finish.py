@@ -131,7 +131,9 @@ def with_subsolution(fields: Fields, certificate: Certificate) -> Fields:
     """``fields``, and what the lower bound of ``certificate`` is of, where that is none of them."""
     if certificate.subsolution is None:
         return fields
-    return Fields({**fields.networks, SUBSOLUTION: copy.deepcopy(certificate.subsolution).to(next(fields.parameters()))})
+    return Fields(
+        {**fields.networks, SUBSOLUTION: copy.deepcopy(certificate.subsolution).to(next(fields.parameters()))}
+    )
 
 
 def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields: Fields) -> Controller:
