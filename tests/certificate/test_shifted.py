@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from ocp_torch.certificate import Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.estimate import replicated_samples
-from ocp_torch.certificate.lower.mollified import DIRECTIONS, EVALUATIONS, Mollified
+from ocp_torch.certificate.lower.mollified import DIRECTIONS, EVALUATIONS, Mollified, mollified_shift
 from ocp_torch.certificate.lower.sampled import SampledValue, attainable
 from ocp_torch.certificate.lower.shifted import Shift, climbed, highest, scaled_by
-from ocp_torch.certificate.lower.slack import TOP, SlackParts, slack_function
+from ocp_torch.certificate.lower.slack import TOP, Peaks, SlackParts, slack_function
 from ocp_torch.certificate.lower.tightened import tightened
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.fields import Fields, PeriodicMLP, Subsolution
@@ -68,6 +68,20 @@ def test_a_peak_of_the_slack_in_a_hollow_counts():
     other = replace(shift, value=lambda x: problem.state_cost(x) + 0.065 * torch.cos(2.0 * math.pi * x[:, 1]))
     assert shift.bound < other.bound < shift.looked.bound
     assert highest([shift, other]) is highest([other, shift]) is other
+
+
+def test_a_peak_that_was_found_is_looked_at_in_averages_too(monkeypatch):
+    problem = Still()
+    value = lambda x: problem.state_cost(x) + 0.1 * hidden_peak(x)
+    sets = replicated_samples(problem, 1024, 8, seed=0, divergences=False)
+    own = Shift(problem, value, sets, ascents=32, beside=[])
+    assert own.bound < own.looked.bound - 0.04
+    # Averages over so small a radius have it nearly as high, and here a search among them finds nothing.
+    monkeypatch.setattr("ocp_torch.certificate.lower.mollified.RADII", (2.0**-9,))
+    monkeypatch.setattr(
+        "ocp_torch.certificate.lower.shifted.steep_peaks", lambda *_: Peaks(torch.zeros(0, 2).double(), 0)
+    )
+    assert mollified_shift(own).bound < own.looked.bound - 0.02
 
 
 @zoo.on(zoo.FEW)

@@ -73,7 +73,10 @@ def mollified_shift(own: Shift) -> Shift:
     """
     slack = SlackParts.join(own.parts).slack(own.theta)
     worst = Samples.concatenate(own.sets).take(slack.topk(min(WORST, len(slack))).indices)
-    worst = Samples.concatenate([worst, *own.beside])
+    # A peak that stands where the slack is low is an average's too: of six oscillators a search among averages missed one of
+    # .4 % of the bound that the search before had found.
+    steep = [own.problem.samples(own.peaks.x, divergences=False)] if len(own.peaks.x) else []
+    worst = Samples.concatenate([worst, *own.beside, *steep])
     few = [samples.take(slice(0, max(1, FEW // len(own.sets)))) for samples in own.sets]
 
     def averaged(radius: float, sets: list[Samples], ascents: int) -> Shift:

@@ -14,7 +14,16 @@ from typing import TYPE_CHECKING, NamedTuple
 from ocp_torch.certificate.bound import LOWER, Bound, sentence_on
 from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
 from ocp_torch.certificate.estimate import Estimate, integrals
-from ocp_torch.certificate.lower.slack import STARTS, TOP, Scaled, SlackParts, climbed_from, slack_function, steep_peaks
+from ocp_torch.certificate.lower.slack import (
+    STARTS,
+    TOP,
+    Peaks,
+    Scaled,
+    SlackParts,
+    climbed_from,
+    slack_function,
+    steep_peaks,
+)
 from ocp_torch.fields.rounded import rounded
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.supremum import Extremum, minimiser
@@ -88,14 +97,18 @@ class Shift:
         return self._scaled(self._sampled, self._plain)
 
     @cached_property
-    def found(self) -> Scaling:
-        """By what is sought in steep places too."""
+    def peaks(self) -> Peaks:
+        """Where ascents from steep places end, as far as more than what is known is in reach there."""
         slack, rough = (slack_function(self.problem, value) for value in (self.value, rounded(self.value)))
         starts = STARTS * self.ascents
         if self.radius:  # its peaks are as wide as that, and every value is of many states
             starts = max(1, starts // AVERAGED)
-        best = self.looked
-        peaks = steep_peaks(slack, rough, self.problem.dim, starts, self._plain.value, best.initial)
+        return steep_peaks(slack, rough, self.problem.dim, starts, self._plain.value, self.looked.initial)
+
+    @cached_property
+    def found(self) -> Scaling:
+        """By what is sought in steep places too."""
+        best, peaks = self.looked, self.peaks
         if len(peaks.x):
             there = Samples.of(self.problem, peaks.x, divergences=False)
             everywhere = SlackParts.join([self._sampled, *self._parts_on([there])])

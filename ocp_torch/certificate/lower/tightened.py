@@ -7,7 +7,8 @@ peaks, so that the supremum is found more surely: on two independent sets of 131
 differed by 0.8 %, of `W` by 0.02 %. Those that are left stand in hollows, where ascents from the largest values do not lead:
 they hid up to 0.3 % of a bound. So peaks are sought in steep places too, in training and by the bound (`steep_peaks`): of
 six `W` in two and three coordinates eight more searches, of other states, then took at most 0.001 % off their bounds. In
-five, of six oscillators, they still took 0.6 %, and 0.3 % off the bound of their average.
+five, of six oscillators, they still took 0.6 %, and 0.3 % off the bound of their average, before that was looked at where its
+own peaks are.
 """
 
 import copy
