@@ -204,8 +204,8 @@ def _rebuilt(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
         raise InputError(f"{path} names the unknown model {model['name']!r}; known are {', '.join(MODELS)}.")
     network, options = MODELS[model["name"]], {k: v for k, v in model.items() if k != "name"}
     outputs = {CONTROL_DENSITY: problem.control_dim}  # the other fields are scalar
-    states = {SUBSOLUTION: {"states": len(tensors[WORST])}} if SUBSOLUTION in names else {}
-    form = lambda name: dict(dim=problem.dim, outputs=outputs.get(name), **states.get(name, {}), **options)
+    states = lambda name: {"states": len(tensors[WORST])} if name == SUBSOLUTION else {}
+    form = lambda name: dict(dim=problem.dim, outputs=outputs.get(name), **states(name), **options)
     build = lambda: Fields({name: made(name, network, **form(name)) for name in names})
     with torch.device("meta"):
         # Shapes first, without memory: a crafted size must not be allocated before it is refused.

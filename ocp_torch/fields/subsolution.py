@@ -4,9 +4,6 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from ocp_torch.maths import jets
-from ocp_torch.maths.jets import Jet
-
 
 class Subsolution(nn.Module):
     """``network`` `W`, ``(N, d) -> (N,)``, and ``worst`` ``(K, d)``, where its slack was found to be largest: a search for
@@ -21,13 +18,9 @@ class Subsolution(nn.Module):
 
     @classmethod
     def of(cls, network: Any, dim: int, states: int = 0, **form: Any) -> "Subsolution":
-        """One of so many ``states``, to be loaded; ``network`` makes what it is of."""
+        """One with room for so many ``states``, to load weights and states into; ``network`` makes its network."""
         made = network(dim=dim, **form)
         return cls(made, next(made.parameters()).new_zeros(states, dim))
 
     def forward(self, x: Tensor) -> Tensor:
         return self.network(x)
-
-    def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
-        """The jet at states ``(N, d)`` with noise ``sigma`` ``(N, d, k)``, as `jets.jet` has it."""
-        return jets.jet(self.network, x, sigma)

@@ -64,11 +64,12 @@ def certify(
     network = build_network(defaults["model"])
     policy = policy_of(controller, problem)
     steps = defaults["trainer"]["steps"] if train_steps is None else require_integer("train_steps", train_steps, 0)
-    steps, kept = 0 if value is not None else steps, None
+    steps = 0 if value is not None else steps
+    kept = None if value is None else kept_of(value, problem)
     if steps:
         value = in_float64(train_value(problem, constants, network, steps, defaults, seed)).value
     elif value is not None:
-        value, kept = value_of(value, problem), kept_of(value, problem)
+        value = value_of(value, problem)
     run = Run(problem_name(problem), "given", seed, steps, steps * defaults["trainer"]["batch"])
     return certify_policy(problem, policy, value, network, constants, settings, run, kept=kept)
 

@@ -88,10 +88,11 @@ def test_where_v_itself_gives_the_bound_nothing_lies_beside_it(tmp_path):
     assert load_controller(tmp_path).fields.subsolution is None
 
 
-def test_the_controller_is_what_it_is_without(run, tmp_path):
+def test_the_controller_is_what_it_is_without_in_a_file_of_the_schema_before(run, tmp_path):
     tensors, metadata = load_tensors(run / "controller.safetensors")
     kept = {name: t for name, t in tensors.items() if "subsolution" not in name}
     metadata["fields"].remove("subsolution")
+    metadata["schema"] = 1
     save_tensors(tmp_path / "controller.safetensors", kept, metadata)
     x = torch.rand(50, 1, dtype=torch.float64)
     assert torch.equal(load_controller(run)(x), load_controller(tmp_path)(x))
