@@ -121,11 +121,11 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
         u = torch.as_tensor(np.asarray(action), dtype=torch.float64).reshape(1, -1).clamp(-1.0, 1.0)
         u = problem.control_cost.within(torch.as_tensor(self.control_bound) * u, torch.ones(1, dtype=torch.float64))
         middle = self.x + 0.5 * h * problem.velocity(self.x, u)
-        cost = float(problem.state_cost(middle) + problem.control_cost.cost(u))
-        self.x = (self.x + h * problem.velocity(middle, u) + self._kick()).remainder(1.0)
+        velocity, cost = problem.motion(middle, u)
+        self.x = (self.x + h * velocity + self._kick()).remainder(1.0)
         self.elapsed += h
         done = self.elapsed >= self.horizon * (1.0 - 1e-9)
-        return observe(self.x), -self._weight * cost, False, done, {**self._info(u), "cost": cost}
+        return observe(self.x), -self._weight * float(cost), False, done, {**self._info(u), "cost": float(cost)}
 
     def _kick(self) -> torch.Tensor | float:
         """`sigma dW` over one step, ``(1, d)``; 0 where there is no noise."""

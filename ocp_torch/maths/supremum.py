@@ -104,6 +104,17 @@ def climb(
     return x, best
 
 
+def extremes(function: Callable[[Tensor], Tensor], x: Tensor, met: Tensor, count: int, steps: int) -> Tensor:
+    """Where so many ``steps`` of descents of ``function`` end, and of ascents, ``(K, d)``, from the ``count`` states of ``x``
+    ``(N, d)`` with the smallest and from those with the largest of its values ``met`` ``(N,)`` there."""
+    count = min(count, len(met))
+    start = torch.cat([(-met).topk(count).indices, met.topk(count).indices])
+    sign = torch.ones_like(met[start])
+    sign[:count] = -1.0
+    ends, _ = climb(lambda at: sign * function(at), x[start], sign * met[start], steps if count else 0)
+    return ends.remainder(1.0)
+
+
 @torch.no_grad()
 def peaks_in_reach(
     function: Callable[[Tensor], Tensor], points: Tensor, starts: int, above: float = -math.inf

@@ -2,12 +2,11 @@
 
 from collections.abc import Callable
 
-import torch
 from torch import Tensor
 
 from ocp_torch.maths import jets
 from ocp_torch.problems.problem import Problem, VectorFields
-from ocp_torch.problems.samples import Samples
+from ocp_torch.problems.samples import Samples, driven
 
 
 class ClosedLoop(Problem):
@@ -31,7 +30,7 @@ class ClosedLoop(Problem):
         return [Samples.concatenate(pieces(samples)) for samples in sets]
 
     def state_cost(self, x: Tensor) -> Tensor:
-        return self._paid(x, self.policy(x))
+        return self.problem.state_cost(x) + self.problem.control_cost.cost(self.policy(x))
 
     def drift(self, x: Tensor) -> Tensor:
         return self.problem.velocity(x, self.policy(x))
@@ -41,27 +40,23 @@ class ClosedLoop(Problem):
         return self.vector_fields(x)[2]
 
     def vector_fields(self, x: Tensor, divergences: bool = True) -> VectorFields:
-        return self._controlled(x, divergences)[1]
+        return self._controlled(x, self.problem.vector_fields(x, divergences))[1]
 
     def cost_and_fields(self, x: Tensor, divergences: bool = True) -> tuple[Tensor, VectorFields]:
-        u, fields = self._controlled(x, divergences)
-        return self._paid(x, u), fields
+        f, fields = self.problem.cost_and_fields(x, divergences)
+        u, own = self._controlled(x, fields)
+        return f + self.problem.control_cost.cost(u), own
 
-    def _controlled(self, x: Tensor, divergences: bool) -> tuple[Tensor, VectorFields]:
-        """The control ``(N, m)``, asked for once, and the `vector_fields`."""
-        a, B, div_a, div_B = self.problem.vector_fields(x, divergences)
+    def _controlled(self, x: Tensor, fields: VectorFields) -> tuple[Tensor, VectorFields]:
+        """The control ``(N, m)``, asked for once, and the `vector_fields`, from those of the problem."""
+        a, B, div_a, div_B = fields
         if div_a is None or div_B is None:
             u, divergence = self.policy(x), None
         else:
             own = getattr(self.policy, "flux_divergence", None) if jets.is_data(x) else None
             u, flux = jets.control_flux_divergence(self.policy, x, B, div_B) if own is None else own(x, B, div_B)
             divergence = div_a + flux
-        velocity = a + torch.einsum("ndm,nm->nd", B, u)
-        return u, (velocity, self.control_matrix(x), divergence, self.control_divergence(x))
-
-    def _paid(self, x: Tensor, u: Tensor) -> Tensor:
-        """`f + R(u)`, ``(N,)``, of controls ``u`` ``(N, m)``."""
-        return self.problem.state_cost(x) + self.problem.control_cost.cost(u)
+        return u, (driven(a, B, u), self.control_matrix(x), divergence, self.control_divergence(x))
 
     def control_matrix(self, x: Tensor) -> Tensor:
         return x.new_zeros(len(x), self.dim, 1)

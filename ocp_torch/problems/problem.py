@@ -20,7 +20,7 @@ from ocp_torch.problems.physical.measures import Measures
 from ocp_torch.problems.placed import Placed
 from ocp_torch.problems.played import Played
 from ocp_torch.problems.reproducible import Reproducible
-from ocp_torch.problems.samples import Samples
+from ocp_torch.problems.samples import Samples, driven
 
 # With more, `B` alone would take over 8 GB for a batch of a thousand states.
 MOST_COORDINATES = 1024
@@ -167,9 +167,7 @@ class Problem(Reproducible, Placed, Played):
 
     def drift_divergence(self, x: Tensor) -> Tensor | None:
         """`div a`, ``(N,)``: by autograd through `drift`. Override where it is known, or give `None`."""
-        if self.driftless:
-            return torch.zeros_like(x[:, 0])
-        return jets.divergence(self.drift, x)
+        return torch.zeros_like(x[:, 0]) if self.driftless else jets.divergence(self.drift, x)
 
     def control_divergence(self, x: Tensor) -> Tensor | None:
         """The divergence of each column of `B`, ``(N, m)``; by forward-mode autograd unless `B` is constant."""
@@ -243,5 +241,9 @@ class Problem(Reproducible, Placed, Played):
 
     def velocity(self, x: Tensor, u: Tensor) -> Tensor:
         """`a(x) + B(x) u`, ``(N, d)``."""
-        pushed = torch.einsum("ndm,nm->nd", self.control_matrix(x), u)
-        return pushed if self.driftless else self.drift(x) + pushed
+        return driven(*self.vector_fields(x, divergences=False)[:2], u)
+
+    def motion(self, x: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
+        """`velocity` and the rate of cost `f(x) + R(u)`, ``(N,)``."""
+        f, (a, B, _, _) = self.cost_and_fields(x, divergences=False)
+        return driven(a, B, u), f + self.control_cost.cost(u)

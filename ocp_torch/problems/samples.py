@@ -14,6 +14,11 @@ if TYPE_CHECKING:
     from ocp_torch.problems.problem import Problem
 
 
+def driven(a: Tensor, B: Tensor, u: Tensor) -> Tensor:
+    """The velocity `a + B u`, ``(N, d)``."""
+    return a + torch.einsum("ndm,nm->nd", B, u)
+
+
 @dataclass(frozen=True)
 class Samples:
     """A problem's data at `N` states.
@@ -75,6 +80,10 @@ class Samples:
 
     def __len__(self) -> int:
         return self.x.shape[0]
+
+    def velocity(self, u: Tensor) -> Tensor:
+        """`a + B u`, ``(N, d)``, under controls ``(N, m)``."""
+        return driven(self.a, self.B, u)
 
     def mean(self, integrand: Tensor) -> Tensor:
         """The weighted mean of ``integrand`` ``(N,)``: an estimate of its integral over the torus."""

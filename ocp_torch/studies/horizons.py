@@ -48,7 +48,7 @@ def play(problem: Problem, control: Control, x0: np.ndarray, step: float, steps:
             began = time.perf_counter()
             u = torch.as_tensor(control(x[0].numpy())).unsqueeze(0)
             spent += time.perf_counter() - began
-            held = lambda y, u=u: (problem.velocity(y, u), problem.state_cost(y) + problem.control_cost.cost(u))
+            held = lambda y, u=u: problem.motion(y, u)
             part, x = discounted_integral(held, x, problem.discount, step, WITHIN, wrap=False)
             total += math.exp(-problem.discount * k * step) * float(part)
         costs.append(total)

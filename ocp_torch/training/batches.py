@@ -134,7 +134,7 @@ class Batches:
         ``(k, d)``; and the part of `STEP_TIME` it took, ``(k,)``."""
         policy, rho = ValuePolicy(self.problem, self.fields.value), self.problem.discount
         u = policy(at.x)
-        velocity = at.a + torch.einsum("ndm,nm->nd", at.B, u)
+        velocity = at.velocity(u)
         time = (LONGEST_STEP / velocity.norm(dim=-1).clamp_min(1e-12)).clamp_max(STEP_TIME / rho)
         moved = at.x + time.unsqueeze(-1) * velocity
         if at.noise is not None:

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.lower.slack import slack_function, slack_peaks
+from ocp_torch.certificate.lower.slack import slack_function
 from ocp_torch.certificate.trained import in_float64
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import SobolSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
-from ocp_torch.maths.supremum import batched
+from ocp_torch.maths.supremum import batched, extremes
 from ocp_torch.problems import Problem
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
@@ -124,7 +124,7 @@ def worst_states(problem: Problem, value: Field, x: Tensor) -> tuple[Tensor, flo
     """Where ascents from the states ``x`` ``(N, d)`` with the largest and the smallest slack of ``value`` end, ``(K, d)``,
     and the largest slack there, whatever its sign."""
     slack = slack_function(problem, value)
-    ends = slack_peaks(slack, x, batched(slack, x), PEAKS, CLIMBED)
+    ends = extremes(slack, x, batched(slack, x), PEAKS, CLIMBED)
     return ends, float(slack(ends).abs().max())
 
 

@@ -5,14 +5,14 @@ import math
 import pytest
 import torch
 
-from ocp_torch.certificate.lower.slack import slack_function, slack_peaks
+from ocp_torch.certificate.lower.slack import slack_function
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.certificate.upper.lowered import UNCHANGED, Above, LoweredSlack, Lowering, Met
 from ocp_torch.certificate.upper.multiples import terms_on
 from ocp_torch.certificate.upper.policy_evaluation import positive_weight
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.maths.jets import reverse_jet
-from ocp_torch.maths.supremum import value_and_gradient
+from ocp_torch.maths.supremum import extremes, value_and_gradient
 from ocp_torch.problems import Manufactured
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.generator import Generator
@@ -178,7 +178,7 @@ def test_peaks_of_the_slack_are_of_both_signs():
     value = lambda x: problem.exact_value(x) + 0.01 * torch.sin(2.0 * math.pi * x[:, 0])
     x = torch.rand(2048, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     slack = lambda at: slack_function(problem, value)(at).detach()
-    found = slack_peaks(slack_function(problem, value), x, slack(x), PEAKS, CLIMBED)
+    found = extremes(slack_function(problem, value), x, slack(x), PEAKS, CLIMBED)
     assert found.shape == (2 * PEAKS, 2)
     assert bool((slack(found[:PEAKS]) <= -(-slack(x)).topk(PEAKS).values + 1e-12).all())
     assert bool((slack(found[PEAKS:]) >= slack(x).topk(PEAKS).values - 1e-12).all())

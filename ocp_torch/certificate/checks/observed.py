@@ -17,7 +17,7 @@ from ocp_torch.control.policies import Policy
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
-from ocp_torch.problems.samples import Samples
+from ocp_torch.problems.samples import Samples, driven
 
 # Of each set of samples: states at which the control is looked at, and states that lines are drawn through in search of
 # jumps. More find rarer ones and take longer.
@@ -114,7 +114,7 @@ def largest_jump(policy: Policy, dim: int, problem: Problem | None = None, near:
         u, noise = policy(x), problem.noise(x) if problem.noisy else None
         found = {} if problem.driftless else {DRIFT: a}
         found |= {MATRIX: B.flatten(1)} | ({} if noise is None else {NOISE: noise.flatten(1)})
-        return found | {CONTROLLER: u, LOOP: a + torch.einsum("ndm,nm->nd", B, u)}
+        return found | {CONTROLLER: u, LOOP: driven(a, B, u)}
 
     generator = fixed_generator()
     draw = partial(torch.rand, dtype=torch.float64, generator=generator)

@@ -77,16 +77,6 @@ def slack_function(problem: Problem, value: Field):
     return slack
 
 
-def slack_peaks(slack: Field, x: Tensor, met: Tensor, count: int, steps: int) -> Tensor:
-    """Where so many ``steps`` of ascents of ``slack`` end, ``(K, d)``, from the ``count`` states of ``x`` ``(N, d)`` with the
-    smallest and from those with the largest of its values ``met`` ``(N,)`` there."""
-    ends, count = [], min(count, len(met))
-    for function, found in ((lambda at: -slack(at), -met), (slack, met)):
-        start, index = found.topk(count)
-        ends.append(climb(function, x[index], start, steps if count else 0)[0].remainder(1.0))
-    return torch.cat(ends)
-
-
 class Peaks(NamedTuple):
     """States ``(K, d)`` where so many ``ascents`` ended."""
 

@@ -57,14 +57,13 @@ class FeedbackLoop:
         """Velocities and rates, see `Dynamics`."""
         problem, x = self.problem, state[:, : self.problem.dim]
         if self.value is None:
-            u = self.policy(x)
-            return problem.velocity(x, u), problem.state_cost(x) + problem.control_cost.cost(u)
+            return problem.motion(x, self.policy(x))
         samples = Samples.of(problem, x, divergences=False)
         generator = Generator.of(problem, samples)
         V = generator.jet(self.value)
         own = isinstance(self.policy, ValuePolicy) and self.policy.value is self.value
         u = self.policy.control(samples.B, V) if own else self.policy(x)  # type: ignore[attr-defined]
-        velocity, rate = samples.a + torch.einsum("ndm,nm->nd", samples.B, u), -generator.bellman_slack(V, u)
+        velocity, rate = samples.velocity(u), -generator.bellman_slack(V, u)
         if not self.summed:
             return velocity, rate
         change = (V.gradient * velocity).sum(dim=-1, keepdim=True)
@@ -90,9 +89,8 @@ class HeldLoop:
     def __call__(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Velocities and rates, see `Dynamics`."""
         problem = self.problem
-        x, u = state.split([problem.dim, problem.control_dim], dim=-1)
-        rate = problem.state_cost(x) + problem.control_cost.cost(u)
-        return pad(problem.velocity(x, u), (0, problem.control_dim)), rate
+        velocity, rate = problem.motion(*state.split([problem.dim, problem.control_dim], dim=-1))
+        return pad(velocity, (0, problem.control_dim)), rate
 
     def noise(self, state: Tensor) -> Tensor:
         """`sigma` at a state: nothing of it moves the control."""

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.estimate import integral
-from ocp_torch.certificate.lower.slack import STARTS, TOP, Peaks, slack_peaks, steep_peaks
+from ocp_torch.certificate.lower.slack import STARTS, TOP, Peaks, steep_peaks
 from ocp_torch.certificate.upper.multiples import Terms, best_multiple
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields.rounded import rounded
 from ocp_torch.maths.jets import Field, Jet
-from ocp_torch.maths.supremum import Extremum, minimiser
+from ocp_torch.maths.supremum import Extremum, extremes, minimiser
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.generator import Generator, pull_back
 from ocp_torch.problems.samples import Samples
@@ -161,7 +161,7 @@ class LoweredSlack:
     @torch.no_grad()
     def climb(self, how: Lowering, ascents: int, steps: int = 60) -> None:
         """Meet the ends of so many ``steps`` of ``ascents`` from where the slack of `W` is smallest and largest."""
-        self._meet(slack_peaks(self._slack_of(how, self.value), self.met.x, self.met.of(how), ascents, steps))
+        self._meet(extremes(self._slack_of(how, self.value), self.met.x, self.met.of(how), ascents, steps))
 
     @torch.no_grad()
     def seek(self, how: Lowering, ascents: int) -> bool:

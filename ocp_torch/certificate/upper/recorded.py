@@ -66,7 +66,7 @@ def closed_loop_samples(samples: Samples, policy: Policy, cost: PowerCost) -> Sa
     for part in samples.split(CHUNK):
         div_a, div_B = part.require_divergences("the closed loop")
         u, flux = control_flux_divergence(policy, part.x, part.B, div_B)
-        flow = part.a + torch.einsum("ndm,nm->nd", part.B, u)
+        flow = part.velocity(u)
         pieces.append(replace(part, f=part.f + cost.cost(u), a=flow, div_a=div_a + flux))
     loop = Samples.concatenate(pieces)
     return replace(loop, B=torch.zeros_like(loop.x).unsqueeze(-1), div_B=torch.zeros_like(loop.x[:, :1]))

@@ -9,13 +9,14 @@ Choose periodic `V0`, `B`, `sigma`, `q`, and densities `mu0`, `mu* > 0`. Then `u
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ocp_torch.errors import InputError, require_flag, require_integer, require_number
 from ocp_torch.maths.sampling import scrambled_sobol
-from ocp_torch.maths.supremum import supremum
+from ocp_torch.maths.supremum import batched, extremes, supremum
 from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.exact.trigonometric import (
     TrigonometricField,
@@ -23,12 +24,26 @@ from ocp_torch.problems.exact.trigonometric import (
     WavyMatrix,
     random_polynomial,
 )
-from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.problem import Problem, VectorFields
+from ocp_torch.problems.samples import driven
 
 # States searched for the extrema of u* and f, and the ascents from the best of them with their steps: the truth claimed is as
 # exact as these extrema.
 SEARCH_POINTS = 2**14
 ASCENTS, ASCENT_STEPS = 64, 100
+
+
+class Parts(NamedTuple):
+    """What cost, drift and divergences at the same states have in common."""
+
+    B: Tensor  # (N, d, m)
+    V: Tensor  # (N,) V0
+    slope: Tensor  # (N, d) grad V0
+    density: Tensor  # (N,) mu*
+    thinning: Tensor  # (N, d) grad mu*
+    pull: Tensor  # (N, m) -B^T grad V0 / rho
+    u: Tensor  # (N, m) u*
+    loop: Tensor  # (N, d) the closed loop g* = (F + div(D mu*)) / mu*
 
 
 class Manufactured(Problem):
@@ -119,34 +134,39 @@ class Manufactured(Problem):
     def _derive(self) -> None:
         """Scale `V0` so that `sup |u*| = control_size`, then find the smallest `c` with `f >= 0`, and the bounds."""
         points = scrambled_sobol(SEARCH_POINTS, self.dim, 0, torch.float64)
-        steepest = supremum(lambda x: self._pull_back(x).norm(dim=-1), points, ASCENTS, ASCENT_STEPS).value
+        pull = lambda x: self._pull_back(self.B(x), self.V0.gradient(x))
+        steepest = supremum(lambda x: pull(x).norm(dim=-1), points, ASCENTS, ASCENT_STEPS).value
         if steepest <= 0.0:
             raise InputError(
                 f"problem.seed = {self.seed} gives a value function the control cannot change; take another."
             )
         self.V0 = self.V0.scaled(self.control_size ** (self.exponent - 1.0) / steepest)
         self.c = 0.0
-        self.c = supremum(lambda x: -self.state_cost(x), points, ASCENTS, ASCENT_STEPS).value
-        self.state_cost_bound = supremum(self.state_cost, points, ASCENTS, ASCENT_STEPS).value
+        ends = extremes(self.state_cost, points, batched(self.state_cost, points), ASCENTS, ASCENT_STEPS)
+        costs = batched(self.state_cost, ends)
+        self.c = -float(costs.min())
+        self.state_cost_bound = float(costs.max()) + self.c
         self.value_bound = self.c + float(self.V0.amplitudes.abs().sum())
         self.control_bound = min(self.control_size, self.control_cost.reach)
         self.occupation_bound = 1.0 + self.contrast
         # Both V0 and mu0 are trigonometric polynomials: their product integrates mode against mode.
         self.exact_optimum = self.c + self.V0.integral_with(self.mu0)
 
-    def _pull_back(self, x: Tensor) -> Tensor:
+    def _pull_back(self, B: Tensor, slope: Tensor) -> Tensor:
         """`-B^T grad V0 / rho`, ``(N, m)``."""
-        return -torch.einsum("ndm,nd->nm", self.B(x), self.V0.gradient(x)) / self.discount
+        return -torch.einsum("ndm,nd->nm", B, slope) / self.discount
 
-    def _closed_loop(self, x: Tensor) -> Tensor:
-        """`g* = (F + div(D mu*)) / mu*`, ``(N, d)``."""
-        flux = self.discount * self.phi.gradient(x) + self.stream(x)
-        sigma, density = self.noise(x), self.mu(x).unsqueeze(-1)
+    def _at(self, x: Tensor) -> Parts:
+        """What costs and drifts at ``x`` are made of."""
+        B, (V, slope), (density, thinning) = self.B(x), self.V0.with_gradient(x), self.mu.with_gradient(x)
+        pull = self._pull_back(B, slope)
+        flux, sigma = self.discount * self.phi.gradient(x) + self.stream(x), self.noise(x)
         if sigma is not None:
             div_D, _ = self.noise_divergences(x)
-            driven = torch.einsum("ndk,nd->nk", sigma, self.mu.gradient(x))
-            flux = flux + div_D * density + 0.5 * torch.einsum("ndk,nk->nd", sigma, driven)
-        return flux / density
+            driven = torch.einsum("ndk,nd->nk", sigma, thinning)
+            flux = flux + div_D * density.unsqueeze(-1) + 0.5 * torch.einsum("ndk,nk->nd", sigma, driven)
+        loop = flux / density.unsqueeze(-1)
+        return Parts(B, V, slope, density, thinning, pull, self.control_cost.argmax(pull), loop)
 
     def _curvature(self, function: TrigonometricPolynomial, x: Tensor) -> Tensor:
         """`D : hess` of ``function``, ``(N,)``; 0 where there is no noise."""
@@ -164,32 +184,49 @@ class Manufactured(Problem):
         return self.sigma.square_divergences(x)
 
     def state_cost(self, x: Tensor) -> Tensor:
-        along = (self.V0.gradient(x) * self._closed_loop(x)).sum(dim=-1) + self._curvature(self.V0, x)
-        return self.V0(x) - along / self.discount - self.control_cost.cost(self.exact_control(x)) + self.c
+        return self._cost(x, self._at(x))
 
     def drift(self, x: Tensor) -> Tensor:
-        pushed = torch.einsum("ndm,nm->nd", self.B(x), self.exact_control(x))
-        return self._closed_loop(x) - pushed
+        return self._drift(self._at(x))
 
     def drift_divergence(self, x: Tensor) -> Tensor:
+        return self._drift_divergence(x, self._at(x))
+
+    def vector_fields(self, x: Tensor, divergences: bool = True) -> VectorFields:
+        return self._fields(x, self._at(x), divergences)
+
+    def cost_and_fields(self, x: Tensor, divergences: bool = True) -> tuple[Tensor, VectorFields]:
+        parts = self._at(x)
+        return self._cost(x, parts), self._fields(x, parts, divergences)
+
+    def _fields(self, x: Tensor, parts: Parts, divergences: bool) -> VectorFields:
+        known = (self._drift_divergence(x, parts), self.control_divergence(x)) if divergences else (None, None)
+        return self._drift(parts), parts.B, *known
+
+    def _cost(self, x: Tensor, parts: Parts) -> Tensor:
+        along = (parts.slope * parts.loop).sum(dim=-1) + self._curvature(self.V0, x)
+        return parts.V - along / self.discount - self.control_cost.cost(parts.u) + self.c
+
+    def _drift(self, parts: Parts) -> Tensor:
+        return driven(parts.loop, parts.B, -parts.u)
+
+    def _drift_divergence(self, x: Tensor, parts: Parts) -> Tensor:
         """`div a = div g* - div(B u*)`, with `div g* = (rho (mu0 - mu*) + div div(D mu*) - grad mu* . g*) / mu*`."""
-        density, slope = self.mu(x), self.mu.gradient(x)
-        outflow = self.discount * (self.mu0(x) - density) - (slope * self._closed_loop(x)).sum(dim=-1)
+        density, slope = parts.density, parts.thinning
+        outflow = self.discount * (self.mu0(x) - density) - (slope * parts.loop).sum(dim=-1)
         if self.noisy:
             div_D, div_div_D = self.noise_divergences(x)
             outflow = outflow + self._curvature(self.mu, x) + 2.0 * (div_D * slope).sum(dim=-1) + density * div_div_D
-        return outflow / density - self._pushed_divergence(x)
+        return outflow / density - self._pushed_divergence(x, parts)
 
-    def _pushed_divergence(self, x: Tensor) -> Tensor:
+    def _pushed_divergence(self, x: Tensor, parts: Parts) -> Tensor:
         """`div(B u*) = (div B) . u* + sum_k (d u*_k along column k of B)`, ``(N,)``, in closed form."""
-        B = self.B(x)
-        p, u = self._pull_back(x), self.exact_control(x)
         # Jacobian of p = -B^T grad V0 / rho, entry (k, j) along coordinate j, from that of grad V0 and that of B.
-        jacobian = torch.einsum("nik,nij->nkj", B, self.V0.hessian(x))
-        moving = self.B.slopes(x) * self.V0.gradient(x).unsqueeze(-1)
+        jacobian = torch.einsum("nik,nij->nkj", parts.B, self.V0.hessian(x))
+        moving = self.B.slopes(x) * parts.slope.unsqueeze(-1)
         jacobian = -(jacobian + torch.einsum("nik,ikj->nkj", moving, self.B.directions(x))) / self.discount
-        moved = self.control_cost.argmax_along(p, jacobian)
-        return (self.control_divergence(x) * u).sum(dim=-1) + torch.einsum("njk,nkj->n", B, moved)
+        moved = self.control_cost.argmax_along(parts.pull, jacobian)
+        return (self.control_divergence(x) * parts.u).sum(dim=-1) + torch.einsum("njk,nkj->n", parts.B, moved)
 
     def control_matrix(self, x: Tensor) -> Tensor:
         return self.B(x)
@@ -204,7 +241,7 @@ class Manufactured(Problem):
         return self.V0(x) + self.c
 
     def exact_control(self, x: Tensor) -> Tensor:
-        return self.control_cost.argmax(self._pull_back(x))
+        return self.control_cost.argmax(self._pull_back(self.B(x), self.V0.gradient(x)))
 
     def exact_occupation(self, x: Tensor) -> Tensor:
         return self.mu(x)

@@ -62,14 +62,25 @@ class TrigonometricPolynomial(Placed):
     def _angle(self, x: Tensor) -> Tensor:
         return TURN * (x @ self._like(x, "waves", self.waves).T) + self._like(x, "phases", self.phases)
 
+    def _value(self, x: Tensor, angle: Tensor) -> Tensor:
+        return self.constant + angle.cos() @ self._like(x, "amplitudes", self.amplitudes)
+
+    def _slope(self, x: Tensor, angle: Tensor) -> Tensor:
+        slopes = -TURN * self._like(x, "amplitudes", self.amplitudes) * angle.sin()
+        return slopes @ self._like(x, "waves", self.waves)
+
     def __call__(self, x: Tensor) -> Tensor:
         """`p(x)`, ``(N,)``."""
-        return self.constant + self._angle(x).cos() @ self._like(x, "amplitudes", self.amplitudes)
+        return self._value(x, self._angle(x))
 
     def gradient(self, x: Tensor) -> Tensor:
         """`grad p(x)`, ``(N, d)``."""
-        slopes = -TURN * self._like(x, "amplitudes", self.amplitudes) * self._angle(x).sin()
-        return slopes @ self._like(x, "waves", self.waves)
+        return self._slope(x, self._angle(x))
+
+    def with_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """`p(x)` and `grad p(x)`."""
+        angle = self._angle(x)
+        return self._value(x, angle), self._slope(x, angle)
 
     def hessian(self, x: Tensor) -> Tensor:
         """Second derivatives of `p`, ``(N, d, d)``."""

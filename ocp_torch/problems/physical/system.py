@@ -190,10 +190,6 @@ class System(Disturbed):
     def control_divergence(self, x: Tensor) -> Tensor | None:
         return self.vector_fields(x)[3]
 
-    def velocity(self, x: Tensor, u: Tensor) -> Tensor:
-        a, B = self._moved(x)
-        return a + torch.einsum("ndm,nm->nd", B, u)
-
     def initial_density(self, x: Tensor) -> Tensor:
         if self.start is None and not self.chart.boxed:
             return super().initial_density(x)

@@ -77,7 +77,6 @@ def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, step
     h, rho = duration / (steps * finer), problem.discount
     control = policy
     velocity = lambda x: problem.velocity(x, control(x))
-    rate = lambda x, u: problem.state_cost(x) + problem.control_cost.cost(u)
     times = h * torch.arange(steps * finer + 1, dtype=x0.dtype)
     weight = rho * h * (-rho * times).exp()
     weight[0], weight[-1] = 0.5 * weight[0], 0.5 * weight[-1]
@@ -89,9 +88,8 @@ def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, step
         if isinstance(policy, HeldPolicy) and k % substeps == 0:
             held = policy(x)
             control = lambda at, u=held: u  # type: ignore[misc]
-        u = control(x)
-        cost = cost + weight[k] * rate(x, u)
-        v1 = problem.velocity(x, u)
+        v1, rate = problem.motion(x, control(x))
+        cost = cost + weight[k] * rate
         v2 = velocity(x + 0.5 * h * v1)
         sigma = problem.noise(x)
         if sigma is None:
@@ -103,7 +101,8 @@ def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, step
         x = x.remainder(1.0)
         if (k + 1) % finer == 0:
             states.append(x)
-    return Path(times[::finer], torch.stack(states), cost + weight[-1] * rate(x, policy(x)), samples)
+    _, rate = problem.motion(x, policy(x))
+    return Path(times[::finer], torch.stack(states), cost + weight[-1] * rate, samples)
 
 
 def admissible(problem: Problem, x: Tensor) -> Tensor:

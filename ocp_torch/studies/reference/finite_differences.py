@@ -23,6 +23,7 @@ from torch import Tensor
 
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.samples import driven
 from ocp_torch.studies.reference.grid import PIECE, Grid
 from ocp_torch.studies.reference.semi_lagrangian import minimiser, running_cost
 
@@ -61,7 +62,7 @@ class FiniteDifferences:
 
     def velocity(self, u: Tensor) -> Tensor:
         """`g` in cells per unit time, ``(n, d)``."""
-        return (self.a + torch.einsum("ndm,nm->nd", self.B, u)) / self.grid.spacing
+        return driven(self.a, self.B, u) / self.grid.spacing
 
     def viscosity(self, g: Tensor) -> Tensor:
         """What is missing along each coordinate for weights of one sign, ``(n, d)``."""

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.samples import driven
 from ocp_torch.studies.reference.error import LINEAR, ORDER, extrapolate, look_between
 from ocp_torch.studies.reference.grid import PIECE, Grid, grid_sides, require_solvable
 from ocp_torch.studies.reference.policy_iteration import GridSolution, solve
@@ -168,7 +169,7 @@ def _speed(problem: Problem, coarsest: int) -> tuple[GridSolution, float]:
         scheme = SemiLagrangian(problem, grid, step)
         rough = solve(scheme, value, control, ROUGH)
         value, control = rough.value, rough.control
-        g = scheme.a + torch.einsum("ndm,nm->nd", scheme.B, control)
+        g = driven(scheme.a, scheme.B, control)
         # Of typical states: the root of the mean square, over the nodes, of the largest component.
         speed = max(float(g.abs().amax(dim=-1).square().mean().sqrt()), 1e-300)
         step = min(longest, CELLS * grid.spacing / speed)

@@ -21,6 +21,7 @@ from torch import Tensor
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.samples import driven
 from ocp_torch.studies.reference.grid import PIECE, Grid
 
 # Of the cubic correction, relative to osc(V) h^{3/2}: a smaller one costs accuracy where V is smooth and the grid coarse, a
@@ -78,9 +79,8 @@ class SemiLagrangian:
     def move(self, nodes: slice | Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         """The midpoint and the end of the path from each of ``nodes`` under ``u``."""
         x = self.x[nodes]
-        middle = x + 0.5 * self.step * (self.a[nodes] + torch.einsum("ndm,nm->nd", self.B[nodes], u))
-        pushed = torch.einsum("ndm,nm->nd", self.problem.control_matrix(middle), u)
-        return middle, x + self.step * (self.problem.drift(middle) + pushed)
+        middle = x + 0.5 * self.step * driven(self.a[nodes], self.B[nodes], u)
+        return middle, x + self.step * self.problem.velocity(middle, u)
 
     def right_side(self, value: Tensor, nodes: slice | Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The right side ``(N,)`` under ``u``, which is linear in `V`; with it the nodes of `V` that enter, their weights,
