@@ -20,6 +20,11 @@ def visible(text: object, most: int = LONGEST, keep: str = "") -> str:
     return "".join(c if c.isprintable() or c in keep else c.encode("unicode_escape").decode() for c in text)
 
 
+def first_line(error: BaseException) -> str:
+    """The first line of what ``error`` says, without its full stop, for a sentence of ours."""
+    return next(iter(str(error).splitlines()), "").rstrip(".?!") or "no message"
+
+
 def notes(found: object) -> tuple[str, ...]:
     """The sentences ``found`` in a file, `visible`; `InputError` where it is no list of them, or an endless one."""
     if not isinstance(found, list | tuple) or len(found) > MOST_NOTES or not all(isinstance(n, str) for n in found):

@@ -79,7 +79,8 @@ def certify(context: Context) -> Certificate:
 
 def handed_out(certificate: Certificate, context: Context) -> Certificate:
     """``certificate`` with the controller that is handed out as its subject, and what is known of that one alone."""
-    best = certificate.best_certified if context.settings.prefer == CERTIFIED else None
+    choose = context.settings.prefer == CERTIFIED and not context.settled
+    best = certificate.best_certified if choose else None
     subject = certificate.subject if best is None else best
     outside, held_for = context.outside(subject), context.held_for(subject)
     warnings = [*certificate.warnings, *outside_note(context.problem, outside)]

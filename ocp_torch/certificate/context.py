@@ -77,6 +77,11 @@ class Context:
         """The controller whose closed loop is looked at and fitted: the one handed out, where that acts at every instant."""
         return self.kind
 
+    @property
+    def settled(self) -> bool:
+        """Whether the controller that is handed out is not to be chosen any more."""
+        return False
+
     def held_for(self, name: str | None) -> float | None:
         """For how long the controller ``name`` holds its control; `None` for one that acts at every instant."""
         return None

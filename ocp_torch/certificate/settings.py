@@ -36,7 +36,7 @@ class Run:
     step: int = 0
     samples: int = 0
     train_seconds: float = 0.0
-    stopped: str = "steps"  # why training ended: steps, target_gap, max_seconds, not_finite or failed
+    stopped: str = "steps"  # why training ended: see `ocp_torch.training.stopping`
 
     @classmethod
     def read(cls, certificate: dict) -> "Run":

@@ -52,7 +52,8 @@ def in_float64(fields: M) -> M:
 
 @dataclass(frozen=True)
 class Trained:
-    """What training hands over: the fields, how they give `mu` (see `trained_policies`), and the network they are made of.
+    """What training hands over: the fields, how they give `mu` (see `trained_policies`), the network they are made of, and
+    which ``kind`` of controller was handed out, where that is settled already.
 
     The `V` of a warm start stays as it is while others are trained: ``memory`` keeps what was simulated of its controller.
     """
@@ -60,6 +61,7 @@ class Trained:
     fields: Fields
     occupation: str | None
     network: Callable[..., nn.Module]
+    kind: str | None = None
     memory: dict = field(default_factory=dict, compare=False, repr=False)
 
 
@@ -91,7 +93,7 @@ class FieldsContext(Context):
 
     def policies_of(self, fields: Fields) -> dict[str, Policy]:
         """The controllers that the trained ``fields`` give, in their precision, by name."""
-        every = self.settings.prefer == CERTIFIED
+        every = self.settings.prefer == CERTIFIED or self.trained.kind == MINIMISED
         return trained_policies(self.occupation, self.problem, fields, self.constants, every)
 
     @cached_property
@@ -144,8 +146,12 @@ class TrainedContext(FieldsContext):
 
     @cached_property
     def kind(self) -> str:
-        """The controller with the lowest performance."""
-        return self._best_of(list(self.policies))
+        """The controller that was handed out, or else the one with the lowest performance."""
+        return self.trained.kind or self._best_of(list(self.policies))
+
+    @property
+    def settled(self) -> bool:
+        return self.trained.kind is not None
 
     @cached_property
     def followed(self) -> str:

@@ -15,10 +15,9 @@ from hydra.errors import HydraException
 from torch.optim import Optimizer
 
 from ocp_torch.cli.assist import assist
-from ocp_torch.cli.compose import composed, configuration, parsed, register_resolvers, run_data, with_own_defaults
-from ocp_torch.cli.explain import CHECKOUT, CONFIGS, explain, is_choice, known_fields
+from ocp_torch.cli.compose import configuration, parsed, register_resolvers, run_data, with_own_defaults
+from ocp_torch.cli.explain import explain, is_choice
 from ocp_torch.cli.help import help_text
-from ocp_torch.cli.job import isolated, job
 from ocp_torch.cli.outcome import BROKEN_PIPE, INTERRUPTED, Record, fail, failures, typed
 from ocp_torch.cli.single import carry_out, checked, require_places_to_write
 from ocp_torch.errors import InputError, require_flag, require_section, shown
@@ -26,8 +25,6 @@ from ocp_torch.files.reading import require_unlinked
 from ocp_torch.maths.ranks import Left, LostError, joined
 from ocp_torch.problems.commands import ForeignProblem
 from ocp_torch.training.stopping import Preempted
-
-__all__ = ["CHECKOUT", "CONFIGS", "composed", "fail", "isolated", "job", "known_fields", "launch", "register_resolvers"]
 
 HELP = ("--help", "-h")
 ASKS = ("--info", "-i", "--cfg", "-c", "--hydra-help", "--version", "--shell-completion", "-sc")

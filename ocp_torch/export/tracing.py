@@ -7,7 +7,7 @@ from torch import Tensor, fx
 from torch._decomp import core_aten_decompositions
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, first_line
 
 # How far the graph may be off the function at other states, relative to its largest number: both compute in float64.
 ROUNDING = 1e-9
@@ -24,8 +24,7 @@ def traced(function: Callable[[Tensor], dict[str, Tensor]], examples: Tensor) ->
     try:
         graph = make_fx(listed, decomposition_table=dict(core_aten_decompositions().items()))(examples[:1])
     except Exception as error:  # whatever the functions of a problem do that a tracer does not follow
-        reason = next(iter(str(error).splitlines()), type(error).__name__).rstrip(".")
-        raise InputError(f"this controller cannot be exported, as it cannot be traced: {reason}.") from None
+        raise InputError(f"this controller cannot be exported, as it cannot be traced: {first_line(error)}.") from None
     graph.graph.eliminate_dead_code()
     found = zip(*(graph(x) for x in examples.split(1)), strict=True)
     for (name, value), parts in zip(wanted.items(), found, strict=True):

@@ -10,7 +10,7 @@ from zipfile import ZIP_DEFLATED, ZIP_STORED, ZipFile
 
 import numpy as np
 
-from ocp_torch.errors import InputError, nearest, visible
+from ocp_torch.errors import InputError, first_line, nearest, visible
 from ocp_torch.files.reading import opened, zip_file
 
 # Bytes of the header of an array of numbers at most; NumPy itself writes 118.
@@ -89,8 +89,9 @@ def read_npz(path: Path, known: Collection[str], most: int) -> dict[str, np.ndar
         except InputError:
             raise
         except Exception as error:  # zipfile, zlib and NumPy have no one type for damage
-            reason = next(iter(str(error).splitlines()), "").rstrip(".") or "no message"
-            raise InputError(f"{path} is not a whole .npz file: it is damaged or of another kind ({reason}).") from None
+            raise InputError(
+                f"{path} is not a whole .npz file: it is damaged or of another kind ({first_line(error)})."
+            ) from None
 
 
 def _forms(path: Path, archive: ZipFile, known: Collection[str]) -> dict[str, Form]:

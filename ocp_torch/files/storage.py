@@ -24,6 +24,8 @@ METADATA_KEY, DIGEST_KEY = "ocp_torch", "sha256"
 LARGEST_HEADER, MOST_TENSORS = 2**24, 2**14
 # How the names of temporary files end, whatever they are to become.
 PART = ".part"
+# What the user wants new files not to permit; it can only be read by setting it, which threads must not see.
+os.umask(_UMASK := os.umask(0o077))
 
 
 def write_atomically(path: Path, write: Callable[[Path], object], make_room: Callable[[], None] | None = None) -> None:
@@ -41,7 +43,7 @@ def write_atomically(path: Path, write: Callable[[Path], object], make_room: Cal
             temporary = Path(file.name)
         write(temporary)
         sync(temporary)
-        temporary.chmod(0o644)
+        temporary.chmod(0o666 & ~_UMASK)
         if make_room is not None:
             make_room()
         os.replace(temporary, path)

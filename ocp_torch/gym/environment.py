@@ -10,7 +10,7 @@ from ocp_torch.errors import InputError, require_choice, require_number
 from ocp_torch.maths.seeds import Branch, derive_seed, fixed_generator
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.physical.system import System
-from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.problem import MARGIN, Problem
 from ocp_torch.problems.starts import drawn_starts, starts_narrowly
 from ocp_torch.runs.canvas import blank_figure, drawn
 
@@ -18,6 +18,8 @@ from ocp_torch.runs.canvas import blank_figure, drawn
 MOST_TRIES = 10_000
 # Where `mu0` is narrow episodes start at one of so many draws from it.
 DRAWN_STARTS = 4096
+# States among which the largest value of `mu0` is sought, elsewhere.
+CANDIDATES = 4096
 # By default a control is held for this part of the discount time `1 / rho`, and an episode takes so many of them.
 HELD, LENGTH = 0.1, 5.0
 # Coordinates drawn, as hands of clocks.
@@ -69,8 +71,8 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
         self.control_bound = np.minimum(require_number("control_bound", bound, above=0.0), problem.control_cost.sides)
         self.time_step = HELD / problem.discount if time_step is None else time_step
         self.horizon = LENGTH / problem.discount if horizon is None else horizon
-        require_number("rl.time_step", self.time_step, above=0.0)
-        require_number("rl.horizon", self.horizon, above=0.0)
+        require_number("time_step", self.time_step, above=0.0)
+        require_number("horizon", self.horizon, above=0.0)
         if render_mode is not None:
             require_choice("render_mode", render_mode, ("rgb_array",))
         if isinstance(problem, System):
@@ -83,10 +85,10 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
         self.observation_space = box(-1.0, 1.0, (2 * problem.dim,), np.float32)
         self.action_space = box(-1.0, 1.0, (problem.control_dim,), np.float32)
         self.generator = torch.Generator().manual_seed(derive_seed(seed, Branch.EPISODES))
-        candidates = torch.rand(4096, problem.dim, dtype=torch.float64, generator=fixed_generator())
+        candidates = torch.rand(CANDIDATES, problem.dim, dtype=torch.float64, generator=fixed_generator())
         narrow = starts_narrowly(problem)
         self._drawn = drawn_starts(problem, DRAWN_STARTS, derive_seed(seed, Branch.EPISODES)) if narrow else None
-        self._ceiling = 1.05 * float(problem.initial_density(candidates).max())
+        self._ceiling = MARGIN * float(problem.initial_density(candidates).max())
         self._weight = -math.expm1(-problem.discount * self.time_step)
         self.x, self.elapsed = torch.full((1, problem.dim), 0.5, dtype=torch.float64), 0.0
 

@@ -13,7 +13,7 @@ from PIL import Image
 
 from ocp_torch.control.controller import Controller
 from ocp_torch.control.policies import TRAJECTORIES
-from ocp_torch.errors import InputError, require_integer
+from ocp_torch.errors import InputError, first_line, require_integer
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.gym.environment import require_gymnasium
 from ocp_torch.runs.evaluate import load_run
@@ -122,8 +122,7 @@ def made(name: str, **options):
     except InputError:
         raise
     except Exception as error:  # whatever a stranger's environment may raise
-        reason = next(iter(str(error).splitlines()), "no message").rstrip(".?!")
-        raise InputError(f"env is {name!r}, which cannot be made: {reason}.") from None
+        raise InputError(f"env is {name!r}, which cannot be made: {first_line(error)}.") from None
 
 
 def play(controller: Controller, env, name: str, episodes: int, seed: int, frames: list | None = None) -> Rollouts:
@@ -147,8 +146,7 @@ def _picture(env, name: str) -> np.ndarray:
     try:
         picture = np.asarray(env.render())
     except Exception as error:  # whatever a stranger's environment may raise
-        reason = next(iter(str(error).splitlines()), "no message").rstrip(".?!")
-        raise InputError(f"{name} cannot be drawn here: {reason}.") from None
+        raise InputError(f"{name} cannot be drawn here: {first_line(error)}.") from None
     if picture.ndim != 3 or picture.shape[2] not in (3, 4):
         raise InputError(f"{name} gives no pictures (its render gave shape {picture.shape}); leave video out.")
     return picture[..., :3].astype(np.uint8)

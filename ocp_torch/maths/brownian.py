@@ -48,10 +48,6 @@ class Grid:
         """`t_k / horizon`, ``(steps + 1,)``."""
         return torch.linspace(0.0, 1.0, self.steps + 1, dtype=self.horizon.dtype) ** self.grading
 
-    @property
-    def halved(self) -> "Grid":
-        return Grid(self.horizon, 2 * self.steps, self.grading)
-
     def of(self, rows: Tensor) -> "Grid":
         """That of the paths ``rows``."""
         return Grid(self.horizon[rows], self.steps, self.grading)

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ocp_torch.errors import first_line
 from ocp_torch.maths.decisions import Noted, Told, listening
 
 log = logging.getLogger(__name__)
@@ -139,7 +140,7 @@ class _Replayed:
         try:
             self.replay = self.recorder.capture(whole)
         except Exception as error:  # whatever the code of a problem does that a graph cannot hold
-            self._refuse(next(iter(str(error).splitlines()), type(error).__name__))
+            self._refuse(first_line(error))
         return self.replay is not None
 
     def _refuse(self, reason: str) -> None:

@@ -22,7 +22,7 @@ class Branch(IntEnum):
     WEIGHTS = 2  # the first weights of a run's networks
     POLICY_EVALUATION = 3  # the fit to a closed loop; below, 0 for weights, 1 for states, 2 for rows of a recording
     EXTERNAL_VALUE = 4  # the V trained for a given controller; below, 0 for weights, 1 for states, 2 for visits
-    VALIDATION = 5  # all that the quick certificates during training draw
+    VALIDATION = 5  # all that the quick evaluations during training draw
     DATASET_SPLIT = 6  # which rows of a recording are held out
     BEST_CONSTANT = 7  # states on which the best constant V is computed
     RECORDING = 8  # states of a recording that is made
@@ -46,7 +46,7 @@ class Branch(IntEnum):
     TIGHTENING = 30  # states on which V is trained on for the shifted bound
     WARM_START = 31  # pieces of trajectory of the warm start; below, their starts, those of trials, the noise of these
     RUNNING = 32  # states and paths of the running estimates
-    REFINEMENT = 33  # states of the Gauss-Newton steps that end a round; below, the round
+    REFINEMENT = 33  # states of Gauss-Newton steps; below, the round and the step
     AUDIT = 1000  # which trajectories are simulated again with finer steps
 
 

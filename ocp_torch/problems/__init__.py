@@ -47,7 +47,4 @@ PROBLEMS: dict[str, type[Problem]] = {
     "inverted_double_pendulum": InvertedDoublePendulum,
 }
 
-# What `Simulator` was called in files written before.
-Callable = Simulator
-
 __all__ = ["Lipschitz", "Problem", "Simulator", "PROBLEMS", *sorted(cls.__name__ for cls in PROBLEMS.values())]

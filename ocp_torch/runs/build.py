@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from ocp_torch.certificate import CertificateSettings, StageSettings
-from ocp_torch.control.controller import problem_name
+from ocp_torch.control.described import problem_name
 from ocp_torch.errors import InputError, call, nearest, require_choice, require_integer, require_number, require_section
 from ocp_torch.fields import MODELS, TRAJECTORY_VALUE, VALUE, Fields
 from ocp_torch.fields.fields import cost_unit

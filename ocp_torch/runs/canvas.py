@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ocp_torch.errors import InputError
 from ocp_torch.files.storage import write_atomically
 
 if TYPE_CHECKING:
@@ -15,6 +16,7 @@ else:
 
 
 DPI = 120
+FORMS = ("png", "pdf", "svg")
 
 
 def blank_figure(width: float, height: float, **options) -> Figure:
@@ -35,6 +37,15 @@ def drawn(figures: dict[str, Figure]) -> dict[str, np.ndarray]:
         canvas.draw()
         pixels[name] = np.asarray(canvas.buffer_rgba())[..., :3].copy()
     return pixels
+
+
+def save_figure(figure: Figure, file: Path, field: str) -> None:
+    """Write ``figure`` in the form that the name of ``file`` asks for; raises `InputError`, about ``field``, where that is no
+    picture's."""
+    form = file.suffix.lower()[1:]
+    if form not in FORMS:
+        raise InputError(f"{field} is {str(file)!r}, but must end in .png, .pdf or .svg.")
+    write_atomically(file, lambda path: figure.savefig(path, format=form, dpi=DPI))
 
 
 def save(pictures: dict[str, np.ndarray], folder: Path) -> None:

@@ -13,7 +13,7 @@ from ocp_torch.certificate.settings import LONGEST_NAME
 from ocp_torch.errors import InputError, visible
 from ocp_torch.files.reading import FOLDER, kind, read_json
 from ocp_torch.files.storage import write_atomically
-from ocp_torch.runs.canvas import blank_figure
+from ocp_torch.runs.canvas import blank_figure, save_figure
 from ocp_torch.training.checkpoint import newest
 
 LARGEST_CERTIFICATE = 2**22
@@ -77,8 +77,6 @@ class Comparison:
 
     def save_plot(self, file: Path) -> None:
         """What lies between the lower bound and each upper side of every run, as a picture."""
-        if file.suffix.lower() not in (".png", ".pdf", ".svg"):
-            raise InputError(f"plot is {str(file)!r}, but must end in .png, .pdf or .svg.")
         figure = blank_figure(7.0, 1.2 + 0.4 * max(1, len(self.rows)))
         axis = figure.subplots()
         for k, row in enumerate(self.rows):
@@ -92,7 +90,7 @@ class Comparison:
         axis.set_yticks(range(len(self.rows)), [row["run"] for row in self.rows], parse_math=False)
         axis.invert_yaxis()
         axis.set(xlabel="lower bound | simulated performance o upper bound | (x: OPT)")
-        write_atomically(file, lambda path: figure.savefig(path, format=file.suffix.lower()[1:], dpi=120))
+        save_figure(figure, file, "plot")
 
 
 def _shown(value, form: str) -> str:
@@ -159,19 +157,19 @@ def row_from(certificate: dict, name: str) -> dict:
     gap, bounds = certificate["gap"], {}
     for side in ("lower", "upper"):  # the bounds that the gap was taken from
         source = gap[f"{side}_from"]
-        bounds[side] = None if source is None else number(certificate[side][source]["value"])
-    gaps = {f"gap_{kind}": number(gap[kind]) for kind in ("certified", "simulated")}
+        bounds[side] = None if source is None else number_or_none(certificate[side][source]["value"])
+    gaps = {f"gap_{kind}": number_or_none(gap[kind]) for kind in ("certified", "simulated")}
     return {
         "run": name,
         **{k: printable(certificate[k]) for k in ("problem", "method")},
-        **{k: int(number(certificate[k], given=True)) for k in ("seed", "step")},
-        "train_seconds": number(certificate["train_seconds"]),
+        **{k: int(number(certificate[k])) for k in ("seed", "step")},
+        "train_seconds": number_or_none(certificate["train_seconds"]),
         "perf": performance(certificate),
         **bounds,
-        "exact": number(certificate["exact"]),
+        "exact": number_or_none(certificate["exact"]),
         # None to rank by where the bounds cross, as older versions wrote them: one of them is then wrong.
         **{k: None if value is not None and value < 0.0 else value for k, value in gaps.items()},
-        "share": number(certificate["share"]["certified"]),
+        "share": number_or_none(certificate["share"]["certified"]),
         "stopped": printable(certificate.get("stopped", "steps")),
         "warnings": len(list(certificate["warnings"])),
     }
@@ -180,24 +178,27 @@ def row_from(certificate: dict, name: str) -> dict:
 def performance(certificate: dict) -> float | None:
     """Of the controller that was certified, which older certificates do not name: the one that was given, or that which the
     upper bounds speak of, or else the one with the smallest value that its errors allow."""
-    known = {name: e for name, e in certificate["perf"].items() if e is not None and number(e["value"]) is not None}
+    known = {
+        name: e for name, e in certificate["perf"].items() if e is not None and number_or_none(e["value"]) is not None
+    }
     spoken_of = [e.get("controller") for e in certificate["upper"].values() if e is not None]
     for name in (certificate.get("controller"), "given", *spoken_of):
         if name in known:
-            return number(known[name]["value"])
-    at_most = lambda e: e["value"] + (number(e.get("bias")) or 0.0) + 2.0 * number(e["se"], given=True)
-    return number(min(known.values(), key=at_most)["value"]) if known else None
+            return number_or_none(known[name]["value"])
+    at_most = lambda e: e["value"] + (number_or_none(e.get("bias")) or 0.0) + 2.0 * number(e["se"])
+    return number_or_none(min(known.values(), key=at_most)["value"]) if known else None
 
 
-def number(value, given: bool = False):
-    """A finite number or, unless it must be ``given``, `None`; `ValueError` or `TypeError` for anything else."""
-    if value is None and given:
-        raise TypeError("a number is missing")
-    if value is None:
-        return None
+def number(value) -> float:
+    """``value`` of a file as a number that can be compared and drawn; `ValueError` or `TypeError` otherwise."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(f"{value!r} is not a number")
+        raise ValueError(f"{visible(value, 80)} is not a number")
     return value
+
+
+def number_or_none(value) -> float | None:
+    """`None`, or a `number`."""
+    return None if value is None else number(value)
 
 
 def progress_of(folder: Path) -> str:

@@ -74,7 +74,7 @@ def certify_saved(controller: Controller, settings: CertificateSettings, seed: i
     run = Run.read(controller.certificate)
     if seed is not None:
         run = replace(run, seed=require_integer("seed", seed, 0))
-    trained = Trained(controller.fields, controller.occupation, build_network(controller.model))
+    trained = Trained(controller.fields, controller.occupation, build_network(controller.model), controller.kind)
     certificate = certify_fields(controller.problem, trained, controller.constants, settings, run)
     found = sanity_warnings(controller.problem, controller.constants, certificate, run.seed)
     fresh = [note for note in found if note not in certificate.warnings]

@@ -16,6 +16,7 @@ from ocp_torch.control.policies import Policy
 from ocp_torch.errors import InputError, require_flag, require_integer
 from ocp_torch.fields import Fields, Subsolution
 from ocp_torch.fields.fields import VALUE, cost_unit
+from ocp_torch.files.storage import write_atomically
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import SAMPLERS, scrambled_sobol
 from ocp_torch.maths.seeds import Branch, derive_seed
@@ -24,7 +25,7 @@ from ocp_torch.objectives import Dual, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.runs import canvas, loading
-from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem, use_threads
+from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem, checked_problem, use_threads
 from ocp_torch.runs.figures import interval_figure
 from ocp_torch.steppers import advance, short_fit
 from ocp_torch.training.batches import Batches
@@ -58,7 +59,7 @@ def certify(
         raise InputError(
             "problem is a data set, on which no given controller can be certified: nothing can be simulated."
         )
-    defaults = _defaults(problem, {})
+    defaults = _defaults(checked_problem(problem), {})
     settings = settings or build_certificate_settings(defaults)
     constants = resolve_constants(problem)
     network = build_network(defaults["model"])
@@ -90,8 +91,11 @@ def train_value(
     batch_seed = derive_seed(seed, Branch.EXTERNAL_VALUE, 2)
     batches = Batches(problem, fields, objective, states, defaults["trainer"]["batch"], batch_seed)
     stepper, average = short_fit(fields, objective, defaults["optimizer"]["lr"], steps, cost_unit(problem))
-    for step in range(steps):
-        advance(stepper, average, batches.draw, Phase(constants, step / steps))
+    try:
+        for step in range(steps):
+            advance(stepper, average, batches.draw, Phase(constants, step / steps))
+    except ArithmeticError as error:
+        raise InputError(f"no V can be trained to judge the controller by: {error}.") from None
     return average.module
 
 
@@ -162,7 +166,7 @@ def arguments(config: dict) -> dict:
 def certify_in(given: dict, folder: Path) -> Certificate:
     """Certify what `arguments` gave; print the table and leave `certificate.json` and its figure in ``folder``."""
     certificate = certify(**given)
-    certificate.save(folder / "certificate.json")
+    write_atomically(folder / "certificate.json", certificate.save)
     canvas.save(canvas.drawn({"certificate": interval_figure(certificate.to_dict())}), folder / "figures")
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
     log.info("in %s", folder)

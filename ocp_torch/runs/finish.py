@@ -66,8 +66,8 @@ def unless_it_failed(failure: str | None, trainer: Trainer):
 def salvaged(
     trainer: Trainer, settings: CertificateSettings, failure: str, monitor: Monitor
 ) -> tuple[Certificate, Fields]:
-    """What a run that cannot go on still gives: the certificate of its best look made anew, or, where the problem fails there
-    as well, as it was seen then; without any look that of the fields as they are. `InputError` when nothing."""
+    """What a run that cannot go on still gives: the certificate of the fields of its best quick evaluation, or, where the
+    problem fails there as well, what that saw; without any that of the fields as they are. `InputError` when nothing."""
     best, seen = trainer.health.best, trainer.health.certificate
     if best is None and trainer.step == 0:
         raise InputError(failure)
@@ -80,7 +80,7 @@ def salvaged(
     if seen is None:
         raise InputError(failure)
     notes.append(
-        f"the numbers are those of the quick look at step {step}: the problem failed again when they were refined."
+        f"the numbers are those of the quick evaluation at step {step}: the problem failed again when they were refined."
     )
     certificate = replace(seen, run=replace(trainer.run, step=step))
     return replace(certificate, warnings=[*seen.warnings, *trainer.health.notes, *notes]), fields

@@ -1,6 +1,5 @@
 """Controllers by what the command line names: a function in a file, a run of ours, ONNX, TorchScript; and their policies."""
 
-import importlib.util
 import logging
 from collections.abc import Callable
 from functools import cache
@@ -9,11 +8,13 @@ from pathlib import Path
 import torch
 
 from ocp_torch.certificate.trained import in_float64
-from ocp_torch.control.controller import Controller, controller_file, load_controller, problem_name
+from ocp_torch.control.controller import Controller, controller_file, load_controller
+from ocp_torch.control.described import problem_name
 from ocp_torch.control.policies import Policy, trained_policies
-from ocp_torch.errors import InputError, nearest
+from ocp_torch.errors import InputError, first_line
 from ocp_torch.files.reading import FOLDER, kind, require_file
 from ocp_torch.problems import PROBLEMS, Problem
+from ocp_torch.problems.simulator.target import resolved
 
 log = logging.getLogger(__name__)
 
@@ -31,9 +32,8 @@ def load_policy(source: str, problem: Problem) -> Callable | Controller:
     A .py file is code, and so is TorchScript: it can write files by itself. Only what is trusted is named here; an .onnx
     file, like one of ours, can do nothing but compute.
     """
-    file, _, name = str(source).rpartition(":")
-    if file.endswith(".py"):
-        return _function(Path(file), name)
+    if str(source).rpartition(":")[0].endswith(".py"):
+        return resolved(str(source), "controller")
     path = Path(str(source))
     if path.suffix == ".py":
         raise InputError(f"controller is {source!r}, but must name its function, as in {source}:function.")
@@ -60,25 +60,6 @@ def load_saved(path: Path, problem: Problem) -> Controller:
     return found
 
 
-def _function(path: Path, name: str) -> Callable:
-    if kind(path) is None:
-        raise InputError(f"controller names {path}, which does not exist.")
-    require_file(path)
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None  # as for every .py file
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:  # whatever a stranger's code may raise
-        raise InputError(f"{path} cannot be run: {type(error).__name__}: {error}.") from None
-    found = getattr(module, name, None)
-    if not callable(found):
-        known = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
-        raise InputError(f"{path} has no function {name!r}{nearest(name, known)}.")
-    return found
-
-
 def _onnx(path: Path) -> Callable:
     try:
         import onnxruntime
@@ -98,8 +79,7 @@ def _torchscript(path: Path) -> Callable:
     try:
         return torch.jit.load(str(path), map_location="cpu").eval()
     except Exception as error:  # the loader has no one type for a bad file
-        reason = next(iter(str(error).splitlines()), "").split(". ")[0]
-        raise InputError(f"{path} is not a TorchScript file ({reason}).") from None
+        raise InputError(f"{path} is not a TorchScript file ({first_line(error).split('. ')[0]}).") from None
 
 
 @cache

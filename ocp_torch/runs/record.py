@@ -28,7 +28,9 @@ def arguments(config: dict) -> dict:
     out = Path(str(config["out"]))
     if out.suffix not in recording.SUFFIXES:
         raise InputError(f"out is {str(out)!r}, but must end in {' or '.join(recording.SUFFIXES)}.")
-    divergences = require_flag("divergences", config["divergences"]) and problem.gives_divergences
+    wanted, unknown = require_flag("divergences", config["divergences"]), problem.unknown_divergences
+    if wanted and unknown:
+        log.warning("warning: no divergences are recorded, as this problem gives none of %s.", unknown)
     count = require_integer("samples", config["samples"], recording.FEWEST, maximum=10**8)
     d, m = problem.dim, problem.control_dim
     sigma = problem.noise(torch.full((1, d), 0.5, dtype=torch.float64))
@@ -39,7 +41,7 @@ def arguments(config: dict) -> dict:
         "count": count,
         "out": out,
         "seed": require_integer("seed", config["seed"], 0),
-        "divergences": divergences,
+        "divergences": wanted and not unknown,
         "contrast": require_number("contrast", config["contrast"], at_least=0.0, at_most=0.95),
     }
 

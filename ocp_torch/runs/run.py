@@ -123,7 +123,7 @@ def train(run: TrainingRun, folder: Path) -> None:
 
 def run_to_end(trainer: Trainer, settings: CertificateSettings, folder: Path) -> Certificate:
     """`ending` of a run that nobody else watches. Raises `InputError` when a loss stops being finite or the user's problem
-    fails, once what the best look so far gives is handed out."""
+    fails, once what the best quick evaluation so far gives is handed out."""
     started = time.perf_counter()
     end = ending(trainer, settings, folder)
     log.info("controller from %s, %.0f s in all, in %s", end.controller.kind, time.perf_counter() - started, folder)
@@ -148,7 +148,7 @@ def assist(trainer: Trainer) -> None:
 
 def handed_out(trainer: Trainer) -> str:
     """Which controller a run that could not go on hands out, in words."""
-    return "the best look before" if trainer.health.best else f"step {trainer.step}, without any look"
+    return "the best evaluation before" if trainer.health.best else f"step {trainer.step}, without any evaluation"
 
 
 def ending(

@@ -12,8 +12,8 @@ from ocp_torch.runs.report.report import write_report
 
 @dataclass(frozen=True)
 class History:
-    """One dict for each moment, made for `pandas.DataFrame(history.looks)`: ``step``, ``samples`` drawn, ``seconds`` of the
-    run, and the scalars of a `Moment`. The last of the ``looks`` is the final certificate."""
+    """One dict for each moment, made for `pandas.DataFrame(history.looks)`: ``step``, ``samples`` drawn, ``seconds``
+    spent in steps, and the scalars of a `Moment`. The last of the ``looks`` is the final certificate."""
 
     steps: list[dict[str, float]] = field(default_factory=list)
     looks: list[dict[str, float]] = field(default_factory=list)

@@ -1,13 +1,11 @@
 """Gaps of runs against a number of their configurations: what a noise level, a budget or a size does to a certificate."""
 
-from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from ocp_torch.errors import InputError, shown
-from ocp_torch.files.storage import write_atomically
-from ocp_torch.runs.canvas import blank_figure
+from ocp_torch.runs.canvas import blank_figure, save_figure
 from ocp_torch.runs.compare import Comparison, number
 from ocp_torch.runs.configuration import saved_configuration
 
@@ -24,7 +22,7 @@ def field_of(folder: Path, field: str) -> float:
     try:
         for part in field.split("."):
             value = value[part]
-        return float(number(value, given=True))
+        return number(value)
     except (LookupError, TypeError, ValueError):
         raise InputError(f"against is {shown(field)}, but {folder} has no such number in its configuration.") from None
 
@@ -32,8 +30,6 @@ def field_of(folder: Path, field: str) -> float:
 def save_trend(comparison: Comparison, field: str, file: Path) -> None:
     """One line for each problem and method of ``comparison``, through the mean of the runs that share a value of ``field``;
     raises `InputError` where a run has no such number, or ``file`` is no picture."""
-    if file.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise InputError(f"plot is {str(file)!r}, but must end in .png, .pdf or .svg.")
     points = [(field_of(comparison.folders[row["run"]], field), row) for row in comparison.rows]
     figure = blank_figure(6.4, 3.6)
     axis = figure.subplots()
@@ -51,4 +47,4 @@ def save_trend(comparison: Comparison, field: str, file: Path) -> None:
     axis.set(yscale="log", ylabel="gap, %")
     axis.set_xlabel(field, parse_math=False)
     axis.legend(fontsize="small")
-    write_atomically(file, partial(figure.savefig, format=file.suffix.lower()[1:], dpi=120))
+    save_figure(figure, file, "plot")

@@ -21,7 +21,7 @@ STEP, LOOK, WARM_START = "step", "look", "warm start"
 class Moment:
     """What a callback is told.
 
-    ``kind`` is `step` (one of every `trainer.log_every`), `look` (a quick certificate, every `trainer.evaluate_every`) or
+    ``kind`` is `step` (one of every `trainer.log_every`), `look` (a quick evaluation, every `trainer.evaluate_every`) or
     `warm start` (a try of its controller). ``step`` counts training steps, of a warm start its rounds. ``scalars`` are named
     as in TensorBoard (`loss/value`, `bounds/F_M`, `gap/certified`), in the units of the problem's cost; ``certificate`` is
     that of a look, as in `certificate.json`, from few samples, and `None` elsewhere.

@@ -8,6 +8,7 @@ from ocp_torch.problems.samples import Samples
 
 DATA = {"f": "the state cost", "a": "the drift", "B": "the control matrix", "mu0": "the initial density"}
 DATA |= {"div_a": "the divergence of the drift", "div_B": "the divergence of the control matrix"}
+DATA |= {"noise": "the noise", "div_D": "the divergence of its D", "div_div_D": "the divergence of that"}
 
 # How the sentence ends where no learning rate would help.
 BROKEN_PROBLEM = "; it must be finite on the whole torus"

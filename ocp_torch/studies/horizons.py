@@ -16,7 +16,7 @@ from ocp_torch.errors import InputError, require_integer, require_number
 from ocp_torch.export.casadi_function import require_casadi
 from ocp_torch.maths.runge_kutta import discounted_integral
 from ocp_torch.problems import Problem
-from ocp_torch.problems.starts import initial_points
+from ocp_torch.problems.starts import drawn_starts
 from ocp_torch.runs.evaluate import load_run
 
 log = logging.getLogger(__name__)
@@ -75,7 +75,7 @@ def horizons(config: dict) -> Callable[[], dict[str, Played]]:
         with tempfile.TemporaryDirectory() as folder:
             (file,) = controller.export(Path(folder) / "V.casadi", coordinates="torus")
             V = casadi.Function.load(str(file))
-        x0 = initial_points(problem, sizes["starts"], 0, seed)[0].double().numpy()
+        x0 = drawn_starts(problem, sizes["starts"], seed).numpy()
         with_V = RecedingHorizon(problem, sizes["steps"], step, V)
         alone = RecedingHorizon(problem, sizes["steps"] * sizes["longer"], step)
         log.info("%d starts, %g units of time, a control every %g", len(x0), count * step, step)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from ocp_torch.errors import InputError, StorageError
+from ocp_torch.errors import InputError, StorageError, first_line
 from ocp_torch.files.archive import After, unpacked
 from ocp_torch.files.reading import LARGEST_FILE, kind, opened
 from ocp_torch.files.storage import write_atomically
@@ -79,8 +79,8 @@ def load_checkpoint(path: Path) -> dict:
                 f"{path} is not a readable checkpoint: it holds more than numbers, words and tensors, which is never run."
             ) from None
         except Exception as error:  # a crafted archive raises whatever its odd part leads to
-            reason = next(iter(str(error).splitlines()), "empty").rstrip(".")
-            raise InputError(f"{path} is not a readable checkpoint ({type(error).__name__}: {reason}).") from None
+            reason = f"{type(error).__name__}: {first_line(error)}"
+            raise InputError(f"{path} is not a readable checkpoint ({reason}).") from None
 
 
 def newest(folder: Path) -> tuple[dict, Path, list[str]]:

@@ -21,7 +21,7 @@ class QuickSettings(CertificateSettings):
     audited = False
 
 
-# What a quick certificate costs: enough for a curve, not for a claim.
+# What a quick evaluation costs: enough for a curve, not for a claim.
 QUICK = QuickSettings(
     points=1024,
     replicates=4,
@@ -40,7 +40,7 @@ QUICK_CERTIFICATES, TRAINED_ON = 6.0, 0.6
 
 @dataclass(eq=False)
 class Evaluator:
-    """Makes quick certificates of a run on ``problem`` as it goes on."""
+    """Makes quick evaluations of a run on ``problem`` as it goes on."""
 
     problem: Problem
     trained: Trained  # the averaged fields in ``state``
@@ -55,7 +55,7 @@ class Evaluator:
         return certify_fields(self.problem.validation_view, self.trained, self.state.constants, settings, elsewhere)
 
     def evaluate(self, run: Run) -> Certificate:
-        """A quick certificate of the averaged fields; made anew only once they have changed."""
+        """The certificate on few samples of the averaged fields; made anew only once they have changed."""
         now = (self.state.step, self.state.constants)
         if self.latest is None or self.latest[:2] != now:
             started = time.perf_counter()
@@ -80,7 +80,7 @@ class Evaluator:
         return QUICK_CERTIFICATES * self.seconds + states * state.seconds / max(state.samples, 1)
 
     def reaches(self, gap: float, run: Run) -> bool:
-        """Whether a quick certificate finds the averaged fields within ``gap``."""
+        """Whether a quick evaluation finds the averaged fields within ``gap``."""
         found = self.evaluate(run).plain_gap
         return found is not None and found <= gap
 

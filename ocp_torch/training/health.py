@@ -1,6 +1,7 @@
 """Whether a run is going anywhere: its best evaluation so far, and signs that it diverges or learns nothing."""
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 
@@ -36,7 +37,7 @@ class Evaluation:
     gap: float | None  # relative, from the lower bound to the simulated performance, between the far ends of both
     perf: float | None  # simulated, the upper end of its interval
     noise: float
-    # The gap if `F_M` counts as well: whether its `M` is large enough is for the full certificate to see, not for a look.
+    # The gap if `F_M` counts as well: whether its `M` is large enough is for the full certificate to see.
     supposed: float | None = None
 
     @classmethod
@@ -71,7 +72,7 @@ class Evaluation:
         """What fields are judged by, as a user is told."""
         if self.gap is not None:
             return f"a gap of {100 * self.gap:.3g} %"
-        return f"a performance of {self.perf or float('nan'):.6g}"
+        return f"a performance of {math.nan if self.perf is None else self.perf:.6g}"
 
 
 @dataclass(eq=False)

@@ -28,11 +28,11 @@ from ocp_torch.training.trainer import Trainer
 log = logging.getLogger(__name__)
 # How the names of TensorBoard's files begin.
 EVENTS = "events.out.tfevents."
-# One chart in which the bracket closes, of running estimates, and one of the looks.
+# One chart in which the bracket closes, of running estimates, and one of the quick evaluations.
 BRACKET = {
     "bracket": {
         "while it trains": ["Multiline", [r"running/.*"]],
-        "looks": ["Multiline", [r"bounds/.*", r"performance/.*"]],
+        "quick evaluations": ["Multiline", [r"bounds/.*", r"performance/.*"]],
     }
 }
 TICK = 1.0  # seconds between two movements of the clock
@@ -71,7 +71,7 @@ class Monitor(Silent):
         self.bar = tqdm(total=max(trainer.end, step), initial=step, unit="step", dynamic_ncols=True, disable=hidden)
         self.stages = Stages(hidden)
         self._folder = folder
-        # What is drawn at a look, by name; whoever has a room for figures says how.
+        # What is drawn at a quick evaluation, by name; whoever has a room for figures says how.
         self.pictures: Callable[[Trainer], dict[str, Any]] = lambda _: {}
         self._shown: dict[str, str] = {}
         self._mark = (time.perf_counter(), trainer.samples)

@@ -11,7 +11,7 @@ class Silent:
         """A step was taken; ``log`` says whether it is one to be recorded."""
 
     def evaluated(self, trainer, certificate: Certificate) -> None:
-        """A quick certificate was made."""
+        """A quick evaluation was made."""
 
     def warmed(self, trainer, looked: bool) -> None:
         """A round of the warm start was made; ``looked`` says whether its controller was tried after it."""

@@ -47,7 +47,7 @@ def refine(trainer: "Trainer", monitor: Silent, checkpoint: Path | None, stop: C
     """Refine the averaged `V` of ``trainer``, from which training goes on, if that helps.
 
     It is to be done anew where told to ``stop``. Before the end of a round it is all or nothing: either the equation is
-    solved, and a look finds a good gap, so that training is over, or all stays as it was.
+    solved, and a quick evaluation finds a good gap, so that training is over, or all stays as it was.
     """
     state, settings, started, told = trainer.state, trainer.settings, time.perf_counter(), []
     spent = lambda: time.perf_counter() - started
@@ -71,8 +71,8 @@ def refine(trainer: "Trainer", monitor: Silent, checkpoint: Path | None, stop: C
     state.elapsed += spent()
     every, another = settings.evaluate_every, state.round + 1 < settings.rounds
     if state.refined and not early and another and every and trainer.step % every == 0:
-        state.pending = trainer.ranks.from_first(lambda: trainer.look(monitor, checkpoint))
-    if found is not None and early:  # no look to be shown: the certificate comes next
+        state.pending = trainer.ranks.from_first(lambda: trainer.evaluate(monitor, checkpoint))
+    if found is not None and early:  # not to be shown: the certificate comes next
         goal = min(settings.good_gap, settings.target_gap or math.inf)
         state.solved = trainer.ranks.from_first(lambda: trainer.evaluator.reaches(goal, trainer.run))
         if not state.solved:

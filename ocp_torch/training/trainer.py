@@ -9,7 +9,7 @@ from torch import nn
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields
 from ocp_torch.certificate.settings import Progress, silent
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, first_line
 from ocp_torch.fields import Fields
 from ocp_torch.maths.ranks import Alone, LostError
 from ocp_torch.maths.replays import replays_on
@@ -95,12 +95,12 @@ class Trainer:
         """Train until there is a reason to stop, and return it; save to ``checkpoint`` on the way and at the end.
 
         The reasons: `steps` (all rounds that `settings` allow), `solved` (see `refine`), `max_seconds`, `callback` (it was
-        ``asked`` to), and `target_gap`: a quick certificate is good enough for a full one to decide. Where the full one is
+        ``asked`` to), and `target_gap`: a quick evaluation is good enough for a full one to decide. Where the full one is
         not, `postpone` the end and call this again. A signal that ``signals`` caught raises `Preempted` after the step in
         hand, with the state saved. Raises `NonFiniteError` before an update that is not finite.
 
-        Of several processes each calls this; the first saves, and makes warm starts and looks while the others wait. Raises
-        `LostError`, with the state saved as it was after the last whole step, where one of them ends without a word.
+        Of several processes each calls this; the first saves, and makes warm starts and quick evaluations while the others
+        wait. Raises `LostError`, with the state saved after the last whole step, where one of them ends without a word.
         """
         signals = signals or Signals()
         self.state.ended = False
@@ -177,7 +177,7 @@ class Trainer:
                 monitor.noticed(sentence)
         monitor.stepped(self, report, log)
         if self._due(settings.evaluate_every) and not last:
-            state.pending = self.ranks.from_first(lambda: self.look(monitor, checkpoint))
+            state.pending = self.ranks.from_first(lambda: self.evaluate(monitor, checkpoint))
         state.elapsed += time.perf_counter() - started
         if self._due(settings.checkpoint_every) or state.pending:
             self.save(checkpoint)
@@ -185,8 +185,8 @@ class Trainer:
     def _due(self, every: int) -> bool:
         return every > 0 and self.step % every == 0
 
-    def look(self, monitor: Silent, checkpoint: Path | None) -> bool:
-        """A quick certificate: keep the state if it is the best so far, and see whether it may be good enough to end."""
+    def evaluate(self, monitor: Silent, checkpoint: Path | None) -> bool:
+        """A quick evaluation: keep the state if it is the best so far, and see whether it may be good enough to end."""
         self.state.require_finite()
         certificate = self.evaluator.evaluate(self.run)
         monitor.evaluated(self, certificate)
@@ -240,5 +240,5 @@ class Trainer:
                 raise
             if (told := blamed(error, type(self.problem))) is not None:
                 raise told from None
-            reason = next(iter(str(error).splitlines()), "empty").rstrip(".")
-            raise InputError(f"{checkpoint} does not fit this run ({type(error).__name__}: {reason}).") from None
+            reason = f"{type(error).__name__}: {first_line(error)}"
+            raise InputError(f"{checkpoint} does not fit this run ({reason}).") from None

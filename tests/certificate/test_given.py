@@ -169,7 +169,14 @@ class Sine(torch.nn.Module):
 
 
 FILE = """
+from __future__ import annotations  # with which a dataclass looks its module up
+
 import math
+from dataclasses import dataclass
+
+@dataclass
+class Law:
+    size: float = 0.3
 
 def u(x):
     return 0.3 * (2 * math.pi * x).sin()
@@ -192,11 +199,30 @@ def test_files_are_loaded_or_refused(tmp_path):
         "nowhere.py:u": "does not exist",
         "nowhere": "does not exist",
         "broken.pt": "not a TorchScript file",
-        "broken.py:u": "cannot be run",
+        "broken.py:u": "controller = .* cannot be imported: SyntaxError",
     }
     for source, words in refusals.items():
         with pytest.raises(InputError, match=words):
             load_policy(str(tmp_path / source), Circle())
+
+
+@pytest.mark.filterwarnings("ignore")  # of numbers that overflow
+def test_a_fit_that_fails_costs_its_bounds_alone():
+    """An absurd learning rate: what is simulated stands, and the warning says what is missing; no `V` can be trained so."""
+    wild = replace(CHEAP, stage=replace(CHEAP.stage, lr=1e6), points=64, trajectories=4)
+    certificate = certify(Circle(), saturated, settings=wild, train_steps=0)
+    assert certificate.perf["given"].finite
+    assert any(w.startswith("the certification stage failed: the loss of player") for w in certificate.warnings)
+
+
+class Misshapen(Circle):
+    def state_cost(self, x):
+        return super().state_cost(x).unsqueeze(-1)
+
+
+def test_a_problem_is_checked_before_a_controller_is_certified():
+    with pytest.raises(InputError, match=r"state_cost of .*Misshapen.* \(7,\)"):
+        certify(Misshapen(), saturated, settings=CHEAP, train_steps=0)
 
 
 @pytest.mark.nightly

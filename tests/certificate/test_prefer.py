@@ -1,11 +1,16 @@
 """Which controller is handed out: of the lowest simulated performance, or of the lowest bound without simulation."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from ocp_torch import load_controller
 from ocp_torch.certificate.estimate import known_of
 from ocp_torch.control.policies import density_policy, occupation_density
+from ocp_torch.runs.evaluate import certify_saved
+from support.controllers import controllers
+from support.honesty import BARE
 from support.small import outcome, session, small
 from support.zoo import states
 
@@ -36,6 +41,17 @@ def test_of_the_lowest_bound(tmp_path):
     perf, G = certificate.perf["minimised"], certificate.upper["G"]
     assert perf.interval(0.999)[0] <= G.interval(0.999)[1]
     assert perf.value == pytest.approx(G.value, rel=0.2)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("prefer", ["simulated", "certified"])
+@pytest.mark.parametrize("kind", ["value", "density", "minimised"])
+def test_what_was_handed_out_is_certified_again(kind, prefer):
+    """`evaluate.py` certifies the controller in the file, also where another one of its fields would be chosen today."""
+    controller = controllers("pd plain")[0]
+    saved = replace(controller, kind=kind, certificate={"problem": "circle", "method": "pd"})
+    certificate = certify_saved(saved, replace(BARE, points=64, replicates=2, trajectories=4, tolerance=0.3, prefer=prefer))
+    assert certificate.controller == certificate.subject == kind
 
 
 @pytest.mark.nightly

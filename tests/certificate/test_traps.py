@@ -123,6 +123,26 @@ class Seam(Circle):
         return x[:, 0].remainder(1.0)
 
 
+class Striped(Circle):
+    """Noise that jumps where the coordinate passes from 1 to 0, or whose sign alone does: the law is then the same."""
+
+    def __init__(self, sign: bool = False) -> None:
+        self.sign = sign
+        super().__init__()
+
+    def noise(self, x):
+        part = x.remainder(1.0)
+        return (0.1 * torch.where(part < 0.5, 1.0, -1.0) if self.sign else 0.1 * (1.0 + part)).unsqueeze(-1)
+
+
+def test_noise_that_jumps_at_the_seam_spoils_what_takes_its_divergence():
+    looked = lambda problem: check_problem(problem, replicated_samples(problem, 64, 2, 0, False))
+    jumps = looked(Striped())
+    assert not jumps.smooth_seam
+    assert any(w.startswith("noise jumps by") and "bounds that take its divergence" in w for w in jumps.warnings)
+    assert looked(Striped(sign=True)).warnings == []
+
+
 class Heavy(Circle):
     def initial_density(self, x):
         return torch.full_like(x[:, 0], 1.5)

@@ -8,7 +8,7 @@ from hypothesis import settings as examples
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from ocp_torch.cli.launch import CONFIGS
+from ocp_torch.cli.explain import CONFIGS
 from support.scripted import entered, leaves
 
 pytestmark = pytest.mark.usefixtures("quick_composition")

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from ocp_torch.cli.launch import CHECKOUT
+from ocp_torch.cli.explain import CHECKOUT
 from support.forked import TINY, train
 
 # What a short run has no use for, each with a tenth of a second of CPU or more to import.

@@ -11,7 +11,7 @@ import pytest
 
 from ocp_torch import load_controller
 from ocp_torch.certificate import table
-from ocp_torch.cli.launch import CHECKOUT
+from ocp_torch.cli.explain import CHECKOUT
 from support.forked import assert_succeeded, certificate_in, script
 
 # Enough for a run of its own folder and certificate, and no more.

@@ -8,7 +8,8 @@ import yaml
 
 from ocp_torch import certify
 from ocp_torch.certificate import CertificateSettings, StageSettings
-from ocp_torch.cli.launch import CONFIGS, composed, register_resolvers
+from ocp_torch.cli.compose import composed, register_resolvers
+from ocp_torch.cli.explain import CONFIGS
 from ocp_torch.fields import MODELS
 from ocp_torch.maths.sampling import SAMPLERS
 from ocp_torch.objectives import METHODS

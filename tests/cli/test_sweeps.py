@@ -7,7 +7,7 @@ import time
 import pytest
 import torch
 
-from ocp_torch.cli.launch import isolated
+from ocp_torch.cli.job import isolated
 from ocp_torch.training.checkpoint import load_checkpoint
 from support.bits import differences
 from support.forked import TINY, completed, train

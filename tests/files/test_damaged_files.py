@@ -185,6 +185,12 @@ def test_what_a_killed_process_left_half_written_is_removed(name, tmp_path, monk
     assert sorted(tmp_path.iterdir()) == sorted(others)
 
 
+def test_files_permit_what_the_user_lets_new_files_permit(tmp_path):
+    (tmp_path / "plain").touch()
+    storage.write_atomically(tmp_path / "whole", lambda path: path.touch())
+    assert (tmp_path / "whole").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
 def test_a_run_goes_on_from_the_newest_good_checkpoint_and_says_which_was_not(tmp_path):
     folder = tmp_path / "run"
     trainer = small("method=dual", "trainer.checkpoint_every=5", "trainer.keep=3", "trainer.steps=18")

@@ -77,8 +77,8 @@ def test_arguments_reach_the_problem_and_the_environment(gymnasium):
     assert cuts == [False] * 4 + [True]
     mine = gymnasium.make("ocp_torch/Problem-v0", problem=zoo.Swing(), control_bound=2.0)
     assert mine.unwrapped.control_bound == 2.0
-    for wrong in (dict(dims=3), dict(control_bound=-1.0), dict(time_step=0.0)):
-        with pytest.raises(InputError, match=next(iter(wrong))):
+    for wrong in (dict(dims=3), dict(control_bound=-1.0), dict(time_step=0.0), dict(horizon=-1.0)):
+        with pytest.raises(InputError, match=rf"^(problem\.)?{next(iter(wrong))} is"):
             gymnasium.make("ocp_torch/Manufactured-v0", **wrong)
     with pytest.raises(InputError, match="problem is missing"):
         gymnasium.make("ocp_torch/Problem-v0")

@@ -7,7 +7,7 @@ from hypothesis import settings as examples
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from ocp_torch.cli.launch import CONFIGS, known_fields
+from ocp_torch.cli.explain import CONFIGS, known_fields
 from ocp_torch.problems import Circle
 from ocp_torch.runs.build import build_trainer
 from ocp_torch.runs.record import record

@@ -11,7 +11,7 @@ import time
 import pytest
 import torch
 
-from ocp_torch.cli.launch import CHECKOUT
+from ocp_torch.cli.explain import CHECKOUT
 from ocp_torch.training.checkpoint import load_checkpoint
 from support.bits import differences
 from support.forked import TINY, certificate_in, completed, slowly

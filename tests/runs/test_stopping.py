@@ -14,6 +14,7 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.run import run_to_end
 from ocp_torch.steppers import NonFiniteError
+from ocp_torch.steppers.nonfinite import first_nonfinite
 from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.health import Evaluation, Health, best_constant
 from ocp_torch.training.monitor import Silent
@@ -114,7 +115,7 @@ def test_a_target_that_could_never_be_seen_to_be_reached_is_refused():
 
 
 def test_fields_that_became_worse_are_not_handed_out(tmp_path, monkeypatch):
-    """The best look is at step 8 of 20; the controller and the certificate are of that step, and say so."""
+    """The best evaluation is at step 8 of 20; the controller and the certificate are of that step, and say so."""
     trainer = small(*WAY)
     saved = {}
 
@@ -222,7 +223,7 @@ def test_a_run_that_diverges_hands_out_its_best_look_and_still_fails(tmp_path, m
         return step(batches, phase)
 
     trainer.stepper.step = failing
-    with pytest.raises(InputError, match=r"Training stopped at step 10, before the update: .*best look before"):
+    with pytest.raises(InputError, match=r"Training stopped at step 10, before the update: .*best evaluation before"):
         run(trainer, tmp_path, monkeypatch, lambda t: 0.1)
     made = json.loads((tmp_path / "certificate.json").read_text())
     assert made["stopped"] == "not_finite"
@@ -284,6 +285,22 @@ def test_weights_that_are_not_finite_are_never_saved(tmp_path):
     with pytest.raises(NonFiniteError, match="not finite at any x: the weights of"):
         trainer.fit(Silent(), tmp_path / "last.pt")
     assert (tmp_path / "last.pt").read_bytes() == good
+
+
+class Spotted(Circle):
+    """Noise that is not a number on the left."""
+
+    def noise(self, x):
+        return torch.where(x < 0.5, math.nan, 0.1).unsqueeze(-1)
+
+
+def test_noise_that_is_not_finite_is_named():
+    trainer = small("method=dual")
+    samples = Samples.of(Spotted(), torch.tensor([[0.7], [0.3]]), divergences=False)
+    said = first_nonfinite(trainer.objective, trainer.fields, samples, trainer.phase)
+    assert said.endswith(
+        "at x = [0.3], where the noise of the problem is not finite; it must be finite on the whole torus"
+    )
 
 
 def test_bounds_that_contradict_each_other_stop_nothing_and_choose_nothing(tmp_path, monkeypatch, caplog):

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from ocp_torch.cli.launch import composed
+from ocp_torch.cli.compose import composed
 from ocp_torch.control import policies
 from ocp_torch.errors import InputError
 from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields, SobolevField

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ocp_torch.cli.launch import composed
+from ocp_torch.cli.compose import composed
 from ocp_torch.errors import InputError
 from ocp_torch.fields import VALUE
 from ocp_torch.fields.sobolev import SobolevFeatures

@@ -17,7 +17,7 @@ import pytorch_optimizer  # noqa: F401 (so that no child has to import it)
 import torch
 
 import ocp_torch.runs.run  # noqa: F401 (as above)
-from ocp_torch.cli.launch import CHECKOUT
+from ocp_torch.cli.explain import CHECKOUT
 
 torch.optim.SGD([torch.zeros(1, requires_grad=True)])  # the first optimiser of a process imports much more
 

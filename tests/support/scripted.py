@@ -11,7 +11,7 @@ from unittest import mock
 import torch
 
 from ocp_torch.cli import launch as launching
-from ocp_torch.cli.launch import fail
+from ocp_torch.cli.outcome import fail
 from ocp_torch.errors import InputError
 
 # What takes one of Hydra's configurations, as a command beside `compare`.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ocp_torch.cli.launch import composed, register_resolvers
+from ocp_torch.cli.compose import composed, register_resolvers
 from ocp_torch.errors import InputError
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.runs.run import run_to_end

@@ -27,13 +27,15 @@ LEAST_WORTH = 0.02
 # How many of the lowest states a function is followed downhill from, in search of a negative value, and for how many steps.
 DESCENTS, DESCENT_STEPS = 16, 40
 # The columns of samples, and the functions that give them.
-NAMES = {"f": "state_cost", "a": "drift", "B": "control_matrix", "mu0": "initial_density"}
+NAMES = {"f": "state_cost", "a": "drift", "B": "control_matrix", "mu0": "initial_density", "noise": "noise"}
+DIFFERENTIATED = {"a", "B", "noise"}  # by the bounds that take divergences
 
 
 @dataclass(frozen=True)
 class WellPosed:
     """What was found: ``sound`` where the problem is one (no bound stands without), ``nonnegative`` where `f >= 0` (`J`
-    and `G` need it), ``smooth_seam`` where `a` and `B` do not jump from 1 to 0 (what takes their divergence needs it)."""
+    and `G` need it), ``smooth_seam`` where `a`, `B` and the noise do not jump from 1 to 0 (what takes their divergence needs
+    it)."""
 
     sound: bool
     nonnegative: bool
@@ -50,14 +52,15 @@ def check_problem(problem: Problem, sets: list[Samples], odd: Callable[[], Tenso
 
     Raises `InputError` where a function is not finite.
     """
-    for name in NAMES:
-        for samples in sets:
-            bad = ~torch.isfinite(getattr(samples, name)).reshape(len(samples), -1).all(dim=-1)
+    for samples in sets:
+        for name, column in _columns(samples).items():
+            bad = ~torch.isfinite(column).reshape(len(samples), -1).all(dim=-1)
             if bool(bad.any()):
                 at = place(samples.x[bad][0])
                 raise ProblemError(f"{NAMES[name]} is not finite at {at}; it must be finite on the whole torus.")
     warnings: list[str] = []
-    sizes = {name: max(float(getattr(samples, name).abs().max()) for samples in sets) for name in NAMES}
+    columns = [_columns(samples) for samples in sets]
+    sizes = {name: max(float(column[name].abs().max()) for column in columns) for name in columns[0]}
     x = scrambled_sobol(PROBES, problem.dim, 2, torch.float64)
     whole_numbers = torch.randint(-2, 4, x.shape, generator=fixed_generator()).to(x)
     shifted = _differences(problem, x, x + whole_numbers, ROUNDING, sizes)
@@ -67,7 +70,7 @@ def check_problem(problem: Problem, sets: list[Samples], odd: Callable[[], Tenso
             f"no bound is used: {NAMES[name]} is not periodic, it changes by {size:.3g} when whole numbers are added to x."
         )
     for name in (n for n in seams if n not in shifted):
-        cost = ": bounds that take its divergence are not used" if name in ("a", "B") else ", as a function may"
+        cost = ": bounds that take its divergence are not used" if name in DIFFERENTIATED else ", as a function may"
         warnings.append(f"{NAMES[name]} jumps by {seams[name]:.3g} where a coordinate passes from 1 to 0{cost}.")
     narrow = odd()
     smallest = _smallest(problem.state_cost, sets, "f", narrow)
@@ -92,16 +95,16 @@ def check_problem(problem: Problem, sets: list[Samples], odd: Callable[[], Tenso
             f"integral to be known (all states are worth as much as {100.0 * carried:.2g} % of them)."
         )
     sound = not shifted and positive and whole and carried >= LEAST_WORTH
-    return WellPosed(sound, nonnegative, not {"a", "B"} & seams.keys(), smallest, mass.value, warnings)
+    return WellPosed(sound, nonnegative, not DIFFERENTIATED & seams.keys(), smallest, mass.value, warnings)
 
 
 def _differences(problem: Problem, x: Tensor, y: Tensor, tolerance: float, sizes: dict[str, float]) -> dict[str, float]:
     """The largest difference of each function between rows of ``x`` and ``y``, where it is above that part of its largest
     value anywhere: at the seam a function that is odd is nearly 0."""
-    here, there = (Samples.of(problem, z, divergences=False) for z in (x, y))
+    here, there = (_columns(Samples.of(problem, z, divergences=False)) for z in (x, y))
     found = {}
-    for name in NAMES:
-        left, right = getattr(here, name), getattr(there, name)
+    for name, left in here.items():
+        right = there[name]
         size = float((left - right).abs().max())
         if not size <= tolerance * max(sizes[name], float(left.abs().max()), float(right.abs().max())):
             found[name] = size
@@ -118,6 +121,12 @@ def _seams(problem: Problem, sizes: dict[str, float]) -> dict[str, float]:
         for name, size in _differences(problem, after, before, SEAM_JUMP, sizes).items():
             found[name] = max(size, found.get(name, 0.0))
     return found
+
+
+def _columns(samples: Samples) -> dict[str, Tensor]:
+    """What `NAMES` are of; of the noise `sigma sigma^T`, on which alone the law of a path depends."""
+    found = {name: getattr(samples, name) for name in NAMES}
+    return {name: c @ c.mT if name == "noise" else c for name, c in found.items() if c is not None}
 
 
 def _smallest(function, sets: list[Samples], name: str, odd: Tensor | None) -> float:

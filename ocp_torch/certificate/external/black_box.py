@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, first_line
 from ocp_torch.maths.differences import STEPS, Differenced
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.problems.control_cost import PowerCost
@@ -120,8 +120,7 @@ def _refusal(error: Exception) -> InputError:
     """What a user is told where the controller raised ``error``."""
     if isinstance(error, InputError):
         return error
-    first_line = next(iter(str(error).splitlines()), "").rstrip(".") or "no message"
-    return InputError(f"the controller raised {type(error).__name__}: {first_line}.")
+    return InputError(f"the controller raised {type(error).__name__}: {first_line(error)}.")
 
 
 def require_limit(u: Tensor, x: Tensor, cost: PowerCost) -> None:

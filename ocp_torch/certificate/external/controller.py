@@ -6,7 +6,7 @@ is the control variate of the simulation and, with the suprema of its Bellman sl
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
@@ -38,6 +38,7 @@ class ControllerContext(Context):
     value: Field | None
     network: Callable[..., nn.Module]
     kept: Subsolution | None = None
+    failures: list[str] = field(default_factory=list, init=False)  # of the fit to the closed loop, in words
 
     external = True
     kind = GIVEN
@@ -56,7 +57,11 @@ class ControllerContext(Context):
         if not self.problem.gives_divergences:
             return None
         how = self.constants, self.settings.stage, self.seed
-        return in_float64(fit_closed_loop(self.problem, self.policy, None, self.network, *how))
+        try:
+            return in_float64(fit_closed_loop(self.problem, self.policy, None, self.network, *how))
+        except ArithmeticError as error:
+            self.failures.append(f"the certification stage failed: {error}")
+            return None
 
     @cached_property
     def _initial(self) -> list[float] | None:
@@ -97,5 +102,8 @@ class ControllerContext(Context):
         notes = [] if self.value is not None else ["no lower bound: there is no V to give one."]
         if self.settings.stage.steps and self.fitted is None:
             unknown = self.problem.unknown_divergences
-            notes.append(f"no bound on Perf without simulation: this problem gives no divergences of {unknown}.")
+            unknown = (
+                unknown and f"no bound on Perf without simulation: this problem gives no divergences of {unknown}."
+            )
+            notes += [unknown] if unknown else self.failures
         return notes

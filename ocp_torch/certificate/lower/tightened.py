@@ -55,7 +55,7 @@ def new_states(problem: Problem, batch: int) -> int:
 def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> Iterator[Subsolution | None]:
     """`W` for ``value`` `V`, in float64, after each round of training in float32 on up to ``batch`` states a step, and `None`
     after each step; nothing where `V` has no weights, nothing more where these do not stay finite. Fewer states than `BATCH`
-    are for a quick certificate, with as many times fewer steps."""
+    are for a quick evaluation, with as many times fewer steps."""
     if not isinstance(value, nn.Module) or not any(True for _ in value.parameters()):
         return
     objective, unit = LevelledDual(problem), cost_unit(problem)

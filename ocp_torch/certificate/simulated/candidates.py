@@ -14,9 +14,9 @@ from ocp_torch.problems.problem import Problem
 
 # Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
 # a controller that another one clearly beats; but without noise so few in all as the second number take hardly longer than a
-# part of them (with noise the finest steps take longest: 2.2 s for the worse controller of a pendulum in a look of 5.3 s).
-# Their steps need not be as fine either: the third is by how many times, and the last how often they are halved at most (four
-# times as elsewhere took 3.5 minutes of a look for a controller that trembled, and cost 40 % more than the best).
+# part of them (with noise the finest steps take longest: 2.2 of 5.3 s of a quick evaluation for the worse controller of a
+# pendulum). Their steps need not be as fine either: the third is by how many times, and the last how often they are halved at
+# most (four times as elsewhere took 3.5 minutes for a controller that trembled, and cost 40 % more than the best).
 BASELINE_PART, CHEAP, ROUGH, HALVED = 4, 256, 200.0, 1
 # Without noise a controller that holds its control is simulated from so many times as many starts: 512 in each of 8 sets took
 # 45 s for 36 on a pendulum with limited torque, and the standard error fell from .004 to .006 to .002 to .003.

@@ -40,8 +40,8 @@ from ocp_torch.problems.starts import initial_points
 # Simulation sets come after those of the bounds in the stream of evaluation points.
 SIMULATION_REPLICATE = 1000
 # What is left of the discount when simulation stops, times the rate's supremum, relative to the answer: that part of the
-# tolerance, and so much at least and at most. At the tolerance of a look, 5e-4, it is the least; only rough simulations stop
-# earlier. The answer is taken to be at least the last part of the mean state cost at the starts.
+# tolerance, and so much at least and at most. At the tolerance of a quick evaluation, 5e-4, it is the least; only rough
+# simulations stop earlier. The answer is taken to be at least the last part of the mean state cost at the starts.
 TAIL_PART, SMALLEST_TAIL, LARGEST_TAIL, LEAST = 0.04, 2e-5, 0.02, 0.1
 # States to which the starts' mean cost is compared, how many standard errors apart the two must be, and by how many times
 # that the interval is widened: trajectories may stay where no start was.

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ocp_torch.errors import InputError, ProblemError, require_integer
+from ocp_torch.errors import InputError, ProblemError, first_line, require_integer
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.problems.simulator.target import Workers, asked, resolved
 
@@ -77,8 +77,7 @@ class Oracle:
                 asked(self._function, half, self.one_by_one)
             except Exception as other:  # whatever a stranger's code may raise
                 x, error = half, other
-        reason = next(iter(str(error).splitlines()), "").rstrip(".") or "no message"
-        return f"the oracle raised {type(error).__name__} at x = {x[0].tolist()}: {reason}."
+        return f"the oracle raised {type(error).__name__} at x = {x[0].tolist()}: {first_line(error)}."
 
     def _shaped(self, answer: object, x: np.ndarray) -> dict[str, Tensor]:
         """The parts of ``answer`` by name, as float64 tensors; `InputError` where one is missing or misshapen."""

@@ -24,15 +24,15 @@ PATIENCE = 2.0
 DIED = "a process of problem.workers died; try problem.workers=1 to see why."
 
 
-def resolved(target: str) -> Callable:
-    """The function that module:function or FILE.py:function names."""
+def resolved(target: str, field: str = "problem.target") -> Callable:
+    """The function that module:function or FILE.py:function names; ``field`` is where it was asked for."""
     source, _, name = target.rpartition(":")
     if not source or not name:
-        raise InputError(f"problem.target is {target!r}, but must be module:function or FILE.py:function.")
+        raise InputError(f"{field} is {target!r}, but must be module:function or FILE.py:function.")
     try:
         if source.endswith(".py"):
             if kind(source) is None:
-                raise InputError(f"problem.target names {source}, which does not exist.")
+                raise InputError(f"{field} names {source}, which does not exist.")
             require_file(source)
             spec = importlib.util.spec_from_file_location(Path(source).stem, source)
             assert spec is not None  # as for every .py file
@@ -45,10 +45,10 @@ def resolved(target: str) -> Callable:
     except InputError:
         raise
     except (Exception, SystemExit) as error:  # whatever a stranger's module may raise
-        raise InputError(f"problem.target = {target} cannot be imported: {type(error).__name__}: {error}.") from None
+        raise InputError(f"{field} = {target} cannot be imported: {type(error).__name__}: {error}.") from None
     if not callable(found := getattr(module, name, None)):
         known = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
-        raise InputError(f"problem.target = {target}: the module has no function {name!r}{nearest(name, known)}.")
+        raise InputError(f"{field} = {target}: the module has no function {name!r}{nearest(name, known)}.")
     return found
 
 

@@ -67,8 +67,8 @@ def metrics(problem: Problem, policy: Policy, seed: int = 0, starts: int = START
 
 def random_starts(problem: Problem, count: int, seed: int) -> Tensor:
     """``(count, d)`` float64: drawn from `mu0` where it is narrow or in a box; else uniform admissible ones, or any."""
-    whole = type(problem).initial_density is not System.initial_density
-    boxed = isinstance(problem, System) and bool(problem.chart.boxed) and not whole
+    own_start = type(problem).initial_density is not System.initial_density
+    boxed = isinstance(problem, System) and bool(problem.chart.boxed) and not own_start
     if boxed or starts_narrowly(problem):
         x = drawn_starts(problem, DRAWN * count, seed)
     else:

@@ -28,7 +28,7 @@ ADVICE = {
     "worse than doing nothing": "Do not use this controller. Train longer, or begin with `warm_start.mode=on`.",
     "this run diverges": "Start again with a smaller `optimizer.lr`, or set `stepper.clip`.",
     "handed out are the averaged fields": "Change what the sentence names and resume, or start again.",
-    "the numbers are those of the quick look": "Correct what failed in the problem, then evaluate again.",
+    "the numbers are those of the quick evaluation": "Correct what failed in the problem, then evaluate again.",
     "it is not so that": "Nothing: the guess is dropped, and the rest stands.",
     "mu is 0 at sampled states": "Trust the controller from `V`, or the Lagrangian bound.",
     "is not finite; it is left out": "Nothing, where another controller is there; else train with a smaller `optimizer.lr`.",

@@ -38,7 +38,6 @@ def commands(folder: Path, problem: Problem, config: dict, certificate: dict) ->
     if problem.has_simulator:
         environment = f"ocp_torch/{type(problem).__name__ if ours else 'Problem'}-v0"
         found.append(("See it at work", typed("rollout", f"run={run}", f"env={environment}", "video=out.gif", *own)))
-    if problem.has_simulator:
         found.append(("Use it without PyTorch", typed("export", f"run={run}", "out=controller.c", *own)))
     found.append(("Look at the curves", shlex.join(["tensorboard", "--logdir", str(folder)])))
     found.append(("Put runs side by side", typed("compare", str(folder.parent), "html=runs.html")))

@@ -78,7 +78,7 @@ def learning(found: history.Curves, certificate: dict) -> str:
     group = lambda name: history.group(found, name)
     perf = {n: points for n, points in group("performance").items() if n == certificate.get("controller")}
     bounds, lower, best = group("bounds"), certificate["lower"], certificate["gap"]["lower_from"]
-    # The axis holds what the gap is between, in the second half of the looks: at first bounds are anywhere.
+    # The axis holds what the gap is between, in the second half of the quick evaluations: at first bounds are anywhere.
     held = [bounds[name] for name in ([best] if best else lower) if name in bounds] + list(perf.values())
     tight = [y for points in held for _, y in points[(len(points) - 1) // 2 :]]
     curves = {words.label("lower", name): bounds.pop(name) for name in lower if name in bounds}
@@ -90,7 +90,7 @@ def learning(found: history.Curves, certificate: dict) -> str:
     late = [y for points in shown for _, y in points[len(points) // 2 :]]
     charts = {
         "The bracket closes: running estimates": chart(running, span=late),
-        "The bracket closes: looks": chart(curves, span=tight),
+        "The bracket closes: quick evaluations": chart(curves, span=tight),
         "Gap": chart(group("gap"), log=True),
         "Losses": chart(group("loss")),
         "Violations": chart(group("violation"), log=True),

@@ -1,12 +1,10 @@
 """What a report says of a certificate in words: which number to trust, what each bound is, and what it rests on."""
 
-import math
-
 from ocp_torch.certificate import bounds
 from ocp_torch.certificate.bound import LOWER, UPPER
 from ocp_torch.certificate.report import CONTROLLERS, MEANS, holding
-from ocp_torch.errors import visible
 from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED
+from ocp_torch.runs.compare import number
 
 # A certified gap up to this, or up to so many times the simulated one, says enough of the controller.
 NARROW, FAR = 0.01, 2.0
@@ -33,13 +31,6 @@ BASES = {
     SEARCHED: "the largest value that samples and local ascents met: an estimate from below, which more effort may raise",
     GUESSED: "a multiple of something seen; what rests on it enters no gap that counts",
 }
-
-
-def number(value) -> float:
-    """``value`` of a file as a number that can be drawn; `ValueError` or `TypeError` otherwise."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(f"{visible(value, 80)} is not a number")
-    return float(value)
 
 
 def percent(part) -> str:

@@ -8,8 +8,9 @@ import torch
 from tqdm import tqdm
 
 from ocp_torch.certificate.settings import require_possible
-from ocp_torch.control.controller import problem_name
+from ocp_torch.control.described import problem_name
 from ocp_torch.errors import InputError, call, require_choice, require_integer, require_number, require_section
+from ocp_torch.files.storage import write_atomically
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants, resolve_constants
 from ocp_torch.runs.build import build_certificate_settings, build_problem, build_trainer
@@ -95,7 +96,7 @@ class Contest:
                     bar.update()
         families = joined([*([self._family(curves)] if curves else []), *self.beside])
         text = tables(families, self.gap)
-        (folder / "benchmark.md").write_text(text + "\n")
+        write_atomically(folder / "benchmark.md", lambda path: path.write_text(text + "\n"))
         save(drawn(pictures(families, self.gap)), folder)
         log.info("\n%s\n\nwritten to %s", text, folder)
         return curves

@@ -10,6 +10,7 @@ import torch
 from tqdm import tqdm
 
 from ocp_torch.errors import InputError, require_choice, require_integer, require_section
+from ocp_torch.files.storage import write_atomically
 from ocp_torch.studies.benchmark.measure import median_and_spread
 from ocp_torch.studies.paper import figures
 from ocp_torch.studies.paper.runs import NOISE, RECIPES, Comparison, History, carry_out, compare_with_exact, truth
@@ -48,10 +49,10 @@ def reproduce(checked: tuple[tuple[int, ...], int, dict[str, int]], folder: Path
             bar.set_postfix_str(f"{name}, exact kernel")
             comparisons.append(compare_with_exact(recipe, exact[name], modes, seeds[0], tick=bar.update))
     text = report(histories, comparisons, seeds, modes) + f"\nIn all {time.perf_counter() - started:.0f} s.\n"
-    (folder / "numbers.md").write_text(text)
+    write_atomically(folder / "numbers.md", lambda path: path.write_text(text))
     numbers = {name: history.numbers for name, history in histories.items()}
     record = {"numbers": numbers, "comparisons": [asdict(c) for c in comparisons]}
-    (folder / "numbers.json").write_text(json.dumps(record, indent=1) + "\n")
+    write_atomically(folder / "numbers.json", lambda path: path.write_text(json.dumps(record, indent=1) + "\n"))
     drawn = {"mu_star": figures.optimal_occupation(), "cost_per_step": figures.costs(comparisons)}
     for name, history in histories.items():
         drawn |= {f"{name}_performance": figures.evolution(history), f"{name}_iterates": figures.iterates(history)}

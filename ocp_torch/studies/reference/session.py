@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from ocp_torch.control.controller import Controller, problem_name
+from ocp_torch.control.controller import Controller, controller_file
+from ocp_torch.control.described import problem_name
 from ocp_torch.errors import InputError, require_integer, require_section
 from ocp_torch.files.reading import FOLDER, kind, require_unlinked
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.runs.build import build_problem
+from ocp_torch.runs.canvas import save_figure
 from ocp_torch.runs.evaluate import load_run
 from ocp_torch.studies.reference.figure import draw
 from ocp_torch.studies.reference.grid import Grid, grid_sides, require_solvable
@@ -42,8 +44,8 @@ class ReferenceJob:
             if target.startswith("ocp_torch.") and not target.endswith((".Simulator", ".Callable")):
                 raise InputError("problem and run are both given, but the run names its problem; leave problem out.")
             self.controller = load_run({"run": config["run"], "problem": section})
-            self.problem, path = self.controller.problem, Path(str(config["run"]))
-            folder = path if path.is_dir() else path.parent
+            self.problem = self.controller.problem
+            folder = controller_file(Path(str(config["run"]))).parent
             require_unlinked(folder, ("figures",))
             self.figure = folder / "figures" / "reference.png"
         self.side, self.memory = config["side"], config["memory"]
@@ -63,7 +65,7 @@ class ReferenceJob:
             log.info("saved in %s", self.file)
         if self.controller is not None:
             figure = draw(reference, self.controller)
-            write_atomically(self.figure, lambda temporary: figure.savefig(temporary, dpi=120, format="png"))
+            save_figure(figure, self.figure, "run")
             log.info("drawn in %s", self.figure)
         return reference
 
