@@ -50,7 +50,9 @@ def test_what_was_handed_out_is_certified_again(kind, prefer):
     """`evaluate.py` certifies the controller in the file, also where another one of its fields would be chosen today."""
     controller = controllers("pd plain")[0]
     saved = replace(controller, kind=kind, certificate={"problem": "circle", "method": "pd"})
-    certificate = certify_saved(saved, replace(BARE, points=64, replicates=2, trajectories=4, tolerance=0.3, prefer=prefer))
+    certificate = certify_saved(
+        saved, replace(BARE, points=64, replicates=2, trajectories=4, tolerance=0.3, prefer=prefer)
+    )
     assert certificate.controller == certificate.subject == kind
 
 

@@ -15,6 +15,7 @@ from ocp_torch.certificate.bound import LOWER, Bound, sentence_on
 from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
 from ocp_torch.certificate.estimate import Estimate, integrals
 from ocp_torch.certificate.lower.slack import (
+    NEGLIGIBLE,
     STARTS,
     TOP,
     Peaks,
@@ -121,14 +122,17 @@ class Shift:
     def _scaled(self, everywhere: SlackParts, plain: Extremum) -> Scaling:
         """The multiple 1, whose supremum is ``plain``, or that which maximises the bound over ``everywhere``.
 
-        The supremum at the maximiser is searched for anew, and 1 stays where that shows no gain. Where `f < 0` is met the
-        problem breaks its promise, `0` is no subsolution to scale towards, and `theta` is 1.
+        The supremum at the maximiser is searched for anew, and 1 stays where the states or that show no gain. Where `f < 0`
+        is met the problem breaks its promise, `0` is no subsolution to scale towards, and `theta` is 1.
         """
         mean = sum(self.initial) / len(self.initial)
         unscaled = Scaling(1.0, mean, plain)
         if bool((everywhere.f < 0.0).any()):
             return unscaled
         theta = scaled_by(everywhere, mean)
+        gain = (theta - 1.0) * mean + float(everywhere.slack(1.0).max() - everywhere.slack(theta).max())
+        if gain <= NEGLIGIBLE * abs(mean):  # as of a `V` that solves the equation: nothing to climb for
+            return unscaled
         scaled = Scaling(theta, mean, climbed(self.problem, self.value, everywhere, theta, self.ascents))
         return max(unscaled, scaled, key=lambda scaling: scaling.bound)
 
