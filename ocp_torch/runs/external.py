@@ -9,11 +9,12 @@ from torch import Tensor, nn
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, certify_policy, in_float64, table
 from ocp_torch.certificate.external.black_box import BlackBox, require_limit
+from ocp_torch.certificate.external.value import Periodic, require_differentiable
 from ocp_torch.certificate.settings import require_possible
 from ocp_torch.control.controller import Controller
 from ocp_torch.control.described import described, problem_name
 from ocp_torch.control.policies import Policy
-from ocp_torch.errors import InputError, require_flag, require_integer
+from ocp_torch.errors import InputError, first_line, require_flag, require_integer
 from ocp_torch.fields import Fields, Subsolution
 from ocp_torch.fields.fields import VALUE, cost_unit
 from ocp_torch.files.storage import write_atomically
@@ -24,6 +25,7 @@ from ocp_torch.maths.supremum import batched
 from ocp_torch.objectives import Dual, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants, resolve_constants
+from ocp_torch.problems.problem import shipped
 from ocp_torch.runs import canvas, loading
 from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem, checked_problem, use_threads
 from ocp_torch.runs.figures import interval_figure
@@ -50,9 +52,10 @@ def certify(
     """What ``controller`` costs on ``problem``, and how far from optimal it can be.
 
     ``controller`` maps states ``(N, d)`` in the unit cell to controls ``(N, m)``: any function of tensors or arrays, or a
-    `Controller` of ours. ``value`` is a `V` to judge it by, ``(N, d) -> (N,)`` and smooth, or a `Controller` that holds
-    one; where it is `None` one is trained by the dual, for ``train_steps`` (default: by dimension; 0 for none, and then
-    there is no lower bound). Raises `InputError` where the controller or the value fails.
+    `Controller` of ours. ``value`` is a `V` to judge it by, ``(N, d) -> (N,)`` on the unit cell, continuous there and from 1
+    to 0, and differentiable by PyTorch but for kinks (with noise without them), or a `Controller` that holds one; where it is
+    `None` one is trained by the dual, for ``train_steps`` (default: by dimension; 0 for none, and then there is no lower
+    bound). Raises `InputError` where the problem, the controller or the value fails.
     """
     require_integer("seed", seed, 0)
     if not problem.has_simulator:
@@ -117,21 +120,24 @@ def policy_of(controller: Callable | Controller, problem: Problem) -> Policy:
 
 
 def value_of(value: Field | Controller, problem: Problem) -> Field:
-    """`V` in float64, tried on a few states."""
+    """`V` in float64: the network of a `Controller` of ours, or anything else on the unit cell, tried on a few states."""
     if isinstance(value, Controller):
         if value.fields.value is None:
             raise InputError("value is a controller without V; give one trained by dual or pd.")
-        value = in_float64(value.fields).value
-    elif isinstance(value, nn.Module):
-        value = in_float64(value)
+        return in_float64(value.fields).value
+    value = in_float64(value) if isinstance(value, nn.Module) else value
     x = torch.full((2, problem.dim), 0.25, dtype=torch.float64)
     try:
         out = value(x)
     except Exception as error:  # whatever a stranger's code may raise
-        raise InputError(f"value raised {type(error).__name__}: {error}.") from None
+        raise InputError(f"value raised {type(error).__name__}: {first_line(error)}.") from None
     if not isinstance(out, Tensor) or out.shape != (2,) or not bool(torch.isfinite(out).all()):
         shape = tuple(getattr(out, "shape", ()))
         raise InputError(f"value gave {shape} for states (2, {problem.dim}), but must give finite numbers (N,).")
+    if shipped(type(value)):
+        return value
+    value = Periodic(value)
+    require_differentiable(value, problem)
     return value
 
 

@@ -11,7 +11,9 @@ from ocp_torch import InputError, certify
 from ocp_torch.certificate import StageSettings, table
 from ocp_torch.certificate.external.black_box import BlackBox
 from ocp_torch.problems import Circle, Manufactured
+from ocp_torch.runs.external import value_of
 from ocp_torch.runs.loading import load_policy
+from support import zoo
 from support.controllers import controllers
 from support.forked import assert_succeeded, certificate_in, script
 from support.honesty import BARE
@@ -238,3 +240,46 @@ def test_the_script_leaves_a_certificate_and_its_figure(tmp_path):
     wrong = script("certify", "controller=law.py:w", *own, cwd=tmp_path)
     assert (wrong.returncode, "Traceback" in wrong.stderr) == (2, False)
     assert "no function 'w'" in wrong.stderr
+
+
+def bowl(x):
+    return 0.2 - 0.1 * (TURN * x[:, 0]).cos()
+
+
+# Functions that are no `V` to judge by, with what is said of them; with noise in the last ones.
+ODD_VALUES = {
+    "a table": (lambda x: bowl(((1000 * x).floor() + 0.5) / 1000), 0.0, "value jumps by 0.00.* at x = "),
+    "no period": (lambda x: 0.1 * (0.5 * TURN * x[:, 0]).cos(), 0.0, "value jumps by 0.2 at x = .* passes from 1 to 0"),
+    "detached": (
+        lambda x: bowl(x.detach()) + 0.0 * x[:, 0],
+        0.0,
+        "the gradient of value by autograd is another function's",
+    ),
+    "half of it": (lambda x: torch.where(x[:, 0] < 0.4, bowl(x.detach()), bowl(x)), 0.0, "another function's"),
+    "kinks": (lambda x: 0.1 * (x[:, 0] - 0.5).abs(), 0.01, "gradient of value jumps by 0.2 at x = .*; with noise"),
+    "bent": (lambda x: bowl(x) + (x - x.detach())[:, 0] * bowl(x.detach()), 0.01, "gradient of value"),
+}
+
+
+@pytest.mark.parametrize("name", ODD_VALUES)
+def test_a_value_that_is_not_what_its_derivatives_say_is_refused(name):
+    value, noise, said = ODD_VALUES[name]
+    with pytest.raises(InputError, match=said):
+        certify(Circle(noise=noise), saturated, value=value, settings=UNFITTED)
+
+
+@zoo.on(("circle rho=2", "manufactured 2-d q=1.5"))
+def test_what_is_continuous_is_a_value(problem):
+    """Exact ones, a piecewise linear table, single precision, a constant; whatever it says beyond the unit cell."""
+    table = lambda y: torch.lerp(
+        bowl(y.floor()[:, None] / 64), bowl((y.floor() + 1)[:, None] / 64), y - y.detach().floor()
+    )
+    for value in (
+        problem.exact_value,
+        bowl,
+        lambda x: bowl(x.float()),
+        lambda x: table(64 * x[:, 0]),
+        lambda x: 0.3 + 0 * x[:, 0],
+    ):
+        inside = lambda x, value=value: torch.where((x < 0).any(-1) | (x >= 1).any(-1), math.nan, value(x))
+        assert torch.isfinite(value_of(inside, problem)(torch.tensor([[1.7] * problem.dim], dtype=torch.float64))).all()
