@@ -64,6 +64,11 @@ def certify(context: Context) -> Certificate:
                 if estimate is not None and estimate.bias
             ),
             *context.remarks,
+            *(
+                f"nothing certain is known of what the controller from {name} costs: {found.jumped_over}."
+                for name, found in simulated.items()
+                if found.jumped_over
+            ),
         ],
         searches=list(dict.fromkeys(line for bound in bounds for line in bound.searches(context))),
         about={bound.name: bound.about(context) for bound in bounds if bound.side == UPPER},

@@ -7,7 +7,7 @@ the paths of the one before (multilevel Monte Carlo: Giles, 2008), and costs no 
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -98,16 +98,33 @@ def path_integral(
     Where dynamics are `Switched` the rate is that after the jump: what is wrong with it is of the order that halved steps
     and extrapolation take off.
     """
-    parts, x, total = grid.parts, x0, torch.zeros_like(grid.horizon)
-    widths = torch.nn.functional.pad(parts.diff(), (1, 1))
-    for k, part in enumerate(parts.tolist()):
+    x, total = x0, torch.zeros_like(grid.horizon)
+    widths = torch.nn.functional.pad(grid.parts.diff(), (1, 1))
+    for k, (after, rate) in enumerate(_states(dynamics, noise, x0, grid, moves)):
+        x = after
+        total = total + 0.5 * float(widths[k] + widths[k + 1]) * weight(grid.horizon, float(grid.parts[k])) * rate
+    return total, x
+
+
+@torch.no_grad()
+def path_of(dynamics: Dynamics, noise: Callable[[Tensor], Any], x0: Tensor, grid: Grid, seed: int) -> Tensor:
+    """The states ``(steps + 1, N, d)`` of paths like those of `path_integral`."""
+    moves = increments(grid, noise(x0[:1]).shape[-1], 0, seed, len(x0))
+    return torch.stack([x for x, _ in _states(dynamics, noise, x0, grid, moves)])
+
+
+def _states(
+    dynamics: Dynamics, noise: Callable[[Tensor], Any], x0: Tensor, grid: Grid, moves: Tensor
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """The states before the steps and after the last one, and their rates."""
+    x, widths = x0, grid.parts.diff()
+    for k in range(grid.steps + 1):
         x = Switched.before(dynamics, k, grid.steps, x) if k < grid.steps else x
         velocity, rate = dynamics(x)
-        total = total + 0.5 * float(widths[k] + widths[k + 1]) * weight(grid.horizon, part) * rate
+        yield x, rate
         if k < grid.steps:
-            step = float(widths[k + 1]) * grid.horizon.unsqueeze(-1)
+            step = float(widths[k]) * grid.horizon.unsqueeze(-1)
             x = x + step * velocity + torch.einsum("ndk,nk->nd", noise(x), moves[k])
-    return total, x
 
 
 class Mean(NamedTuple):
@@ -117,6 +134,7 @@ class Mean(NamedTuple):
     refinement: Tensor  # (replicates,) what finer steps, extrapolated, add to the weighted mean of each replicate
     end: Tensor  # (N, d) on the first steps
     bias: float  # a bound on the error of the mean over all replicates
+    steps: int  # the finest
 
 
 @torch.no_grad()
@@ -182,4 +200,5 @@ def expectation(
         of = slice(exact.shape[1])
         off = (mass[:, of] * (exact - integrals[:, of])).flatten()
         bias += abs(float(off.mean())) + 2.0 * float(off.std()) / math.sqrt(len(off))
-    return Mean(integrals.flatten(), extrapolated - (mass * integrals).mean(dim=1), end, bias)
+    steps = grid.steps * 2**halvings
+    return Mean(integrals.flatten(), extrapolated - (mass * integrals).mean(dim=1), end, bias, steps)

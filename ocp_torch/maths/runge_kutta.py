@@ -5,8 +5,9 @@ libraries choose one step for a whole batch, so that a single trajectory at a ju
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -60,16 +61,32 @@ def discounted_integral(
     unless ``wrap`` is false: not every coordinate need be an angle. The discount multiplies the rate inside the scheme, so
     that state and integral are one smooth system of order 4.
     """
-    time = lambda s: horizon * s**grading
     pace = lambda s: horizon * grading * s ** (grading - 1.0)
-    weight = lambda s: rho * math.exp(-rho * time(s)) * pace(s)
+    weight = lambda s: rho * math.exp(-rho * horizon * s**grading) * pace(s)
     x, total, ds = x0, x0.new_zeros(()), 1.0 / steps
-    for k in range(steps):
-        x = Switched.before(dynamics, k, steps, x)
+    for k, (after, (r1, r2, r3, r4)) in enumerate(_steps(dynamics, x0, horizon, steps, grading)):
+        x = after
         start, middle, end = k * ds, (k + 0.5) * ds, (k + 1.0) * ds
-        x, (r1, r2, r3, r4) = _step(dynamics, x, tuple(ds * pace(s) for s in (start, middle, end)))
         total = total + ds / 6.0 * (weight(start) * r1 + 2.0 * weight(middle) * (r2 + r3) + weight(end) * r4)
     return total, x.remainder(1.0) if wrap else x
+
+
+@torch.no_grad()
+def path_of(dynamics: Dynamics, x0: Tensor, horizon: float, steps: int, grading: float = 1.0) -> Tensor:
+    """The states ``(steps + 1, N, d)`` of the steps that `discounted_integral` takes."""
+    return torch.stack([x0, *(x for x, _ in _steps(dynamics, x0, horizon, steps, grading))])
+
+
+def _steps(
+    dynamics: Dynamics, x0: Tensor, horizon: float, steps: int, grading: float
+) -> Iterator[tuple[Tensor, tuple[Tensor, ...]]]:
+    """The state after each step, and the rates at its four stages."""
+    pace = lambda s: horizon * grading * s ** (grading - 1.0)
+    x, ds = x0, 1.0 / steps
+    for k in range(steps):
+        x = Switched.before(dynamics, k, steps, x)
+        x, rates = _step(dynamics, x, tuple(ds * pace(s) for s in (k * ds, (k + 0.5) * ds, (k + 1.0) * ds)))
+        yield x, rates
 
 
 @torch.no_grad()
@@ -105,6 +122,16 @@ def _step(dynamics: Dynamics, x: Tensor, h: tuple) -> tuple[Tensor, tuple[Tensor
     return x + (h[0] * v1 + 2.0 * h[1] * (v2 + v3) + h[2] * v4) / 6.0, (r1, r2, r3, r4)
 
 
+class Refined(NamedTuple):
+    """``results`` ``(N,)`` and ``ends`` ``(N, d)`` of trajectories, a bound on the ``error`` of the results' mean, and how
+    many ``steps`` ``(N,)`` each took."""
+
+    results: Tensor
+    ends: Tensor
+    error: float
+    steps: Tensor
+
+
 def in_finer_steps(integrate: Integrate, times: Tensor) -> Integrate:
     """``integrate`` with so many ``times`` ``(N,)`` the steps that it is asked for, at least 1, trajectory by trajectory."""
 
@@ -129,8 +156,8 @@ def refined(
     audit: Integrate | None = None,
     doublings: int = MAX_DOUBLINGS,
     audited: int = AUDITED,
-) -> tuple[Tensor, Tensor, float]:
-    r"""Results and end states of all trajectories, and a bound on the error of the results' mean by ``weights`` ``(N,)``.
+) -> Refined:
+    r"""Results of all trajectories, and a bound on the error of their mean by ``weights`` ``(N,)``.
 
     While the mean change is above ``tolerance``, or a tenth of it and of the ``standard_error`` of the results, those that
     still change by more than ``tolerance`` on halving the step are halved again, ``doublings`` times at most, and while they
@@ -161,7 +188,7 @@ def refined(
         factor[active] = max(1.0, ratio / (1.0 - ratio))
     seen = float((weights * change * factor).mean())
     if not audited:
-        return result, end, seen
+        return Refined(result, end, seen, taken)
     picked = torch.randperm(len(weights), generator=generator)[:audited]
     missed = torch.zeros_like(weights[picked])
     finest = finest if audit is None else max(finest, int(taken[picked].max()))
@@ -171,4 +198,4 @@ def refined(
         missed[rough] = weights[rows] * ((audit or integrate)(rows, finest)[0] - result[rows])
     noise = float(missed.std()) / math.sqrt(len(missed)) if len(missed) > 1 else 0.0
     unseen = abs(float(missed.mean())) + 2.0 * noise
-    return result, end, seen + unseen
+    return Refined(result, end, seen + unseen, taken)

@@ -259,7 +259,7 @@ def test_a_standard_error_spares_halvings_and_hides_no_error(order):
     def run(standard_error):
         taken.clear()
         generator = torch.Generator().manual_seed(0)
-        result, _, bias = refined(
+        result, _, bias, _ = refined(
             integrate, torch.ones_like(sizes), 4, tolerance, generator, lambda results: standard_error
         )
         return float(result.mean()) - 1.0, bias, sum(taken)
@@ -283,7 +283,7 @@ def test_one_trajectory_that_hardly_counts_is_not_halved_any_more(jump, finest):
         return 3.0 * tolerance * size, torch.zeros(len(rows), 1, dtype=torch.float64)
 
     found = refined(integrate, torch.ones(count).double(), 4, tolerance, torch.Generator().manual_seed(1))
-    result, _, bias = found
+    result, _, bias, _ = found
     assert max(taken) == finest
     assert abs(float(result.mean())) <= bias
 
@@ -296,7 +296,7 @@ def test_what_rounds_is_audited_however_fine_the_steps_of_all_trajectories_are()
         return lambda rows, steps: (1.0 + off + sizes[rows] * float(steps) ** -8, end[rows])
 
     how = torch.ones_like(sizes), 4, 1e-3, torch.Generator().manual_seed(0), lambda results: 0.0
-    result, _, bias = refined(by(rounding), *how, by(0.0))
+    result, _, bias, _ = refined(by(rounding), *how, by(0.0))
     assert float(result.mean()) - 1.0 == pytest.approx(rounding, rel=0.2)
     assert rounding <= bias < 1.5 * rounding
     assert refined(by(rounding), *how)[2] < 0.2 * rounding
@@ -306,7 +306,7 @@ def test_what_rounds_is_audited_however_fine_the_steps_of_all_trajectories_are()
         asked.append(steps)
         return by(rounding)(rows, steps)
 
-    plain, _, seen = refined(counted, *how, by(0.0), audited=0)
+    plain, _, seen, _ = refined(counted, *how, by(0.0), audited=0)
     assert torch.equal(plain, result)
     assert 0.0 < seen < 0.2 * rounding
     assert asked == [2, 4, *(2**k for k in range(3, 3 + len(asked) - 2))]  # halvings alone

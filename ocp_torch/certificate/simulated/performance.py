@@ -14,6 +14,7 @@ from torch import Tensor
 from ocp_torch.certificate.checks.tails import unmet, widened
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
+from ocp_torch.certificate.simulated.between import jumped_over
 from ocp_torch.certificate.simulated.held import held_integrals
 from ocp_torch.certificate.simulated.loops import FeedbackLoop, HeldLoop, Loop, Sliding, loop_of
 from ocp_torch.certificate.simulated.steps import Steps
@@ -56,6 +57,8 @@ ROUNDED = 0.1
 # to the simulation changes faster than what it takes off. From values of trajectories it was .7 on a pendubot and 2 on a
 # quadrotor, and asked for 15,000 steps where the cost asks for 800; .003 to .08 for `V` of `dual` and `pd`.
 NO_VARIATE = 0.5
+# How many times as many steps are taken, once, where others jump over a wall: one a hundredth of a turn thick is met then.
+FINER = 8
 # Head-room on the rate's supremum, met at starts and ends, for the states after the end.
 RATE_ROOM = 2.0
 
@@ -68,6 +71,7 @@ class Simulated:
     perf: Estimate
     largest_value: float | None
     end_states: Tensor
+    jumped_over: str = ""  # what the steps cannot have seen, where there is anything
 
 
 def starting_points(
@@ -93,13 +97,18 @@ def unseen_cost(problem: Problem, x0: Tensor, mass: Tensor, seed: int) -> float:
 
 
 @torch.no_grad()
-def unmet_cost(loop: Loop, problem: Problem, met: float, draws: int, size: float) -> float:
+def largest_rate_of(loop: Loop) -> float:
+    """The largest rate of ``loop`` at evenly spread states, whatever its sign."""
+    x = scrambled_sobol(COMPARED, loop.problem.dim, 0, torch.float64)
+    return float(batched(lambda at: loop(loop.start(at))[1].reshape(len(at), -1)[:, 0].abs(), x).max())
+
+
+def unmet_cost(loop: Loop, met: float, draws: int, size: float) -> float:
     """What states of a rate of cost far above ``met``, the largest that ``draws`` random paths or times showed, may add to
     the mean, whose size is ``size``; 0 where that is little."""
-    if not problem.scan_factor:
+    if not loop.problem.scan_factor:
         return 0.0
-    x = scrambled_sobol(COMPARED, problem.dim, 0, torch.float64)
-    dearest = float(batched(lambda at: loop(loop.start(at))[1].reshape(len(at), -1)[:, 0].abs(), x).max())
+    dearest = largest_rate_of(loop)
     added = unmet(dearest, draws)
     return added if met < MET * dearest and added > MATERIAL * size else 0.0
 
@@ -127,7 +136,8 @@ def simulate_performance(
     precision, takes their place where it agrees well enough with them at the starts; a few trajectories are exact, and what
     they differ by goes into the ``bias``, unless, without noise, they are not ``audited``. The ``bias`` is the error of
     integration (`refined`, with noise `expectation`), plus, where the ``horizon`` is truncated, the discount left there times
-    the rate's supremum as met along the trajectories, with head-room, and what states that no random path met may add. A
+    the rate's supremum as met along the trajectories, with head-room, and what states that no random path met may add; and
+    all that any state may cost, where an audit shows a wall that the steps jump over (`jumped_over`). A
     `HeldPolicy` is simulated as one: its control changes only when it is renewed, always up to a truncated horizon.
     """
     dim, rho = problem.dim, problem.discount
@@ -181,22 +191,28 @@ def simulate_performance(
     swift, exact = steps.taken_by(quick), None if quick is dynamics else steps.taken_by(dynamics)
     means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
     generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT))
+    between = lambda taken: jumped_over(quick, steps, state, taken, seed) if audited else ""
     if problem.noisy:
         horizons, grading = (times, 1.0) if random else (torch.full_like(mass, steps.horizon), steps.grading)
         grid = Grid(horizons, steps.count, grading)
         how = at_random_times(rho) if random else discounted(rho), tolerance * size, seed
         found = expectation(swift, dynamics.noise, state, mass, replicates, grid, *how, exact, together)
-        result, refinement, end, bias = found
+        result, refinement, end, bias, finest = found
+        wall = between(torch.full_like(mass, finest))
         result = result if beside is None else result - beside(x0)
     elif isinstance(dynamics, HeldLoop) and isinstance(quick, HeldLoop):
         loops, sets = (dynamics, quick, beside), (state, mass, replicates)
         result, end, bias = held_integrals(*loops, *sets, steps.horizon, tolerance * size, generator, together)
-        refinement = torch.zeros_like(means(result))
+        refinement, wall = torch.zeros_like(means(result)), between(torch.full_like(mass, steps.count))
     else:
         error = lambda results: Estimate.of(means(results).tolist()).se
         audit = None if exact is None else integrated(exact)
         accuracy = tolerance * size, generator, error, audit, doublings, AUDITED if audited else 0
-        result, end, bias = refined(integrated(swift), mass, steps.count, *accuracy)
+        result, end, bias, taken = refined(integrated(swift), mass, steps.count, *accuracy)
+        if (wall := between(taken)) and doublings == MAX_DOUBLINGS:
+            steps = replace(steps, count=FINER * steps.count)
+            result, end, bias, taken = refined(integrated(swift), mass, steps.count, *accuracy)
+            wall = between(taken)
         bias += 0.0 if audited or exact is None else float(off)  # rounding alone must not look like a contradiction
         refinement = torch.zeros_like(means(result))
     ended = end[:, :dim].remainder(1.0)
@@ -208,9 +224,10 @@ def simulate_performance(
     if not random:
         bias += math.exp(-rho * steps.horizon) * largest_rate * float(mass.mean())
     bias += UNSEEN_ROOM * unseen_cost(problem, x0, mass, seed)
+    bias += largest_rate_of(loop_of(problem, policy, None)) if wall else 0.0
     if problem.noisy or random:
         met = torch.maximum(met, (mass * result).abs())
-        bias += unmet_cost(quick, problem, float(met.max()), len(met), size)
+        bias += unmet_cost(quick, float(met.max()), len(met), size)
     parts = (means(result) + refinement).tolist()
     totals = [part + (initial[r % len(initial)] if initial else 0.0) for r, part in enumerate(parts)]
     perf = Estimate.of(totals, bias=bias)
@@ -219,7 +236,7 @@ def simulate_performance(
     # One path with noise is off its mean, `V^u`; the largest of `N` by some `sqrt(2 log N)` standard deviations.
     chance = float(result.std()) * math.sqrt(2.0 * math.log(len(result))) if problem.noisy else 0.0
     largest = None if random or isinstance(dynamics, HeldLoop) else float((base + result).max()) - chance
-    return Simulated(perf, largest, ended)
+    return Simulated(perf, largest, ended, wall)
 
 
 def stratum_error(results: Tensor, replicates: int) -> float:

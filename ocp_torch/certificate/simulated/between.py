@@ -1,0 +1,91 @@
+"""What the steps of a simulation jump over: a wall in the drift or the controller, or a place without noise, so thin that no
+state of a path is in it. Halved steps jump over it as well, and agree; the true path stays there.
+
+Of a few paths random states between each step and the next are looked at. Where a coordinate moves steadily before and after,
+and there stands still or turns back, a path cannot pass.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool1d
+
+from ocp_torch.certificate.simulated.loops import HeldLoop, Loop
+from ocp_torch.certificate.simulated.steps import Steps
+from ocp_torch.maths import brownian, runge_kutta
+from ocp_torch.maths.runge_kutta import Switched
+from ocp_torch.maths.seeds import Branch, derive_seed, fixed_generator
+from ocp_torch.maths.supremum import batched
+from ocp_torch.problems.blame import place
+from ocp_torch.problems.problem import Problem
+
+# Paths that are looked at, and states on each of their steps: where each of them crosses a wall once by a step of a fiftieth
+# of a turn, 20 of them show one a thousandth of a turn thick, two or three one a tenth of that.
+LOOKED_AT, ON_STEP = 64, 8
+# How many steps before and after must agree, to what part; and what part of that is as good as standing still.
+AROUND, STEADY, STILL = 4, 0.5, 0.05
+# A coordinate that moves less in a step, in turns, is at rest.
+AT_REST = 1e-5
+
+
+def jumped_over(loop: Loop, steps: Steps, state: Tensor, taken: Tensor, seed: int) -> str:
+    """What a few of the paths of ``loop`` from ``state`` ``(N, k)``, of so many steps ``taken`` ``(N,)``, jump over, in
+    words; empty where nothing is seen. Without noise that is where velocities turn back, with it where noise vanishes."""
+    problem, noisy = loop.problem, loop.problem.noisy
+    if noisy and type(problem).noise is Problem.noise:
+        return ""
+    generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT, 1))
+    rows = torch.randperm(len(state), generator=generator)[:LOOKED_AT]
+    speed = lambda states: loop.noise(states)[:, : problem.dim].norm(dim=-1) if noisy else loop(states)[0]
+    for path in _paths(loop, steps, state[rows], taken[rows] * steps.multiples[rows], seed):
+        if (x := stopped(speed, path, problem.dim)) is not None:
+            what = "there is no noise" if noisy else "the velocity is 0 or has the other sign"
+            return f"at {place(x)}, which steps of simulated paths jump over, {what}: paths may end there"
+    return ""
+
+
+def _paths(loop: Loop, steps: Steps, state: Tensor, taken: Tensor, seed: int) -> Iterator[Tensor]:
+    """Those from ``state`` ``(n, k)``, for each number of steps that some have ``taken`` ``(n,)``; those of a control that is
+    held, of which there are many, for a discount time."""
+    horizon, rho = steps.horizon, loop.problem.discount
+    for count in map(int, taken.unique()):
+        at = state[taken == count]
+        if loop.problem.noisy:
+            grid = brownian.Grid(torch.full_like(at[:, 0], horizon), count, steps.grading)
+            yield brownian.path_of(steps.taken_by(loop), loop.noise, at, grid, seed)
+        elif isinstance(loop, HeldLoop):
+            holds = min(steps.renewals, math.ceil(1.0 / (rho * loop.hold)))
+            switched = Switched(loop, loop.renewed, holds)
+            yield runge_kutta.path_of(switched, at, holds * loop.hold, holds * (count // steps.renewals))
+        else:
+            yield runge_kutta.path_of(loop, at, horizon, count, steps.grading)
+
+
+@torch.no_grad()
+def stopped(speed: Callable[[Tensor], Tensor], path: Tensor, dim: int) -> Tensor | None:
+    """A state ``(d,)`` between two of ``path`` ``(K + 1, n, k)``, whose first ``dim`` columns move, where one of ``speed``
+    ``(N, k) -> (N, d)`` or more is 0 or has the other sign; `None` where there is none."""
+    moved, generator = path[1:, :, :dim] - path[:-1, :, :dim], fixed_generator()
+    each = lambda states: batched(speed, states.flatten(0, 1)).unflatten(0, states.shape[:2])
+    here = each(path)[:, :, :dim]
+    most, least = _around(here), -_around(-here)
+    sign = torch.where(least > 0.0, 1.0, -1.0).to(here)
+    weakest, strongest = torch.minimum(sign * least, sign * most), torch.maximum(sign * least, sign * most)
+    steady = (weakest > STEADY * strongest) & (moved.abs() > AT_REST)
+    for _ in range(ON_STEP if bool(steady.any()) else 0):
+        part = torch.rand(*moved.shape[:2], 1, dtype=path.dtype, generator=generator)
+        between = path[:-1].clone()
+        between[:, :, :dim] += part * moved
+        met = steady & (sign * each(between)[:, :, :dim] <= STILL * weakest)
+        if bool(met.any()):
+            return between[met.any(dim=-1)][0, :dim].remainder(1.0)
+    return None
+
+
+def _around(values: Tensor) -> Tensor:
+    """The largest of ``values`` ``(K + 1, n, d)`` within `AROUND` ends of steps before and after each step, ``(K, n, d)``."""
+    by_row = values.permute(1, 2, 0).flatten(0, 1).unsqueeze(1)
+    found = max_pool1d(by_row, 2 * AROUND, stride=1, padding=AROUND - 1)
+    return found.squeeze(1).unflatten(0, values.shape[1:]).permute(2, 0, 1)
