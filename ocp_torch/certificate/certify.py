@@ -17,6 +17,7 @@ from ocp_torch.certificate.external.controller import ControllerContext
 from ocp_torch.certificate.external.dataset import RecordedContext
 from ocp_torch.certificate.settings import CERTIFIED, CertificateSettings, Progress, Run, silent
 from ocp_torch.certificate.simulated.outside import outside_note
+from ocp_torch.certificate.simulated.performance import Simulated
 from ocp_torch.certificate.trained import FieldsContext, Trained, TrainedContext
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import InputError
@@ -64,11 +65,7 @@ def certify(context: Context) -> Certificate:
                 if estimate is not None and estimate.bias
             ),
             *context.remarks,
-            *(
-                f"nothing certain is known of what the controller from {name} costs: {found.jumped_over}."
-                for name, found in simulated.items()
-                if found.jumped_over
-            ),
+            *(note for name, found in simulated.items() for note in unseen(name, found)),
         ],
         searches=list(dict.fromkeys(line for bound in bounds for line in bound.searches(context))),
         about={bound.name: bound.about(context) for bound in bounds if bound.side == UPPER},
@@ -80,6 +77,14 @@ def certify(context: Context) -> Certificate:
         subsolution=None if context.sampled_value is None else context.sampled_value.subsolution,
     )
     return handed_out(examined(certificate), context)
+
+
+def unseen(name: str, found: Simulated) -> list[str]:
+    """What the simulation ``found`` of the controller ``name`` cannot have seen, in sentences."""
+    of = f"the controller from {name}"
+    wall = f"nothing certain is known of what {of} costs: {found.jumped_over}."
+    rare = f"no path of {of} came near the dearest states; if one does, it costs up to {found.unmet:.2g} more."
+    return ([wall] if found.jumped_over else []) + ([rare] if found.unmet else [])
 
 
 def handed_out(certificate: Certificate, context: Context) -> Certificate:

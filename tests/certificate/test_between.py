@@ -86,6 +86,28 @@ def test_a_wall_that_finer_steps_meet_is_resolved():
     assert high - low < 0.1
 
 
+class Lottery(Problem):
+    """From everywhere to `y = 0`, where one in some 25,000 `x`, which never changes, costs 10,000."""
+
+    def state_cost(self, z):
+        near = (-(away(z[:, 0]) / 2e-5).square() - (1.0 - (TURN * z[:, 1]).cos()) / 0.1).exp()
+        return 1.0 + 1e4 * near
+
+    def drift(self, z):
+        return torch.stack([torch.zeros_like(z[:, 0]), -(TURN * z[:, 1]).sin()], dim=-1)
+
+    def initial_density(self, z):
+        return 1.0 + (TURN * z[:, 1]).cos().neg()
+
+
+def test_dear_states_that_no_path_came_to_are_told():
+    problem = Lottery(2, discount=1.0)
+    found = simulated(problem, zero_policy(problem))
+    assert found.perf.value == pytest.approx(1.0, abs=0.02)
+    assert found.unmet > 1.0
+    assert simulated(River(), zero_policy(River())).unmet == 0.0
+
+
 class Notched(Circle):
     """Noise that vanishes at a point, which no path can pass."""
 

@@ -72,6 +72,7 @@ class Simulated:
     largest_value: float | None
     end_states: Tensor
     jumped_over: str = ""  # what the steps cannot have seen, where there is anything
+    unmet: float = 0.0  # what states far dearer than any that was met add, if one path comes to them
 
 
 def starting_points(
@@ -104,7 +105,7 @@ def largest_rate_of(loop: Loop) -> float:
 
 
 def unmet_cost(loop: Loop, met: float, draws: int, size: float) -> float:
-    """What states of a rate of cost far above ``met``, the largest that ``draws`` random paths or times showed, may add to
+    """What states of a rate of cost far above ``met``, the largest that ``draws`` paths or random times showed, may add to
     the mean, whose size is ``size``; 0 where that is little."""
     if not loop.problem.scan_factor:
         return 0.0
@@ -225,18 +226,17 @@ def simulate_performance(
         bias += math.exp(-rho * steps.horizon) * largest_rate * float(mass.mean())
     bias += UNSEEN_ROOM * unseen_cost(problem, x0, mass, seed)
     bias += largest_rate_of(loop_of(problem, policy, None)) if wall else 0.0
-    if problem.noisy or random:
-        met = torch.maximum(met, (mass * result).abs())
-        bias += unmet_cost(quick, float(met.max()), len(met), size)
+    chance, met = problem.noisy or random, torch.maximum(met, (mass * result).abs())
+    rare = unmet_cost(quick, float(met.max()), len(met), size) if chance or audited else 0.0
+    bias += rare if chance else 0.0  # starts are spread evenly, and their paths follow from them
     parts = (means(result) + refinement).tolist()
     totals = [part + (initial[r % len(initial)] if initial else 0.0) for r, part in enumerate(parts)]
     perf = Estimate.of(totals, bias=bias)
-    perf = replace(perf, se=max(perf.se, stratum_error(mass * result, replicates)))
-    perf = widened(perf, [mass * result])
+    perf = widened(replace(perf, se=max(perf.se, stratum_error(mass * result, replicates))), [mass * result])
     # One path with noise is off its mean, `V^u`; the largest of `N` by some `sqrt(2 log N)` standard deviations.
-    chance = float(result.std()) * math.sqrt(2.0 * math.log(len(result))) if problem.noisy else 0.0
-    largest = None if random or isinstance(dynamics, HeldLoop) else float((base + result).max()) - chance
-    return Simulated(perf, largest, ended, wall)
+    above = float(result.std()) * math.sqrt(2.0 * math.log(len(result))) if problem.noisy else 0.0
+    largest = None if random or isinstance(dynamics, HeldLoop) else float((base + result).max()) - above
+    return Simulated(perf, largest, ended, wall, 0.0 if chance else rare)
 
 
 def stratum_error(results: Tensor, replicates: int) -> float:
