@@ -87,10 +87,10 @@ def test_a_wall_that_finer_steps_meet_is_resolved():
 
 
 class Lottery(Problem):
-    """From everywhere to `y = 0`, where one in some 25,000 `x`, which never changes, costs 10,000."""
+    """From everywhere to `y = 0`, where one in some 5,000 `x`, which never changes, costs 10,000."""
 
     def state_cost(self, z):
-        near = (-(away(z[:, 0]) / 2e-5).square() - (1.0 - (TURN * z[:, 1]).cos()) / 0.1).exp()
+        near = (-(away(z[:, 0] + 0.1) / 1e-4).square() - (1.0 - (TURN * z[:, 1]).cos()) / 0.1).exp()
         return 1.0 + 1e4 * near
 
     def drift(self, z):
