@@ -122,6 +122,30 @@ def test_where_noise_vanishes_paths_may_end():
     assert found.perf.half_width(0.95) >= float(problem.state_cost(torch.tensor([[0.99]], dtype=torch.float64)))
 
 
+class NoisyRiver(River):
+    """Beside the river there is a coordinate that noise moves, and nothing else."""
+
+    def __init__(self) -> None:
+        super().__init__(1e-3)
+        self.dim = 2
+
+    def drift(self, x):
+        return torch.cat([super().drift(x[:, :1]), torch.zeros_like(x[:, :1])], dim=-1)
+
+    def control_matrix(self, x):
+        return x.new_zeros(len(x), 2, 1)
+
+    def noise(self, x):
+        return x.new_tensor([[0.0], [0.1]]).expand(len(x), 2, 1)
+
+
+def test_a_wall_is_one_where_another_coordinate_has_noise():
+    problem = NoisyRiver()
+    found = simulated(problem, zero_policy(problem), trajectories=16)
+    assert "the velocity is 0 or has the other sign" in found.jumped_over
+    assert found.perf.interval(0.95)[1] >= cost_of_staying()
+
+
 @zoo.on((*zoo.FEW, *zoo.NATURAL))
 def test_nothing_is_seen_where_nothing_is(problem):
     """Optimal controllers, no control, and the controller of a `V` that knows nothing of the problem."""
@@ -136,12 +160,10 @@ def test_what_counts_is_a_coordinate_that_moves_steadily():
     t = torch.linspace(0.0, 1.0, 41, dtype=torch.float64)
     path = torch.stack([t, 0.5 + 0.2 * (TURN * t).sin()], dim=-1).unsqueeze(1)
     circling = lambda x: torch.stack([torch.ones_like(x[:, 0]), 0.2 * TURN * (TURN * x[:, 0]).cos()], dim=-1)
-    assert stopped(circling, path, 2) is None
+    assert stopped(circling, path) is None
     walled = lambda x: torch.where((x[:, :1] - 0.5061).abs() < 2e-3, -1.0, 1.0) * circling(x)
-    assert stopped(walled, path, 2) is not None
+    assert stopped(walled, path) is not None
     sliding = torch.stack([t, 0.5 + 1e-3 * (-1.0) ** torch.arange(41)], dim=-1).unsqueeze(1)
-    assert (
-        stopped(lambda x: torch.stack([torch.ones_like(x[:, 0]), (0.5 - x[:, 1]).sign()], dim=-1), sliding, 2) is None
-    )
+    assert stopped(lambda x: torch.stack([torch.ones_like(x[:, 0]), (0.5 - x[:, 1]).sign()], dim=-1), sliding) is None
     still = torch.full((41, 1, 2), 0.3, dtype=torch.float64) + 1e-7 * t[:, None, None]
-    assert stopped(lambda x: 1e-7 * torch.where(x < 0.3 + 4.9e-8, 1.0, -1.0), still, 2) is None
+    assert stopped(lambda x: 1e-7 * torch.where(x < 0.3 + 4.9e-8, 1.0, -1.0), still) is None

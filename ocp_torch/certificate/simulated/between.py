@@ -32,17 +32,24 @@ AT_REST = 1e-5
 
 def jumped_over(loop: Loop, steps: Steps, state: Tensor, taken: Tensor, seed: int) -> str:
     """What a few of the paths of ``loop`` from ``state`` ``(N, k)``, of so many steps ``taken`` ``(N,)``, jump over, in
-    words; empty where nothing is seen. Without noise that is where velocities turn back, with it where noise vanishes."""
-    problem, noisy = loop.problem, loop.problem.noisy
-    if noisy and type(problem).noise is Problem.noise:
-        return ""
+    words; empty where nothing is seen: where the velocity of a coordinate without noise turns back, and where noise ends."""
+    problem = loop.problem
     generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT, 1))
     rows = torch.randperm(len(state), generator=generator)[:LOOKED_AT]
-    speed = lambda states: loop.noise(states)[:, : problem.dim].norm(dim=-1) if noisy else loop(states)[0]
-    for path in _paths(loop, steps, state[rows], taken[rows] * steps.multiples[rows], seed):
-        if (x := stopped(speed, path, problem.dim)) is not None:
-            what = "there is no noise" if noisy else "the velocity is 0 or has the other sign"
-            return f"at {place(x)}, which steps of simulated paths jump over, {what}: paths may end there"
+    spread = lambda states: loop.noise(states)[:, : problem.dim].norm(dim=-1)
+    turns, ends = "the velocity is 0 or has the other sign", "there is no noise"
+    speeds: dict[str, Callable[[Tensor], Tensor]] = {}
+    if not problem.noisy:
+        speeds[turns] = lambda states: loop(states)[0][:, : problem.dim]
+    elif problem.scan_factor:  # the package's own have no walls, and no such noise
+        if bool((spread(state[rows]) == 0.0).any()):
+            speeds[turns] = lambda states: loop(states)[0][:, : problem.dim] * (spread(states) == 0.0)
+        if type(problem).noise is not Problem.noise:
+            speeds[ends] = spread
+    for path in _paths(loop, steps, state[rows], taken[rows] * steps.multiples[rows], seed) if speeds else ():
+        for what, speed in speeds.items():
+            if (x := stopped(speed, path)) is not None:
+                return f"at {place(x)}, which steps of simulated paths jump over, {what}: paths may end there"
     return ""
 
 
@@ -64,12 +71,13 @@ def _paths(loop: Loop, steps: Steps, state: Tensor, taken: Tensor, seed: int) ->
 
 
 @torch.no_grad()
-def stopped(speed: Callable[[Tensor], Tensor], path: Tensor, dim: int) -> Tensor | None:
-    """A state ``(d,)`` between two of ``path`` ``(K + 1, n, k)``, whose first ``dim`` columns move, where one of ``speed``
-    ``(N, k) -> (N, d)`` or more is 0 or has the other sign; `None` where there is none."""
-    moved, generator = path[1:, :, :dim] - path[:-1, :, :dim], fixed_generator()
+def stopped(speed: Callable[[Tensor], Tensor], path: Tensor) -> Tensor | None:
+    """A state ``(d,)`` between two of ``path`` ``(K + 1, n, k)``, whose first `d` columns move, where one of ``speed``
+    ``(N, k) -> (N, d)`` is 0 or has the other sign; `None` where there is none."""
     each = lambda states: batched(speed, states.flatten(0, 1)).unflatten(0, states.shape[:2])
-    here = each(path)[:, :, :dim]
+    here, generator = each(path), fixed_generator()
+    dim = here.shape[-1]
+    moved = path[1:, :, :dim] - path[:-1, :, :dim]
     most, least = _around(here), -_around(-here)
     sign = torch.where(least > 0.0, 1.0, -1.0).to(here)
     weakest, strongest = torch.minimum(sign * least, sign * most), torch.maximum(sign * least, sign * most)
@@ -78,7 +86,7 @@ def stopped(speed: Callable[[Tensor], Tensor], path: Tensor, dim: int) -> Tensor
         part = torch.rand(*moved.shape[:2], 1, dtype=path.dtype, generator=generator)
         between = path[:-1].clone()
         between[:, :, :dim] += part * moved
-        met = steady & (sign * each(between)[:, :, :dim] <= STILL * weakest)
+        met = steady & (sign * each(between) <= STILL * weakest)
         if bool(met.any()):
             return between[met.any(dim=-1)][0, :dim].remainder(1.0)
     return None
