@@ -26,7 +26,7 @@ def test_groups_of_paths_from_one_start_are_independent():
     noise = lambda x: torch.ones(len(x), 1, 1, dtype=x.dtype)
     dynamics = lambda x: (0.0 * x, x[:, 0])
     run = lambda seed: expectation(dynamics, noise, x0, weights, 1, grid, discounted(RHO), 1.0, seed)
-    result, _, end, _ = run(0)
+    result, _, end, *_ = run(0)
     for values in (result, end[:, 0]):
         first, second = values[:TOGETHER], values[TOGETHER:]
         assert abs(float(torch.corrcoef(torch.stack([first, second]))[0, 1])) < 5.0 / math.sqrt(TOGETHER)

@@ -205,3 +205,22 @@ def test_a_wrong_argument_is_refused_by_name(make, arguments, field):
 def test_a_problem_without_a_state_cost_says_what_is_missing():
     with pytest.raises(InputError, match="state_cost"):
         Problem(dim=1).state_cost(torch.zeros(1, 1))
+
+
+class Geared(Manufactured):
+    def control_matrix(self, x):
+        return 2.0 * super().control_matrix(x)
+
+
+def test_what_is_put_in_the_place_of_a_function_is_what_everybody_sees():
+    """The class gives cost and fields by one evaluation, which knows nothing of a subclass or of a function set later."""
+    plain, changed = Manufactured(dim=2), Geared(dim=2)
+    x, u = zoo.states(plain, 16), zoo.states(plain, 16, seed=1)
+    f, (a, B, div_a, div_B) = plain.cost_and_fields(x)
+    there = changed.cost_and_fields(x)
+    for here, other in zip((f, a, 2.0 * B, div_a, div_B), (there[0], *there[1]), strict=True):
+        torch.testing.assert_close(other, here, **ROUNDING)
+    torch.testing.assert_close(changed.velocity(x, u), a + 2.0 * torch.einsum("ndm,nm->nd", B, u), **ROUNDING)
+    plain.state_cost, plain.drift = lambda y: 7.0 + 0.0 * y[:, 0], lambda y: 0.0 * y
+    assert bool((plain.cost_and_fields(x)[0] == 7.0).all())
+    assert bool((plain.vector_fields(x)[0] == 0.0).all())
