@@ -24,7 +24,8 @@ from ocp_torch.problems.problem import Problem
 # Paths that are looked at, and states on each of their steps: where each of them crosses a wall once by a step of a fiftieth
 # of a turn, 20 of them show one a thousandth of a turn thick, two or three one a tenth of that.
 LOOKED_AT, ON_STEP = 64, 8
-# How many steps before and after must agree, to what part; and what part of that is as good as standing still.
+# How many steps before and after must agree, to what part, as all velocities at both ends of the step must; and what part of
+# that is as good as standing still.
 AROUND, STEADY, STILL = 4, 0.5, 0.05
 # A coordinate that moves less in a step, in turns, is at rest.
 AT_REST = 1e-5
@@ -81,7 +82,8 @@ def stopped(speed: Callable[[Tensor], Tensor], path: Tensor) -> Tensor | None:
     most, least = _around(here), -_around(-here)
     sign = torch.where(least > 0.0, 1.0, -1.0).to(here)
     weakest, strongest = torch.minimum(sign * least, sign * most), torch.maximum(sign * least, sign * most)
-    steady = (weakest > STEADY * strongest) & (moved.abs() > AT_REST)
+    straight = here.diff(dim=0).norm(dim=-1, keepdim=True) < STEADY * here[:-1].norm(dim=-1, keepdim=True)
+    steady = straight & (weakest > STEADY * strongest) & (moved.abs() > AT_REST)  # else no chord is near the path
     for _ in range(ON_STEP if bool(steady.any()) else 0):
         part = torch.rand(*moved.shape[:2], 1, dtype=path.dtype, generator=generator)
         between = path[:-1].clone()
