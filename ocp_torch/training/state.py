@@ -61,7 +61,7 @@ class TrainState:
             "average": self.average.state_dict(),
             "stepper": self.stepper.state_dict(),
             "batches": self.batches.state_dict(),
-            "watch": self.health.state_dict(),
+            "watch": self.health.state_dict(),  # the name that files have known it by
             "warm": None if self.warm is None else self.warm.state_dict(),
             "generators": generator_states(),
         }
