@@ -15,10 +15,11 @@ from ocp_torch.certificate.estimate import Estimate, known_of
 from ocp_torch.certificate.external.black_box import BlackBox
 from ocp_torch.certificate.external.controller import ControllerContext
 from ocp_torch.certificate.external.dataset import RecordedContext
+from ocp_torch.certificate.fields import FieldsContext, Trained
 from ocp_torch.certificate.settings import CERTIFIED, CertificateSettings, Progress, Run, silent
 from ocp_torch.certificate.simulated.outside import outside_note
 from ocp_torch.certificate.simulated.performance import Simulated
-from ocp_torch.certificate.trained import FieldsContext, Trained, TrainedContext
+from ocp_torch.certificate.trained import TrainedContext
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import InputError
 from ocp_torch.fields.subsolution import Subsolution

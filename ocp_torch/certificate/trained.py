@@ -1,21 +1,16 @@
-"""What training hands over to a certificate, and what its bounds share: nothing here knows how the fields were trained."""
+"""What the bounds of trained fields share, where the problem can be simulated."""
 
-import copy
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
-from typing import TypeVar
 
 import torch
-from torch import nn
 
 from ocp_torch.certificate.checks.observed import Observed, observe
 from ocp_torch.certificate.checks.tails import sharpened
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
-from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.certificate.settings import CERTIFIED
+from ocp_torch.certificate.fields import FieldsContext, in_float64
 from ocp_torch.certificate.simulated.candidates import Candidate
 from ocp_torch.certificate.simulated.performance import Simulated
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
@@ -27,78 +22,14 @@ from ocp_torch.control.policies import (
     DENSITY,
     MINIMISED,
     TRAJECTORIES,
-    VALUE,
     Density,
-    Policy,
     admissible_density,
     occupation_density,
-    trained_policies,
 )
-from ocp_torch.fields.fields import Fields
-from ocp_torch.fields.subsolution import Subsolution
-from ocp_torch.maths.jets import Field
 from ocp_torch.problems.samples import Samples
 
 # States of each set at which the density is looked at for places without mass.
 LOOKED_AT = 4096
-
-M = TypeVar("M", bound=nn.Module)
-
-
-def in_float64(fields: M) -> M:
-    """A frozen float64 copy on the CPU: what every bound is computed with."""
-    return copy.deepcopy(fields).to("cpu").double().requires_grad_(False).eval()
-
-
-@dataclass(frozen=True)
-class Trained:
-    """What training hands over: the fields, how they give `mu` (see `trained_policies`), the network they are made of, and
-    which ``kind`` of controller was handed out, where that is settled already.
-
-    The `V` of a warm start stays as it is while others are trained: ``memory`` keeps what was simulated of its controller.
-    """
-
-    fields: Fields
-    occupation: str | None
-    network: Callable[..., nn.Module]
-    kind: str | None = None
-    memory: dict = field(default_factory=dict, compare=False, repr=False)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FieldsContext(Context):
-    """The context of trained fields: what certificates of them share, wherever the problem is known."""
-
-    trained: Trained
-
-    listed = (VALUE, DENSITY)
-
-    @property
-    def occupation(self) -> str | None:
-        """How `mu` follows from the fields, see `trained_policies`."""
-        return self.trained.occupation
-
-    @cached_property
-    def fields(self) -> Fields:
-        """In float64."""
-        return in_float64(self.trained.fields)
-
-    @property
-    def value(self) -> Field | None:
-        return self.fields.value
-
-    @property
-    def kept(self) -> Subsolution | None:
-        return self.fields.subsolution
-
-    def policies_of(self, fields: Fields) -> dict[str, Policy]:
-        """The controllers that the trained ``fields`` give, in their precision, by name."""
-        every = self.settings.prefer == CERTIFIED or self.trained.kind == MINIMISED
-        return trained_policies(self.occupation, self.problem, fields, self.constants, every)
-
-    @cached_property
-    def policies(self) -> dict[str, Policy]:
-        return self.policies_of(self.fields)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

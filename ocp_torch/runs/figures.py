@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.bound import LOWER, UPPER
+from ocp_torch.certificate.fields import in_float64
 from ocp_torch.certificate.lower.slack import slack_function
 from ocp_torch.certificate.settings import LONGEST_NAME
-from ocp_torch.certificate.trained import in_float64
 from ocp_torch.control.policies import NETWORK, occupation_density, trained_policies
 from ocp_torch.errors import visible
 from ocp_torch.fields import Fields

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from ocp_torch.certificate.trained import in_float64
+from ocp_torch.certificate.fields import in_float64
 from ocp_torch.control.controller import Controller, controller_file, load_controller
 from ocp_torch.control.described import problem_name
 from ocp_torch.control.policies import Policy, trained_policies

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from ocp_torch.certificate.fields import in_float64
 from ocp_torch.certificate.lower.slack import slack_function
-from ocp_torch.certificate.trained import in_float64
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import SobolSampler

@@ -6,7 +6,7 @@ is the control variate of the simulation and, with the suprema of its Bellman sl
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -16,8 +16,8 @@ from ocp_torch.certificate.checks.observed import Observed, observe
 from ocp_torch.certificate.context import Context
 from ocp_torch.certificate.estimate import integral
 from ocp_torch.certificate.external.black_box import BlackBox
+from ocp_torch.certificate.fields import in_float64
 from ocp_torch.certificate.simulated.candidates import Candidate
-from ocp_torch.certificate.trained import in_float64
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
 from ocp_torch.control.policies import Policy, ValuePolicy
@@ -38,7 +38,6 @@ class ControllerContext(Context):
     value: Field | None
     network: Callable[..., nn.Module]
     kept: Subsolution | None = None
-    failures: list[str] = field(default_factory=list, init=False)  # of the fit to the closed loop, in words
 
     external = True
     kind = GIVEN
@@ -49,19 +48,22 @@ class ControllerContext(Context):
         return isinstance(self.policy, BlackBox) and self.policy.precision is torch.float32
 
     @cached_property
-    def _fit(self) -> Fields | None:
-        """`V^u` and `log mu^u`, in float64."""
+    def _attempt(self) -> tuple[Fields | None, list[str]]:
+        """`V^u` and `log mu^u`, in float64, or a warning that says why not."""
         if not self.settings.stage.steps:
-            return None
+            return None, []
         self.progress("closed-loop fit")
-        if not self.problem.gives_divergences:
-            return None
+        if unknown := self.problem.unknown_divergences:
+            return None, [f"no bound on Perf without simulation: this problem gives no divergences of {unknown}."]
         how = self.constants, self.settings.stage, self.seed
         try:
-            return in_float64(fit_closed_loop(self.problem, self.policy, None, self.network, *how))
+            return in_float64(fit_closed_loop(self.problem, self.policy, None, self.network, *how)), []
         except ArithmeticError as error:
-            self.failures.append(f"the certification stage failed: {error}")
-            return None
+            return None, [f"the certification stage failed: {error}"]
+
+    @property
+    def _fit(self) -> Fields | None:
+        return self._attempt[0]
 
     @cached_property
     def _initial(self) -> list[float] | None:
@@ -100,10 +102,4 @@ class ControllerContext(Context):
     @property
     def remarks(self) -> list[str]:
         notes = [] if self.value is not None else ["no lower bound: there is no V to give one."]
-        if self.settings.stage.steps and self.fitted is None:
-            unknown = self.problem.unknown_divergences
-            unknown = (
-                unknown and f"no bound on Perf without simulation: this problem gives no divergences of {unknown}."
-            )
-            notes += [unknown] if unknown else self.failures
-        return notes
+        return notes + self._attempt[1]

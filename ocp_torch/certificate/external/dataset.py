@@ -15,7 +15,7 @@ from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.checks.hidden import Hidden
 from ocp_torch.certificate.checks.observed import Observed, largest_jump
 from ocp_torch.certificate.checks.wellposed import WellPosed
-from ocp_torch.certificate.trained import FieldsContext
+from ocp_torch.certificate.fields import FieldsContext
 from ocp_torch.certificate.upper.recorded import RecordedFit, fit_recorded
 from ocp_torch.control.policies import NETWORK
 from ocp_torch.problems.needs import SEARCHED

@@ -15,7 +15,7 @@ from ocp_torch.certificate.bound import recorded
 from ocp_torch.certificate.checks.hidden import Hidden, hidden_divergence
 from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate, integral
-from ocp_torch.certificate.trained import in_float64
+from ocp_torch.certificate.fields import in_float64
 from ocp_torch.certificate.upper.multiples import best_multiples, terms_on
 from ocp_torch.certificate.upper.penalised import PenalisedPrimal
 from ocp_torch.certificate.upper.policy_evaluation import Drawn, fit_closed_loop
