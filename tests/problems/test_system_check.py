@@ -96,6 +96,11 @@ MISTAKES = {
         dict(cost=lambda self, s: np.square(s[:, 1])),
         "cost of my_module.Mistaken raised RuntimeError: NumPy was given a tensor; use the functions of torch",
     ),
+    "no derivative": (
+        dict(cost=lambda self, s: 1.0 + s[:, 1] ** 2 + torch.floor_divide(s[:, 1], 0.3).cos()),
+        r"cost of my_module.Mistaken cannot be differentiated by the state, .* \(RuntimeError: derivative for "
+        r"aten::floor_divide is not implemented\): use functions that have a derivative in torch",
+    ),
     "nothing made": (
         dict(__init__=lambda self: None),
         r"its __init__ must call super\(\).__init__\(coordinates, controls, ..\)",

@@ -132,6 +132,11 @@ def steps_of(self, x):
     return torch.where(x[:, :1].remainder(1.0) < 0.3, 0.5, 1.0).to(x)
 
 
+def step_of(x):
+    """A step that autograd has no derivative of."""
+    return torch.heaviside(torch.sin(TURN * x), torch.full_like(x, 0.5))
+
+
 def column(size=0.1):
     """`sigma` of one Brownian motion that varies with the state."""
     return lambda self, x: (size * torch.stack([torch.sin(TURN * x[:, 1]), 2.0 + torch.cos(TURN * x[:, 0])], -1))[
@@ -272,6 +277,12 @@ REFUSED = {
     "div a": (lambda: with_(drift_divergence=lambda self, x: 0.0 * x[:, 0]), "drift_divergence .* by differences of drift"),
     "detached": (lambda: with_(control_matrix=lambda self, x: Good.control_matrix(self, x.detach())),
                  "control_divergence .* by differences of control_matrix"),
+    **{f"{name} without a derivative": (lambda name=name, step=step: with_(**{name: step}),
+                                        f"{name} of .*Mine cannot be differentiated .*aten::heaviside is not implemented.*:"
+                                        " use functions that have a derivative")
+       for name, step in {"state_cost": lambda self, x: step_of(x[:, 0]), "drift": lambda self, x: step_of(x),
+                          "control_matrix": lambda self, x: step_of(x)[:, :, None] * torch.eye(2, dtype=x.dtype),
+                          "noise": lambda self, x: 0.1 * step_of(x)[..., None]}.items()},
     "noise without columns": (lambda: with_(noise=sigma(lambda s, x: s[..., 0])),
                               r"noise of .*Mine gave shape \(7, 2\) .* \(N, d, k\) = \(7, 2, 1\) with d = 2, k = 1"),
     "noise of too few rows": (lambda: with_(noise=sigma(lambda s, x: s[:, :1])), r"noise .* gave shape \(7, 1, 1\)"),
@@ -318,6 +329,8 @@ LEGAL = {
     "B jumps": lambda: with_(control_matrix=lambda self, x: steps_of(self, x)[:, :, None] * torch.eye(2, dtype=x.dtype)),
     "rough": lambda: with_(state_cost=wobbly),
     "kinks": lambda: with_(drift=lambda self, x: torch.sin(TURN * x).abs().sqrt()),
+    "a step of a detached state": lambda: with_(state_cost=lambda self, x: step_of(x[:, 0].detach())),
+    "mu0 without a derivative": lambda: with_(initial_density=lambda self, x: 2.0 * step_of(x[:, 0])),
     "flat": lambda: with_(state_cost=lambda self, x: torch.zeros_like(x[:, 0])),
     "a hole": lambda: with_(state_cost=lambda self, x: 1.0 - bump(0.0025, 0.5)(self, x)),
     "a spike": lambda: with_(state_cost=lambda self, x: 5000.0 * bump(0.0025, 0.5)(self, x)),

@@ -79,16 +79,21 @@ def require_system(functions: SystemFunctions) -> None:
 
 def _require_functions(functions: Functions) -> Answers:
     """They are functions of the state, of the right shapes; and what was first answered."""
+    _require_forms(functions, list(functions.data))
+    first = require_purity(functions)
+    if not functions.simulator:  # before the divergences, which autograd makes of these
+        require_differentiable(functions)
+    _require_forms(functions, [name for name in functions.forms if name not in functions.data])
+    return first
+
+
+def _require_forms(functions: Functions, names: list[str]) -> None:
     for dtype in (torch.float64, torch.float32):
         for size in SIZES:
             x = functions.states(size).to(dtype)
-            for name in functions.forms:
+            for name in names:
                 functions.given(name, x)
             functions.require_silence(x)
-    first = require_purity(functions)
-    if not functions.simulator:
-        require_differentiable(functions)
-    return first
 
 
 def require_made(problem: Problem) -> None:

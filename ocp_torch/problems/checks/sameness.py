@@ -1,5 +1,5 @@
 """A function of each state alone, with period 1: not of the other rows, nor of what was asked before or of whole turns; and
-one that autograd may call."""
+one that autograd may differentiate."""
 
 import math
 
@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ocp_torch.errors import ProblemError
 from ocp_torch.maths.seeds import fixed_generator
+from ocp_torch.problems.blame import words
 from ocp_torch.problems.checks.functions import Functions
 
 # Answers that differ by more than that part of the largest are not the same; rounding in single precision stays below.
@@ -49,12 +50,22 @@ def require_still(functions: Functions, first: Answers) -> None:
 
 
 def require_differentiable(functions: Functions) -> None:
-    """It can be called with states that need gradients: ascents to suprema differentiate by the state."""
+    """It can be called with states that need gradients, and gives them: ascents to suprema differentiate by the state."""
     x = functions.states(DIFFERENTIATED, DIFFERENTIATED_DESIGN)
     for name in functions.data:
+        function, at = functions.function(name), x.clone()
         with torch.enable_grad():
-            function = functions.function(name)
-            functions.called(lambda at, f=function: f(at.requires_grad_(True)), x.clone(), name)
+            answer = functions.called(lambda s, f=function: f(s.requires_grad_(True)), at, name)
+            if name == functions.density or not answer.requires_grad:  # nothing differentiates a density
+                continue
+            try:
+                torch.autograd.grad(answer.sum(), at, allow_unused=True)
+            except Exception as error:  # whatever the backward pass of a stranger's code may raise
+                raise ProblemError(
+                    f"{name} of {functions.name} cannot be differentiated by the state, as training and bounds do "
+                    f"({words(error)}): use functions that have a derivative in torch, as torch.where(x > 0, 1.0, 0.0) "
+                    "for a step, or detach what they are given where the derivative is 0."
+                ) from None
 
 
 def require_period(functions: Functions) -> None:
