@@ -59,18 +59,24 @@ def exported_function(
     problem: Problem, fields: Fields, kind: str, occupation: str | None, constants: Constants, coordinates: str
 ) -> Callable[[Tensor], Outputs]:
     """States ``(N, d)`` to ``control`` ``(N, m)`` and, where the controller holds a `V`, its ``value`` ``(N,)`` and
-    ``gradient`` ``(N, d)``, in float64. In physical units a state beyond the box is taken for the nearest one in it."""
+    ``gradient`` ``(N, d)``, in float64. In physical units a state beyond the box is taken for the nearest one in it.
+    All is NaN where a coordinate is, or an angle is infinite."""
     fields = copy.deepcopy(fields).to("cpu").double()
     policy = trained_policies(occupation, problem, fields, constants, every=True)[kind]
     field = policy.value if isinstance(policy, ValuePolicy | HeldPolicy) else fields.value
 
-    def on_torus(x: Tensor) -> Outputs:
+    def found_at(x: Tensor) -> Outputs:
         if field is None:
             return {CONTROL: policy(x)}
         V = jets.jet(field, x)
         own = isinstance(policy, ValuePolicy)
         u = policy.control(problem.control_matrix(x), V) if own else policy(x)  # type: ignore[attr-defined]
         return {CONTROL: u, VALUE: V.value, GRADIENT: V.gradient}
+
+    def on_torus(x: Tensor) -> Outputs:
+        # 0, but NaN where a coordinate is: a branch of a controller may lose that, and answer as if nothing were broken.
+        broken = x.clamp(0.0, 0.0).floor().sum(dim=-1, keepdim=True)
+        return {name: y + (broken if y.ndim > 1 else broken[:, 0]) for name, y in found_at(x).items()}
 
     def in_units(s: Tensor) -> Outputs:
         assert isinstance(problem, System)  # `coordinates_of` has seen to it

@@ -14,11 +14,11 @@ ENTRYWISE = {
     "tan": "tan({0})", "erf": "erf({0})", "sqrt": "sqrt({0})", "abs": "fabs({0})", "floor": "floor({0})", "atan": "atan({0})",
     "asin": "asin({0})", "acos": "acos({0})", "sinh": "sinh({0})", "cosh": "cosh({0})", "atan2": "atan2({0}, {1})",
     "add": "{0} + {1}", "sub": "{0} - {1}", "mul": "{0} * {1}", "div": "{0} / {1}", "pow": "pow({0}, {1})",
-    "maximum": "fmax({0}, {1})", "minimum": "fmin({0}, {1})", "eq": "R({0} == {1})", "ne": "R({0} != {1})",
+    "maximum": "MAX({0}, {1})", "minimum": "MIN({0}, {1})", "eq": "R({0} == {1})", "ne": "R({0} != {1})",
     "lt": "R({0} < {1})", "le": "R({0} <= {1})", "gt": "R({0} > {1})", "ge": "R({0} >= {1})",
     "where": "{0} != 0 ? {1} : {2}",
 }  # fmt: skip
-REDUCED = {"sum": "{0} + {1}", "max": "fmax({0}, {1})", "min": "fmin({0}, {1})"}
+REDUCED = {"sum": "{0} + {1}", "max": "MAX({0}, {1})", "min": "MIN({0}, {1})"}
 # Sums of products are split over so many, so that compilers may use vector instructions without reordering what is written.
 LANES = 8
 # The array that all results are in.

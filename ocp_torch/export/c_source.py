@@ -21,10 +21,12 @@ HEADER = Template("""\
 /* $name: exported by ocp_torch.
  *
  * $about
- * Stack: $space numbers; nothing is allocated. Fastest with gcc -O3 -march=native -ffast-math. Compile both files alike:
+ * Stack: $space numbers; nothing is allocated. Fastest with gcc -O3 -march=native -ffast-math -fno-finite-math-only.
+ * A state that is NaN gives NaN in all results; -ffast-math alone would lose that, and is refused. Compile both files alike:
  *   (no flag)        states and results are doubles
  *   -D${NAME}_FLOAT   they are floats; what is between is computed in double, so that results are off by their rounding alone
- *   -D${NAME}_SINGLE  all is computed in float, for processors without doubles; results are off by some 1e-5 of the most */
+ *   -D${NAME}_SINGLE  all is computed in float, for processors without doubles; results are off by some 1e-5 of the most for
+ *                    angles within a turn of their centre, and by as much again for each turn beyond */
 #ifndef ${NAME}_H
 #define ${NAME}_H
 
@@ -46,6 +48,10 @@ SOURCE = Template("""\
 
 #include <tgmath.h>
 
+#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
+#error "a state that is NaN would give a control like any other: add -fno-finite-math-only after -ffast-math"
+#endif
+
 #ifdef ${NAME}_SINGLE
 typedef float real;
 #else
@@ -53,6 +59,9 @@ typedef double real;
 #endif
 #define R(number) ((real)(number))
 #define OUT(number) ((${name}_real)(number))
+/* Unlike fmax and fmin, which drop a NaN. */
+#define MAX(a, b) ((a) > (b) || (a) != (a) ? (a) : (b))
+#define MIN(a, b) ((a) < (b) || (a) != (a) ? (a) : (b))
 
 $constants
 

@@ -61,11 +61,18 @@ class Writer:
         casadi = self.casadi
         if name == "sum":
             return casadi.sum2(self._matrix(rows))
-        pick = casadi.fmax if name == "max" else casadi.fmin
+        pick = self._entrywise()["maximum" if name == "max" else "minimum"]
         first, *rest = (self.entries(View(rows.buffer, rows.places[:, k])) for k in range(rows.places.shape[1]))
         for column in rest:
             first = pick(first, column)
         return first
+
+    def _picked(self, first: Any, second: Any, above: Any, below: Any) -> Any:
+        """``first`` where it is ``above``, ``second`` where it is ``below``, NaN where neither holds, as one of them is NaN.
+
+        CasADi's own `fmax` and `fmin` drop it, and it takes `x != x` for 0."""
+        casadi = self.casadi
+        return casadi.if_else(above, first, casadi.if_else(below, second, first + second))
 
     def _entrywise(self) -> dict[str, Any]:
         casadi = self.casadi
@@ -81,8 +88,8 @@ class Writer:
             "mul": lambda a, b: a * b,
             "div": lambda a, b: a / b,
             "pow": casadi.power,
-            "maximum": casadi.fmax,
-            "minimum": casadi.fmin,
+            "maximum": lambda a, b: self._picked(a, b, a >= b, a < b),
+            "minimum": lambda a, b: self._picked(a, b, a <= b, a > b),
             "eq": lambda a, b: a == b,
             "ne": lambda a, b: a != b,
             "lt": lambda a, b: a < b,

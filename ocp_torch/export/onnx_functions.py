@@ -31,7 +31,8 @@ def erf(graph: Nodes, x: str) -> str:
     place = node("Floor", [node("Add", [node("Mul", [x, number(PLACES)]), number(0.5)])])
     start = node("Mul", [place, number(1.0 / PLACES)])
     way = node("Sub", [x, start])
-    row = graph.cast(node("Add", [place, number(PLACES * FAR)]), "INT64")
+    known_place = node("Where", [node("Equal", [place, place]), place, number(0.0)])  # NaN is no row of the table
+    row = graph.cast(node("Add", [known_place, number(PLACES * FAR)]), "INT64")
     known = node("Gather", [graph.table(_table()), row], axis=0)
     heights = []
     for part in (0.5 - GAUSS, 0.5 + GAUSS):

@@ -143,5 +143,5 @@ class Writer:
         if not any(constant):
             return inputs
         first = self.node("Gather", [self.names[STATE], self.integers([0])], axis=1)
-        zeros = self.node("Mul", [first, self.number(0.0)])
+        zeros = self.cast(self.node("Less", [first, first]), "DOUBLE")  # of a state that is not finite too
         return [self.node("Add", [name, zeros]) if c else name for name, c in zip(inputs, constant, strict=True)]

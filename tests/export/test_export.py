@@ -1,9 +1,7 @@
 """A controller is the same function in ONNX, in C and in CasADi: random networks, every limit and price, wraps included."""
 
-import ctypes
 import json
 import shutil
-import subprocess
 from functools import cache
 
 import numpy as np
@@ -12,15 +10,15 @@ import torch
 
 from ocp_torch import InputError
 from ocp_torch.control.described import described
-from ocp_torch.control.exported import PHYSICAL, TORUS, exported_function
+from ocp_torch.control.exported import PHYSICAL, TORUS
 from ocp_torch.control.policies import trained_policies
 from support.controllers import METHODS, SMALL, controller_of, controllers
+from support.exports import STATES, states_of, through_c, truth
 from support.small import configured
 from support.systems import Cart
 
 pytestmark = pytest.mark.usefixtures("quick_composition")
 
-STATES = 200
 # Of the largest number of an output: in double; computed in double for states and results in single precision; and all in
 # single precision, where what PyTorch itself is off by is allowed four times.
 DOUBLE, ROUNDED, SINGLE, AS_PYTORCH = 1e-12, 1e-7, 1e-5, 4.0
@@ -56,25 +54,6 @@ def controllers_of(variant):
     return controller_of(configured(*small, *METHODS[method], *rest))
 
 
-def truth(controller, coordinates):
-    return exported_function(
-        controller.problem, controller.fields, controller.kind, controller.occupation, controller.constants, coordinates
-    )
-
-
-def states_of(controller, coordinates):
-    """Whole turns around the cell on the torus; in units also beyond the box."""
-    x = (
-        4.0
-        * torch.rand(STATES, controller.problem.dim, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-        - 2.0
-    )
-    if coordinates == TORUS:
-        return x
-    chart = controller.problem.chart
-    return chart.centre + 0.4 * x * chart.length
-
-
 def agree(got, wanted, tolerance, rounded=None):
     """``got`` is ``wanted``; what is ``rounded``, the control in single precision by PyTorch, may be off as that is."""
     assert list(got) == list(wanted)
@@ -94,24 +73,6 @@ def rounded_by_pytorch(controller, states):
     if not problem.measures:
         return policy(states.remainder(1.0)).double()
     return problem.from_controls(policy(problem.to_torus(problem.chart.nearest(states)))).double()
-
-
-def through_c(folder, name, wanted, states, precision=None, speed="-O1"):
-    """What the compiled source gives at ``states``; ``precision`` is null, `FLOAT` or `SINGLE`."""
-    library = folder / f"{name}{precision}{speed[:3]}.so"
-    flags = [] if precision is None else [f"-D{name.upper()}_{precision}"]
-    strict = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", *speed.split(), "-shared", "-fPIC"]
-    subprocess.run(["gcc", *strict, *flags, "-o", str(library), str(folder / f"{name}.c"), "-lm"], check=True)
-    compiled, dtype = ctypes.CDLL(str(library)), np.float64 if precision is None else np.float32
-    x = np.ascontiguousarray(states.numpy().astype(dtype))
-    got = {key: np.full((len(x), int(np.prod(value.shape[1:]))), np.nan, dtype) for key, value in wanted.items()}
-    at = lambda array, i: ctypes.c_void_p(array[i].ctypes.data)
-    for i in range(len(x)):
-        getattr(compiled, f"{name}_control")(at(x, i), at(got["control"], i))
-        if "value" in got:
-            getattr(compiled, f"{name}_value")(at(x, i), at(got["value"], i), at(got["gradient"], i))
-    metadata = ctypes.string_at(ctypes.addressof((ctypes.c_char * 1).in_dll(compiled, f"{name}_metadata")))
-    return got, json.loads(metadata)
 
 
 @pytest.mark.nightly
