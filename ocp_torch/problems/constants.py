@@ -8,6 +8,7 @@ import torch
 from ocp_torch.errors import ProblemError, require_number
 from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.blame import place
+from ocp_torch.problems.idle_noise import idle_noise
 from ocp_torch.problems.needs import GIVEN, GUESSED, SEARCHED
 from ocp_torch.problems.problem import MARGIN, Problem
 from ocp_torch.problems.scan import odd_states
@@ -112,6 +113,8 @@ def resolve_constants(
     if sources["M"] == FROM_CONFIGURATION and true is not None and chosen["M"] < true:
         shown = f"{true:.4g}" if math.isfinite(true) else "infinite"
         notes.append(f"method.occupation_bound = {chosen['M']:.4g} is below this problem's sup mu*, which is {shown}.")
+    if idle := idle_noise(problem):
+        notes.append(f"{idle}, as noise takes longer to simulate.")
     unbounded = is_unbounded(problem, occupation_bound)
     return Constants(**chosen, sources=sources, warnings=tuple(notes), unbounded=unbounded)
 

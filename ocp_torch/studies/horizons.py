@@ -16,6 +16,7 @@ from ocp_torch.errors import InputError, require_integer, require_number
 from ocp_torch.export.casadi_function import require_casadi
 from ocp_torch.maths.runge_kutta import discounted_integral
 from ocp_torch.problems import Problem
+from ocp_torch.problems.idle_noise import idle_noise
 from ocp_torch.problems.starts import drawn_starts
 from ocp_torch.runs.evaluate import load_run
 
@@ -63,7 +64,9 @@ def horizons(config: dict) -> Callable[[], dict[str, Played]]:
     if controller.fields.value is None:
         raise InputError(f"run is {str(config['run'])!r}, which holds no V: take one of method=dual or pd.")
     if not problem.has_simulator or problem.noisy:
-        raise InputError("a receding horizon needs a problem that can be simulated, without noise.")
+        idle = idle_noise(problem)
+        hint = f" ({idle})" if idle else ""
+        raise InputError(f"a receding horizon needs a problem that can be simulated, without noise{hint}.")
     sizes = {name: require_integer(name, config[name], 1, maximum=10_000) for name in ("steps", "longer", "starts")}
     step = STEP / problem.discount if config["step"] is None else require_number("step", config["step"], above=0.0)
     asked = config["time"]

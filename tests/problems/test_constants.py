@@ -46,6 +46,19 @@ class Declared(Problem):
         return 1.0 + (2.0 * math.pi * (x[:, 0] - 0.3)).cos()
 
 
+@pytest.mark.parametrize("size", [None, 0.0, 0.1])
+def test_noise_that_is_0_wherever_it_is_asked_is_told_but_kept(size):
+    class Gusts(Declared):
+        def noise(self, x):
+            return None if size is None else size * (x.remainder(1.0) > 0.9).to(x).unsqueeze(-1)
+
+    problem = Gusts(2.0)
+    told = [note for note in resolve_constants(problem).warnings if "is 0 at all of 4,096 states" in note]
+    assert len(told) == (size == 0.0)
+    assert all(note.startswith("noise is 0 at all") and "must give None" in note for note in told)
+    assert problem.noisy == (size is not None)
+
+
 @pytest.mark.parametrize("declared", [None, 1e-3, 1.0, 1.99, 2.0, 2.5, 100.0])
 def test_no_state_costs_more_than_the_supremum_whatever_is_declared(declared):
     problem = Declared(declared)

@@ -1,5 +1,7 @@
 """A receding horizon with `V*` at its end is optimal however short it is; its factors are those of the problem."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -98,6 +100,23 @@ def test_starts_are_drawn_from_the_start_density(tmp_path, monkeypatch):
     density = controller.problem.initial_density(torch.as_tensor(met[0]))
     assert len(met) == 3
     assert bool((density > 0.0).all())
+
+
+class Calm(Swing):
+    """Its gusts are of size 0, but there."""
+
+    def disturbance(self, s):
+        return 0.0 * self.dynamics(s)[1]
+
+
+@pytest.mark.parametrize("problem", [Calm(), Swing(torque_noise=0.1)])
+def test_noise_is_refused_and_what_is_0_is_told_to_be_left_out(problem, monkeypatch):
+    held = SimpleNamespace(problem=problem, fields=SimpleNamespace(value=True))
+    monkeypatch.setattr("ocp_torch.studies.horizons.load_run", lambda config: held)
+    with pytest.raises(InputError, match="without noise") as refused:
+        horizons(asked("anything"))
+    hint = "disturbance is 0 at all of 4,096 states that were tried; where there is no noise it must give None"
+    assert (hint in str(refused.value)) == isinstance(problem, Calm)
 
 
 @pytest.mark.nightly

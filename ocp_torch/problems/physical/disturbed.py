@@ -15,8 +15,8 @@ class Disturbed(Problem):
     _columns: Tensor | None = None
 
     def disturbance(self, s: Tensor) -> Tensor | None:
-        """`sigma`, ``(N, d, k)``, units of the coordinates per square root of the unit of time; `None` for no noise. By
-        default what `disturb` was given where there is a box."""
+        """`sigma`, ``(N, d, k)``, units of the coordinates per square root of the unit of time; `None` for no noise: 0
+        counts as some. By default what `disturb` was given where there is a box."""
         return None if self._columns is None else self._like(s, "columns", self._columns).expand(len(s), -1, -1)
 
     def disturb(self, columns: Tensor) -> None:
