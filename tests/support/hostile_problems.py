@@ -263,6 +263,9 @@ REFUSED = {
     "mass 0": (lambda: with_(initial_density=lambda self, x: 0.0 * x[:, 0]), "is 0 at all of"),
     "mass of a bump": (lambda: with_(initial_density=bump(0.1)), "integrates to 0.06"),
     "mass of a needle": (lambda: with_(initial_density=bump(0.004)), "integrates to 0.0001|integrates to 9.*e-05"),
+    "mass 1.005": (lambda: with_(initial_density=lambda self, x: 1.005 * gaussian(0.1, 2)(self, x)), "integrates to 1.00"),
+    "mass 1.005 of a quarter": (lambda: with_(initial_density=lambda self, x: 4.02 * (x.remainder(1.0) < 0.5).all(-1).to(x)),
+                                "integrates to 1.005"),
     "mass 2.5": (lambda: with_(initial_density=lambda self, x: 2.5 * gaussian(0.004, 2)(self, x)), "integrates to 2"),
     "counts calls": (Moody, "state_cost .* is no function of the state alone"),
     "random": (lambda: with_(state_cost=lambda self, x: 1.0 + 0.1 * torch.rand(len(x), dtype=x.dtype)), "no function of"),
@@ -353,6 +356,7 @@ LEGAL = {
     "mu0 half a needle": lambda: with_(initial_density=lambda self, x: 0.5 + 0.5 * gaussian(0.004, 2)(self, x)),
     "mu0 two needles": lambda: with_(
         initial_density=lambda self, x: 0.5 * gaussian(0.004, 2)(self, x) + 0.5 * gaussian(0.01, 2, 0.8)(self, x)),
+    "mu0 a quarter": lambda: with_(initial_density=lambda self, x: 4.0 * (x.remainder(1.0) < 0.5).all(-1).to(x)),
     "mu0 a box": lambda: with_(initial_density=box(0.01, 2)),
     "mu0 a box in 4-d": lambda: with_(4, initial_density=box(0.2, 4)),
     "mu0 a ring": lambda: with_(initial_density=ring),

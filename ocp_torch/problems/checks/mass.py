@@ -54,6 +54,11 @@ class Mass:
         return self.half <= CLOSE and abs(self.value - 1.0) <= self.half + TOLERANCE
 
     @property
+    def above(self) -> bool:
+        """Whether it is certainly more than 1 and known so closely that another look need not do as well."""
+        return self.half <= CLOSE and self.value - self.half > 1.0 + TOLERANCE
+
+    @property
     def sentence(self) -> str:
         if self.value == 0.0:
             return f"is 0 at all of {self.states:,} states"
@@ -86,7 +91,7 @@ def sampled_mass(density: Density, dim: int, count: int) -> Mass:
     none = torch.empty(0, dim, dtype=torch.float64)
     peaks: Peaks = none, none, none[:, 0]
     for look in range(LOOKS):
-        if found.right:
+        if found.right or found.above:
             break
         climbed, asked = _climbed(density, x, share)
         peaks = _distinct(*(torch.cat(parts) for parts in zip(peaks, climbed, strict=True)))
