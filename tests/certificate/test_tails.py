@@ -1,5 +1,6 @@
 """Spikes that a few sampled states carry: more states are drawn there, or the interval says that it may be off."""
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 from ocp_torch.certificate import Run, Trained, certify_fields
-from ocp_torch.certificate.checks.tails import rarity, sharpened, widened
+from ocp_torch.certificate.checks.tails import beyond_largest, rarity, sharpened, widened
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
@@ -167,3 +168,30 @@ def test_where_all_that_costs_much_was_met_nothing_is_added():
     problem.state_cost = lambda x: 1e5 * (1.0 + (TURN * (x[:, 0] - 0.4)).cos())  # most where all start
     found = simulate_performance(problem, zero_policy(problem), 64, 4, 0, tolerance=1e-2).perf
     assert found.bias < 0.05 * found.value
+
+
+@pytest.mark.parametrize("power", [0.5, 0.65, 0.8])
+def test_a_cost_without_a_variance_widens_the_interval_of_a_mean_by_what_was_not_met(power):
+    """`E |x|^-p` over evenly spread states and importance samples: the scatter of those met says too little."""
+    missed = 0
+    for seed in range(40):
+        generator = torch.Generator().manual_seed(seed)
+        x, weight = torch.rand(2048, generator=generator, dtype=torch.float64), torch.ones(2048, dtype=torch.float64)
+        if seed % 2:  # half of the states in the innermost thousandth
+            near = torch.rand(2048, generator=generator) < 0.5
+            x = torch.where(near, 1e-3 * x, x)
+            weight = 1.0 / (0.5 + 500.0 * (x < 1e-3))
+        cost = x ** (-power)
+        estimate, truth = float((weight * cost).mean()), 1.0 / (1.0 - power)
+        error = 2.0 * float((weight * cost).std()) / math.sqrt(2048.0)
+        missed += abs(estimate - truth) > error + beyond_largest(cost, weight, estimate)
+    assert missed <= 4
+
+
+@pytest.mark.parametrize(
+    "cost", [lambda x: x, lambda x: (6.0 * x).exp(), lambda x: -x.log(), lambda x: (x < 0.01).double()]
+)
+def test_where_the_largest_fall_off_fast_it_widens_nothing(cost):
+    x = torch.rand(4096, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert beyond_largest(cost(x), torch.ones_like(x), 1.0) == 0.0
+    assert beyond_largest(cost(x)[:200], torch.ones_like(x)[:200], 1.0) == 0.0

@@ -41,10 +41,10 @@ def simulate_candidates(
     best_only: bool,
     remembered: dict[str, Simulated] | None = None,
 ) -> tuple[dict[str, Simulated], Estimate]:
-    """Performance of each of ``candidates``, and of doing nothing. With ``best_only`` one that is clearly worse than another
-    on a quarter of the trajectories gets no more of them, where that saves time. Beside one that holds its control, and takes
-    as long for a few trajectories, any worse one is left at that: acting at every instant it trembles where the other jumps,
-    and would take minutes on fine steps. What is ``remembered`` is not simulated again."""
+    """Performance of each of ``candidates``, and of doing nothing. With ``best_only``, and where that saves time, only the one
+    that is best on a quarter of the trajectories gets all of them, and one that then still looks better. Beside one that
+    holds its control, and takes as long for a few trajectories, any worse one is left at that: acting at every instant it
+    trembles where the other jumps, and would take minutes on fine steps. What is ``remembered`` is not simulated again."""
 
     def simulate(candidate: Candidate, roughly: bool = False) -> Simulated:
         policy, value, initial, rounded = candidate
@@ -62,9 +62,11 @@ def simulate_candidates(
     found = dict(remembered or {})
     found |= {name: simulate(c, name in quickly) for name, c in candidates.items() if name not in found}
     best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
-    for name in quickly:
+    lowest = math.inf  # of those that were simulated at length
+    for name in sorted(quickly, key=lambda name: found[name].perf.value if found[name].perf.finite else math.inf):
         perf = found[name].perf
-        if not (perf.above if held else perf.interval(CONFIDENCE)[0]) > best:
+        if not (perf.above if held else perf.interval(CONFIDENCE)[0]) > best and not perf.value >= lowest:
             found[name] = simulate(candidates[name])
+            lowest = min(lowest, found[name].perf.value)
     nothing = zero_policy(problem)  # the same in any precision
     return found, simulate(Candidate(nothing, None, None, (nothing, None)), roughly=True).perf

@@ -11,13 +11,21 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.checks.tails import unmet, widened
+from ocp_torch.certificate.checks.tails import beyond_largest, widened
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
 from ocp_torch.certificate.simulated.between import jumped_over
 from ocp_torch.certificate.simulated.held import held_integrals
-from ocp_torch.certificate.simulated.loops import FeedbackLoop, HeldLoop, Loop, Sliding, loop_of
+from ocp_torch.certificate.simulated.loops import FeedbackLoop, HeldLoop, Sliding, loop_of
 from ocp_torch.certificate.simulated.steps import Steps
+from ocp_torch.certificate.simulated.unseen import (
+    SIMULATION_REPLICATE,
+    UNSEEN_ROOM,
+    largest_rate_of,
+    stratum_error,
+    unmet_cost,
+    unseen_cost,
+)
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.brownian import Grid, at_random_times, discounted, expectation
 from ocp_torch.maths.cores import in_pieces
@@ -32,24 +40,14 @@ from ocp_torch.maths.runge_kutta import (
     rate_at,
     refined,
 )
-from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import Branch, derive_seed
-from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import initial_points
 
-# Simulation sets come after those of the bounds in the stream of evaluation points.
-SIMULATION_REPLICATE = 1000
 # What is left of the discount when simulation stops, times the rate's supremum, relative to the answer: that part of the
 # tolerance, and so much at least and at most. At the tolerance of a quick evaluation, 5e-4, it is the least; only rough
 # simulations stop earlier. The answer is taken to be at least the last part of the mean state cost at the starts.
 TAIL_PART, SMALLEST_TAIL, LARGEST_TAIL, LEAST = 0.04, 2e-5, 0.02, 0.1
-# States to which the starts' mean cost is compared, how many standard errors apart the two must be, and by how many times
-# that the interval is widened: trajectories may stay where no start was.
-COMPARED, UNLIKELY, UNSEEN_ROOM = 2**15, 2.5, 2.0
-# States that cost so much more than all that was met count with what no path showed (`unmet`), where that makes this part of
-# the answer: with 2,048 paths where they cost 70 times the answer.
-MET, MATERIAL = 0.01, 0.1
 # How far the rates of networks in single precision may be off at the starts in the mean, as a part of what the steps of a
 # trajectory may be off by: 2e-7 of the answer on the circle and on dubins, a twenty-fifth of this at the default tolerance.
 ROUNDED = 0.1
@@ -57,8 +55,12 @@ ROUNDED = 0.1
 # to the simulation changes faster than what it takes off. From values of trajectories it was .7 on a pendubot and 2 on a
 # quadrotor, and asked for 15,000 steps where the cost asks for 800; .003 to .08 for `V` of `dual` and `pd`.
 NO_VARIATE = 0.5
-# How many times as many steps are taken, once, where others jump over a wall: one a hundredth of a turn thick is met then.
-FINER = 8
+# How many times as many steps are taken, once, where others jump over a wall: one a hundredth of a turn thick is met then;
+# and how often these are halved at most, for steps that are as fine as elsewhere in the end.
+FINER, LEFT = 8, MAX_DOUBLINGS - 3
+# Where the first steps of all paths are more than that, as with a small discount, fewer paths are taken, but so many in each
+# set, and the cost itself along them: each is so long that it sees most of what others do. A quadrotor's are 1.6e6.
+MOST_STEPS, LEAST_PATHS = 2.0e6, 4
 # Head-room on the rate's supremum, met at starts and ends, for the states after the end.
 RATE_ROOM = 2.0
 
@@ -82,36 +84,6 @@ def starting_points(
     that each stands for (see `initial_points`)."""
     sets = [initial_points(problem, trajectories, SIMULATION_REPLICATE + r, seed, extra) for r in range(replicates)]
     return torch.cat([x for x, _ in sets]), torch.cat([mass for _, mass in sets])
-
-
-@torch.no_grad()
-def unseen_cost(problem: Problem, x0: Tensor, mass: Tensor, seed: int) -> float:
-    """By how much `E[f mu0]` over the starts ``x0`` ``(N, d)`` and their ``mass`` differs from what many more states say,
-    where that is more than chance: a spike or a hole of `f` that no start has met, or that too few have."""
-    if not problem.scan_factor:
-        return 0.0
-    x, weight = initial_points(problem, COMPARED, SIMULATION_REPLICATE - 1, seed)
-    seen, there = mass * problem.state_cost(x0), weight * problem.state_cost(x)
-    noise = math.hypot(float(seen.std()) / math.sqrt(len(seen)), float(there.std()) / math.sqrt(len(there)))
-    off = abs(float(seen.mean() - there.mean()))
-    return off if off > UNLIKELY * noise + 1e-9 * float(there.abs().mean()) else 0.0
-
-
-@torch.no_grad()
-def largest_rate_of(loop: Loop) -> float:
-    """The largest rate of ``loop`` at evenly spread states, whatever its sign."""
-    x = scrambled_sobol(COMPARED, loop.problem.dim, 0, torch.float64)
-    return float(batched(lambda at: loop(loop.start(at))[1].reshape(len(at), -1)[:, 0].abs(), x).max())
-
-
-def unmet_cost(loop: Loop, met: float, draws: int, size: float) -> float:
-    """What states of a rate of cost far above ``met``, the largest that ``draws`` paths or random times showed, may add to
-    the mean, whose size is ``size``; 0 where that is little."""
-    if not loop.problem.scan_factor:
-        return 0.0
-    dearest = largest_rate_of(loop)
-    added = unmet(dearest, draws)
-    return added if met < MET * dearest and added > MATERIAL * size else 0.0
 
 
 def simulate_performance(
@@ -146,6 +118,10 @@ def simulate_performance(
     random = horizon == RANDOM and not isinstance(dynamics, HeldLoop)
     points, mass = starting_points(problem, trajectories, replicates, seed, extra=int(random))
     x0 = points[:, :dim]
+    plain = None if rounded is None else (rounded[0], None)
+    plainly = lambda count: simulate_performance(
+        problem, policy, count, replicates, seed, None, None, horizon, tolerance, plain, doublings, audited
+    )
     along, beside = (None, value) if isinstance(dynamics, HeldLoop) else (value, None)  # of rates; of whole pieces
     with torch.no_grad():
         base = along(x0) if along is not None else torch.zeros_like(x0[:, 0])
@@ -156,11 +132,7 @@ def simulate_performance(
             if not float((mass * rate.reshape(len(x0), -1)[:, 0]).abs().mean()) <= NO_VARIATE * float(
                 (mass * paid).mean()
             ):
-                plain = None if rounded is None else (rounded[0], None)
-                effort = trajectories, replicates, seed
-                return simulate_performance(
-                    problem, policy, *effort, None, None, horizon, tolerance, plain, doublings, audited
-                )
+                return plainly(trajectories)
         quick = dynamics if rounded is None else loop_of(problem, *rounded)
         off = (quick(quick.renewed(state))[1] - rate).abs().mean()
         velocity, rate = velocity[:, :dim], rate.reshape(len(x0), -1)[:, 0]
@@ -176,6 +148,9 @@ def simulate_performance(
     tail = min(max(TAIL_PART * tolerance, SMALLEST_TAIL), LARGEST_TAIL)
     longest = float(times.max()) if random else max(math.log(max(largest_rate / (tail * size), math.e)), 1.0) / rho
     steps = Steps.of(dynamics, longest, velocity)
+    fewer = max(LEAST_PATHS, 2 ** int(math.log2(max(MOST_STEPS / (steps.count * replicates), 1.0))))
+    if fewer < trajectories and not isinstance(dynamics, HeldLoop):
+        return plainly(fewer)
     sliding = Sliding(len(x0), tolerance * size) if isinstance(dynamics, FeedbackLoop) and dynamics.summed else None
 
     def integrated(by: Dynamics) -> Integrate:
@@ -212,6 +187,7 @@ def simulate_performance(
         result, end, bias, taken = refined(integrated(swift), mass, steps.count, *accuracy)
         if (wall := between(taken)) and doublings == MAX_DOUBLINGS:
             steps = replace(steps, count=FINER * steps.count)
+            accuracy = tolerance * size, generator, error, audit, LEFT, AUDITED
             result, end, bias, taken = refined(integrated(swift), mass, steps.count, *accuracy)
             wall = between(taken)
         bias += 0.0 if audited or exact is None else float(off)  # rounding alone must not look like a contradiction
@@ -231,20 +207,10 @@ def simulate_performance(
     bias += rare if chance else 0.0  # starts are spread evenly, and their paths follow from them
     parts = (means(result) + refinement).tolist()
     totals = [part + (initial[r % len(initial)] if initial else 0.0) for r, part in enumerate(parts)]
+    bias += beyond_largest(result, mass, size)
     perf = Estimate.of(totals, bias=bias)
     perf = widened(replace(perf, se=max(perf.se, stratum_error(mass * result, replicates))), [mass * result])
     # One path with noise is off its mean, `V^u`; the largest of `N` by some `sqrt(2 log N)` standard deviations.
     above = float(result.std()) * math.sqrt(2.0 * math.log(len(result))) if problem.noisy else 0.0
     largest = None if random or isinstance(dynamics, HeldLoop) else float((base + result).max()) - above
     return Simulated(perf, largest, ended, wall, 0.0 if chance else rare)
-
-
-def stratum_error(results: Tensor, replicates: int) -> float:
-    """The standard error of a mean of ``results`` ``(N,)``, of ``replicates`` of evenly spread starts, if one stratum is off.
-
-    Where the cost jumps, all replicates may put the start of the stratum with the jump on the same side, and then agree with
-    one another. A stratum holds one of the `n` starts of a replicate: its mean is off by the spread of the results over `n`.
-    Without this, 95 % intervals missed the mean of a step in 7 to 25 % of draws, whatever `n` from 4 to 256; with it, in 1 to
-    7 %.
-    """
-    return float(results.std()) / (len(results) // replicates * math.sqrt(replicates))

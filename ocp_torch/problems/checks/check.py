@@ -32,8 +32,8 @@ SIZES = (7, 1, 37, 2)
 SET_BY_INIT = ("dim", "control_dim", "discount", "exponent", "control_cost")
 DECLARED = ("state_cost_bound", "occupation_bound", "control_bound", "value_bound", "exact_optimum")
 # Turns of a state round the torus within 1 / discount. Paths are simulated in steps of a fraction of a turn: more than so
-# many would take hours; the square of the turns that noise spreads it over counts as much.
-MOST_TURNS = 1e4
+# many would take hours (a thousand take some ten minutes); the square of the turns that noise spreads it over counts as much.
+MOST_TURNS = 1e3
 # States at which typical speeds are taken, and the number of their fixed design.
 SPEED_STATES, SPEED_DESIGN = 64, 13
 
