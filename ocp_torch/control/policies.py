@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.pace import Pace
-from ocp_torch.fields.fields import Fields
+from ocp_torch.fields.fields import SUBSOLUTION, Fields
 from ocp_torch.maths import jets
 from ocp_torch.maths.jets import Field, Jet
 from ocp_torch.objectives.objective import CLOSED, NETWORK, SADDLE
@@ -19,8 +19,10 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
 # The controllers of trained fields: from `V`; from `w / mu`; from the `V` of a warm start, which the values of trajectories
-# under held controls were fitted to; and from `w` and the `mu` of Lemma 2 where training takes another: `G` bounds its cost.
+# under held controls were fitted to; from `V` trained on for the lower bound; and from `w` and the `mu` of Lemma 2 where
+# training takes another: `G` bounds its cost.
 VALUE, DENSITY, TRAJECTORIES, MINIMISED = "value", "density", "trajectories", "minimised"
+BOUNDING = SUBSOLUTION
 
 # Multiples of it are spread evenly, and no grid or symmetric state has them as coordinates.
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
@@ -75,13 +77,14 @@ def admissible_density(kind: str | None, problem: Problem, fields: Fields, const
 
 
 def density_policy(control_density: Field, occupation: Density, cost: PowerCost) -> Policy:
-    """`u = w / mu`, within the limit of ``cost``; 0 where `mu` is 0 (nobody is there) or infinite (mass stands still)."""
+    """`u = w / mu`, within the limit of ``cost``; 0 where `mu` is 0 (nobody is there) or infinite (mass stands still), and
+    NaN where a state is."""
 
     def policy(x: Tensor) -> Tensor:
         mu = occupation(x)
-        usable = (mu > 0) & torch.isfinite(mu)
-        mu = torch.where(usable, mu, 1.0)
-        return torch.where(usable.unsqueeze(-1), cost.within(control_density(x), mu) / mu.unsqueeze(-1), 0.0)
+        idle = (mu <= 0) | mu.isinf()
+        mu = torch.where(idle, 1.0, mu)
+        return torch.where(idle.unsqueeze(-1), 0.0, cost.within(control_density(x), mu) / mu.unsqueeze(-1))
 
     return policy
 
@@ -112,8 +115,9 @@ def occupation_density(kind: str | None, problem: Problem, fields: Fields, const
 def trained_policies(
     kind: str | None, problem: Problem, fields: Fields, constants: Constants, every: bool = False
 ) -> dict[str, Policy]:
-    """The controllers trained fields give: ``value`` if they hold `V`, ``density`` if they hold `w`, and ``trajectories`` if
-    they hold the `V` of a warm start; or ``every`` one, ``minimised`` too."""
+    """The controllers trained fields give: ``value`` if they hold `V`, ``density`` if they hold `w`, ``trajectories`` if they
+    hold the `V` of a warm start, and ``subsolution`` if they hold one trained on from `V` for the lower bound without noise;
+    or ``every`` one, ``minimised`` too."""
     policies: dict[str, Policy] = {}
     if fields.value is not None:
         policies[VALUE] = ValuePolicy(problem, fields.value)
@@ -126,4 +130,6 @@ def trained_policies(
             policies[MINIMISED] = density_policy(fields.control_density, mu, problem.control_cost)
     if fields.trajectory_value is not None:
         policies[TRAJECTORIES] = HeldPolicy(problem, fields.trajectory_value, Pace.of(problem))
+    if fields.subsolution is not None and (every or not problem.noisy):
+        policies[BOUNDING] = ValuePolicy(problem, fields.subsolution)
     return policies
