@@ -146,7 +146,7 @@ class Context:
         if self.value is None:
             return None
         search = self.settings.searches(self.constants)
-        how = self.settings.ascents, search, self.seed, self.odd, self.kept
+        how = self.settings.ascents, search, self.seed, self.odd, self.kept, self.settings.bound_steps
         return SampledValue(self.problem, self.value, self.wide, *how)
 
     @property

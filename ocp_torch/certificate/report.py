@@ -24,6 +24,7 @@ CONTROLLERS = {
     "density": "controller w / mu",
     "minimised": "controller w / mu, mu of Lemma 2",
     "trajectories": "controller from V of trajectories",
+    "subsolution": "controller from V trained on for its bound",
     "given": "this controller",
 }
 
@@ -98,6 +99,7 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
     row("Perf: controller w/mu", certificate["perf"].get("density"))
     row("Perf: w/mu, mu of Lemma 2", certificate["perf"].get("minimised"))
     row("Perf: from trajectories", certificate["perf"].get("trajectories"))
+    row("Perf: from V trained on", certificate["perf"].get("subsolution"))
     for kind, estimate in certificate.get(PERFORMANCE, {}).items():
         row(f"Perf, at least: {visible(kind, LONGEST_NAME)}", estimate)
     row("Perf: this controller", certificate["perf"].get("given"))

@@ -62,6 +62,7 @@ class CertificateSettings:
     trajectories: int = 256  # simulated starts per replicate; 0 skips every simulation
     ascents: int = 32  # local ascents from the worst sampled states; 64 times as many start where a slack is steep
     mollify: bool | None = None  # train on and average V for the bound without M; None: where there is no M
+    bound_steps: int | None = None  # by which V is trained on for that bound; None: 2,000, with noise 700; 0: none
     occupation_states: int = 144  # where the supremum of the occupation density is looked for; 0 skips it
     rigorous: bool = False  # a lower bound proved over cells, in one and two dimensions: a second, or up to two minutes
     confidence: float = CONFIDENCE  # how often an interval covers the truth, by Student's t over the replicates
@@ -77,6 +78,8 @@ class CertificateSettings:
         least = {"points": 1, "replicates": 2, "trajectories": 0, "ascents": 1, "occupation_states": 0}
         for name, minimum in least.items():
             require_integer(f"certificate.{name}", getattr(self, name), minimum)
+        if self.bound_steps is not None:
+            require_integer("certificate.bound_steps", self.bound_steps, 0)
         if self.mollify is not None:
             require_flag("certificate.mollify", self.mollify)
         require_flag("certificate.rigorous", self.rigorous)

@@ -14,7 +14,7 @@ from ocp_torch.control.described import described, problem_name, require_same
 from ocp_torch.control.exported import about, coordinates_of, example_states, exported_function
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.pace import Pace
-from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, TRAJECTORIES, Policy, trained_policies
+from ocp_torch.control.policies import BOUNDING, CLOSED, NETWORK, SADDLE, TRAJECTORIES, Policy, trained_policies
 from ocp_torch.errors import InputError, notes, require_number
 from ocp_torch.export import export
 from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, MODELS, SUBSOLUTION, TRAJECTORY_VALUE, VALUE, Fields, made
@@ -28,7 +28,7 @@ from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.physical.system import System
 
 # What a run calls the file of its controller, and its schema, raised when an older version could not read what is written.
-FILE_NAME, SCHEMA = "controller.safetensors", 2
+FILE_NAME, SCHEMA = "controller.safetensors", 3
 # What the file holds of a controller just as it is.
 PLAIN = ("model", "occupation", "kind", "certificate", "config")
 FIELDS = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION, TRAJECTORY_VALUE, SUBSOLUTION)
@@ -43,7 +43,8 @@ class Controller:
     """`u(x)` with all it came from.
 
     ``kind`` says which policy `u` is: ``value`` (from `V` alone), ``density`` (`w / mu`), ``minimised`` (`w / mu` with the
-    `mu` of Lemma 2 in place of the trained one) or ``trajectories`` (best for a whole step, from the `V` of the warm start).
+    `mu` of Lemma 2 in place of the trained one), ``trajectories`` (best for a whole step, from the `V` of the warm start) or
+    ``subsolution`` (from `V` trained on for the lower bound).
     ``certificate`` is the dict of `certificate.json`, ``config`` the resolved configuration of the run, ``model`` the
     network's configuration. Controls are computed in double precision, whatever the networks were trained in: in single
     precision those of a pendulum were off by up to 1e-5 of the largest.
@@ -93,7 +94,8 @@ class Controller:
         """Controls ``(N, m)`` at states ``(N, d)`` that are best where each is held for ``step`` units of time, from the `V`.
 
         Raises `InputError` as a call does, for a ``step`` that is no time, and where the controller holds no `V`."""
-        field = self._exact.value if self.kind != TRAJECTORIES else self._exact.trajectory_value
+        others = {TRAJECTORIES: self._exact.trajectory_value, BOUNDING: self._exact.subsolution}
+        field = others.get(self.kind, self._exact.value)
         if field is None:
             raise InputError("this controller holds no V, from which controls for a whole step follow.")
         pace = Pace.of(self.problem).with_step(require_number("step", step, above=0.0))

@@ -22,7 +22,7 @@ from ocp_torch.problems.problem import Problem
 VALUE, CONTROL_DENSITY, LOG_OCCUPATION = "value", "control_density", "log_occupation"
 # A second `V`, from values of trajectories or of a grid: what controls best and what bounds best differ. No player moves it.
 TRAJECTORY_VALUE = "trajectory_value"
-# A third, `V` trained on for the lower bound alone: it proves how good a controller is, and gives none.
+# A third, `V` trained on for the lower bound alone.
 SUBSOLUTION = "subsolution"
 # Builds a network from (dim, outputs, shift, scale); outputs None means a scalar field.
 NetworkFactory = Callable[..., nn.Module]

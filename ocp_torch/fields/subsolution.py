@@ -4,6 +4,9 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from ocp_torch.maths import jets
+from ocp_torch.maths.jets import Jet
+
 
 class Subsolution(nn.Module):
     """``network`` `W`, ``(N, d) -> (N,)``, and ``worst`` ``(K, d)``, where its slack was found to be largest: a search for
@@ -24,3 +27,11 @@ class Subsolution(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return self.network(x)
+
+    def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
+        """As `jets.jet` has it."""
+        return jets.jet(self.network, x, sigma)
+
+    def curvature(self, x: Tensor, sigma: Tensor) -> Tensor:
+        """As `jets.curvature` has it."""
+        return jets.curvature(self.network, x, sigma)

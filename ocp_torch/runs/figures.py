@@ -32,6 +32,7 @@ TITLES = {
     "control_value": "u from V",
     "control_density": "u = w / mu",
     "control_trajectories": "u from V of trajectories",
+    "control_subsolution": "u from V trained on",
     "occupation": "mu",
     "slack": "HJB slack Q",
 }

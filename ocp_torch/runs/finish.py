@@ -10,6 +10,7 @@ import numpy as np
 
 from ocp_torch.certificate import Certificate, CertificateSettings
 from ocp_torch.control.controller import FILE_NAME, Controller
+from ocp_torch.control.policies import BOUNDING
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.fields import SUBSOLUTION, Fields
 from ocp_torch.files.storage import write_atomically
@@ -100,7 +101,7 @@ def hand_out(
     write_atomically(folder / MARK, lambda path: path.write_text("a resume makes what is missing\n"))
     named = certificate.controller or certificate.subject
     kind = named or ("value" if fields.value is not None else "density")
-    controller = controller_of(trainer, certificate, kind, with_subsolution(fields, certificate))
+    controller = controller_of(trainer, certificate, kind, with_subsolution(fields, certificate, kind))
     controller.save(folder / FILE_NAME)
     write_atomically(folder / "certificate.json", certificate.save)
     drawn: dict = {}
@@ -127,13 +128,14 @@ def glimpse(trainer: Trainer) -> dict[str, np.ndarray]:
         return canvas.drawn(Shown(trainer.problem, trainer.averaged_fields, *how, quick=True).figures())
 
 
-def with_subsolution(fields: Fields, certificate: Certificate) -> Fields:
-    """``fields``, and what the lower bound of ``certificate`` is of, where that is none of them."""
-    if certificate.subsolution is None:
-        return fields
-    return Fields(
-        {**fields.networks, SUBSOLUTION: copy.deepcopy(certificate.subsolution).to(next(fields.parameters()))}
-    )
+def with_subsolution(fields: Fields, certificate: Certificate, kind: str) -> Fields:
+    """``fields``, and what the lower bound of ``certificate`` is of; without a subsolution that serves neither that bound nor
+    the controller, which is of ``kind``."""
+    found = certificate.subsolution or (fields.subsolution if kind == BOUNDING else None)
+    others = {name: network for name, network in fields.networks.items() if name != SUBSOLUTION}
+    if found is None:
+        return Fields(others)
+    return Fields({**others, SUBSOLUTION: copy.deepcopy(found).to(next(fields.parameters()))})
 
 
 def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields: Fields) -> Controller:

@@ -4,7 +4,8 @@ import copy
 import math
 from dataclasses import dataclass, replace
 
-from ocp_torch.errors import require_choice, require_section
+from ocp_torch.certificate.lower.tightened import plan_of
+from ocp_torch.errors import require_choice, require_number, require_section
 from ocp_torch.fields import MODELS
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import is_unbounded
@@ -79,6 +80,10 @@ SAMPLER, WORST_STATE_SAMPLER = "sobol", "uniform"
 # States at which a certificate computes the occupation density, and at most so many differences at them, `d + 1` for each:
 # with 64 coordinates 144 states took eight of a certificate's twelve minutes, with 16 a third of a minute and a half.
 OCCUPATION_STATES, OCCUPATION_DIFFERENCES = 144, 144 * 9
+# Of value iteration along trajectories.
+WARM_ROUNDS = 120
+# By how much the steps of all parts that are left null may be multiplied together.
+EFFORTS = dict(at_least=0.01, at_most=100.0)
 # Steps between looks at most, and where one of them may end the run. A look with noise takes as long as 100 to 200 steps;
 # every 600 steps they were a third of the training of a pendulum.
 LOOKS_APART, TARGET_APART = 1200, 600
@@ -90,10 +95,12 @@ def fill(config: dict, problem: Problem) -> dict:
     Sizes of the networks are those that the class of the model has for itself. Raises `InputError` for a model that is not
     known, or a section that is none.
     """
-    budget = next(b for b in BUDGETS if problem.dim <= b.dim)
     for name in ("model", "trainer", "optimizer", "certificate"):
         require_section(name, config.get(name))
     filled = copy.deepcopy(config)
+    budget = next(b for b in BUDGETS if problem.dim <= b.dim)
+    effort = require_number("trainer.effort", config["trainer"].get("effort", 1.0), **EFFORTS)
+    scaled = lambda steps: max(1, round(effort * steps))
     method = require_section("method", config.get("method") or {})
     model = MODELS[require_choice("model.name", config["model"].get("name"), MODELS)]
     unbounded = is_unbounded(problem, method.get("occupation_bound"))
@@ -111,23 +118,26 @@ def fill(config: dict, problem: Problem) -> dict:
         **{f"model.{name}": value for name, value in model.defaults(problem.dim, unbounded, problem.noisy).items()},
         "trainer.rounds": 2 if config["trainer"].get("steps") is None else 1,
         "trainer.good_gap": budget.good_gap,
-        "trainer.steps": budget.steps,
+        "trainer.steps": scaled(budget.steps),
         "trainer.batch": budget.batch,
         "optimizer.lr": LEARNING_RATE if unbounded else budget.lr,
         "sampler.name": WORST_STATE_SAMPLER if unbounded else SAMPLER,
         "certificate.occupation_states": min(OCCUPATION_STATES, OCCUPATION_DIFFERENCES // (problem.dim + 1)),
-        "certificate.stage.steps": budget.stage_steps,
+        "certificate.bound_steps": scaled(plan_of(problem, None)[1]),
+        "certificate.stage.steps": scaled(budget.stage_steps),
         "certificate.stage.lr": budget.stage_lr,
     }
     if unbounded and method_name == "pd" and config["trainer"].get("batch") is None:
         defaults["method.density_batch"] = DENSITY_BATCH
     given = config["trainer"].get("steps")
-    steps = given if isinstance(given, int) and given > 0 else budget.steps
+    steps = given if isinstance(given, int) and given > 0 else scaled(budget.steps)
     defaults["trainer.newton_steps"] = budget.newton_steps if steps >= FEWEST_STEPS else 0
     early = given is None and method_name == "dual"
     defaults["trainer.newton_after"] = budget.newton_after if early else 0
     apart = LOOKS_APART if config["trainer"].get("target_gap") is None else TARGET_APART
     defaults["trainer.evaluate_every"] = math.ceil(steps / math.ceil(steps / apart))
+    if config.get("warm_start") is not None:
+        defaults["warm_start.rounds"] = scaled(WARM_ROUNDS)
     for path, value in defaults.items():
         *groups, field = path.split(".")
         section = filled

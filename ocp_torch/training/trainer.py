@@ -209,6 +209,10 @@ class Trainer:
             return False
         return not self.evaluator.reaches(self.settings.good_gap, self.run)
 
+    def tightened(self, settings: CertificateSettings, fields: Fields) -> Fields:
+        """``fields`` with the `V` of the highest lower bound, see `Evaluator.tightened`."""
+        return self.evaluator.tightened(fields, self.run, settings, self.tell)
+
     def certify(self, settings: CertificateSettings, fields: Fields | None = None) -> Certificate:
         """The full certificate of ``fields``, or of the averaged ones as they stand."""
         trained = replace(self.trained, fields=fields or self.averaged_fields)

@@ -62,7 +62,7 @@ def hasty(monkeypatch):
 @pytest.fixture
 def briefly_tightened(monkeypatch):
     """A value is trained on for its bound, but not for long."""
-    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.ROUNDS", ((100.0, 60, 1e-3), (1000.0, 120, 1e-3)))
+    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.PLAN", (1000.0, 180, 1e-3))
 
 
 @pytest.mark.usefixtures("hasty")

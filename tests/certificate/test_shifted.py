@@ -253,8 +253,8 @@ def perturbed(problem, size=1e-3, seed=0):
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["manufactured 2-d q=1.5", "noisy 1-d"])
 def test_a_value_trained_on_for_the_bound_comes_closer_to_the_optimum_from_below(name, monkeypatch):
-    for rounds in ("ROUNDS", "NOISY_ROUNDS"):
-        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{rounds}", ((100.0, 150, 2e-2),))
+    for plan in ("PLAN", "NOISY_PLAN"):
+        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{plan}", (100.0, 150, 2e-2))
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.BATCH", 512)
     monkeypatch.setattr("ocp_torch.certificate.lower.mollified.RADII", (1.0 / 64.0,))
     for least in ("WORTH", "NOISY_WORTH"):
@@ -272,19 +272,20 @@ def test_a_value_trained_on_for_the_bound_comes_closer_to_the_optimum_from_below
 
 
 def test_what_cannot_be_trained_on_stays_as_it_is():
-    assert not list(tightened(Circle(), Circle().exact_value, seed=0))
+    trained = lambda value, **how: Ahead(tightened(Circle(), value, seed=0, **how)).answer()
+    assert trained(Circle().exact_value) is None
+    assert trained(perturbed(Circle()), steps=0) is None
     broken = perturbed(Circle())
     broken.head.bias.fill_(math.nan)
-    assert not list(tightened(Circle(), broken, seed=0))
+    assert trained(broken) is None
 
 
 def test_a_quick_certificate_trains_for_as_many_times_fewer_steps_as_it_has_fewer_states(monkeypatch):
-    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.ROUNDS", ((100.0, 8, 1e-3), (1000.0, 16, 1e-3)))
+    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.PLAN", (1000.0, 24, 1e-3))
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.BATCH", 64)
-    for batch, first, second in ((1000, 8, 16), (64, 8, 16), (16, 2, 4), (1, 1, 1)):
-        met = list(tightened(Circle(), perturbed(Circle()), 0, batch))
-        rounds = [k for k, W in enumerate(met) if W is not None]
-        assert rounds == [first, first + second + 1]
+    count = lambda *how: sum(1 for _ in tightened(Circle(), perturbed(Circle()), 0, *how))
+    assert [count(batch) for batch in (1000, 64, 16, 1)] == [24, 24, 6, 1]
+    assert [count(batch, 48) for batch in (64, 16)] == [48, 12]
 
 
 class AsIfNoisy(Circle):
@@ -293,16 +294,16 @@ class AsIfNoisy(Circle):
     noisy = True
 
 
-# Heights of spikes on the exact `V` before and after each round; the optimum is .06.
+# Heights of spikes on the exact `V` before and after; the optimum is .06.
 @pytest.mark.parametrize(
     ("problem", "heights", "trained", "best"),
     [
-        (AsIfNoisy(), (6e-4, 2e-4, 0.0), True, 0.0),
-        (AsIfNoisy(), (2e-4, 0.0, 0.0), False, 2e-4),  # a third of one per cent is little
-        (Circle(), (0.02, 0.0, 0.01), True, 0.01),  # the last round counts
-        (Circle(), (0.02, 0.0, 0.03), True, 0.02),
-        (Circle(), (2e-4, 0.0, 0.0), True, 0.0),  # a third of one per cent is much
-        (Circle(), (1e-5, 0.0, 0.0), False, 1e-5),
+        (AsIfNoisy(), (6e-4, 0.0), True, 0.0),
+        (AsIfNoisy(), (2e-4, 0.0), False, 2e-4),  # a third of one per cent is little
+        (Circle(), (0.02, 0.01), True, 0.01),
+        (Circle(), (0.02, 0.03), True, 0.02),
+        (Circle(), (2e-4, 0.0), True, 0.0),  # a third of one per cent is much
+        (Circle(), (1e-5, 0.0), False, 1e-5),
     ],
 )
 def test_v_is_trained_on_where_there_is_enough_to_gain(problem, heights, trained, best, monkeypatch):
@@ -320,22 +321,22 @@ def test_v_is_trained_on_where_there_is_enough_to_gain(problem, heights, trained
             return exact.exact_value(x) + self.height * spike(x)
 
     sets = replicated_samples(problem, 2048, 2, 0, divergences=False)
-    V, *later = (Spiked(h) for h in heights)
+    V, W = (Spiked(h) for h in heights)
     asked = []
 
-    def rounds(*_):
-        for W in later:
-            asked.append(W)
-            yield Subsolution(W, sets[0].x[:4])
+    def training(*_):
+        asked.append(W)
+        yield
+        return Subsolution(W, sets[0].x[:4])
 
-    monkeypatch.setattr("ocp_torch.certificate.lower.sampled.tightened", rounds)
+    monkeypatch.setattr("ocp_torch.certificate.lower.sampled.tightened", training)
     monkeypatch.setattr("ocp_torch.certificate.lower.sampled.mollified_shift", lambda best: best)
     found = SampledValue(problem, V, sets, ascents=2, search=True)
     lost = exact.exact_optimum - found.own.bound
     # The mean of the tail has a part of the spike.
     assert attainable(found.own) - found.own.bound == pytest.approx(lost, rel=0.4, abs=1e-4)
     assert found.best.value.height.item() == best
-    assert asked == (later if trained else [])
+    assert asked == ([W] if trained else [])
     # Its supremum is sought at the states that training found worst, too.
     assert len(found.best.beside) == (found.best.value is not V)
     # And it is kept, where the bound is of it.
@@ -345,8 +346,8 @@ def test_v_is_trained_on_where_there_is_enough_to_gain(problem, heights, trained
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["kuramoto n=3", "noisy 1-d"])
 def test_a_second_core_gives_the_same_certificate(name, monkeypatch):
-    for rounds in ("ROUNDS", "NOISY_ROUNDS"):
-        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{rounds}", ((100.0, 10, 1e-3), (1000.0, 20, 1e-3)))
+    for plan in ("PLAN", "NOISY_PLAN"):
+        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{plan}", (1000.0, 30, 1e-3))
     for least in ("WORTH", "NOISY_WORTH"):
         monkeypatch.setattr(f"ocp_torch.certificate.lower.sampled.{least}", 0.0)
     problem, threads = zoo.build(name), []

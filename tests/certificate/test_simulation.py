@@ -17,7 +17,7 @@ from ocp_torch.maths import cores
 from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.runge_kutta import discounted_integral, refined
 from ocp_torch.maths.sampling import evaluation_points
-from ocp_torch.problems import Pendulum, Problem
+from ocp_torch.problems import Circle, Pendulum, Problem
 from ocp_torch.training.evaluator import QUICK
 from support import zoo
 
@@ -460,3 +460,18 @@ def test_a_few_fast_trajectories_take_finer_steps_and_the_others_none(monkeypatc
         assert abs(perf.value - exact) <= perf.bias
         assert perf.bias < 0.01 * exact
     assert work[0] < 0.5 * work[1]
+
+
+def test_paths_that_are_very_long_are_fewer_and_agree_with_the_time_average(monkeypatch):
+    """A constant speed of 1 and a discount of .02: what a path costs is nearly the mean of the cost along the circle."""
+    problem = Circle(discount=0.02)
+    taken = []
+    count = lambda *how, **rest: taken.append(how[1:3]) or starting_points(*how, **rest)
+    monkeypatch.setattr("ocp_torch.certificate.simulated.performance.starting_points", count)
+    monkeypatch.setattr("ocp_torch.certificate.simulated.performance.MOST_STEPS", 2.0e4)
+    found = simulate_performance(problem, lambda x: torch.ones_like(x), 256, 2, seed=0, tolerance=1e-3).perf
+    assert taken[0] == (256, 2)
+    assert taken[-1][0] < 16
+    x = torch.linspace(0.0, 1.0, 4097, dtype=torch.float64)[:-1].unsqueeze(1)
+    mean = float(problem.state_cost(x).mean()) + float(problem.control_cost.cost(torch.ones(1, 1, dtype=torch.float64)))
+    assert found.value == pytest.approx(mean, rel=0.02)

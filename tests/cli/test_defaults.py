@@ -11,6 +11,7 @@ from ocp_torch.certificate import CertificateSettings, StageSettings
 from ocp_torch.cli.compose import composed, register_resolvers
 from ocp_torch.cli.explain import CONFIGS
 from ocp_torch.fields import MODELS
+from ocp_torch.files.plain import value_at
 from ocp_torch.maths.sampling import SAMPLERS
 from ocp_torch.objectives import METHODS
 from ocp_torch.problems.constants import resolve_constants
@@ -23,6 +24,7 @@ from ocp_torch.training.batches import Batches
 from ocp_torch.training.budgets import fill
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.warm_start.settings import WarmStartSettings
+from support.small import outcome
 
 register_resolvers()
 CHOICES = sorted(
@@ -116,6 +118,29 @@ def test_what_is_null_is_chosen_in_one_place_for_the_command_line_and_for_python
         known = parameters(*TAKERS[group](section))
         for field in (f for f, value in section.items() if value is None and f not in BOUND_FIELDS):
             assert known[field].default in (None, inspect.Parameter.empty), f"{group}.{field}"
+
+
+@pytest.mark.parametrize("problem", ["circle", "unicycle", "pendulum", "cart_pole"])
+def test_half_the_effort_is_half_of_all_steps_that_nobody_set(problem):
+    """With noise too; and what is set stays as it is."""
+    places = ("trainer.steps", "certificate.stage.steps", "certificate.bound_steps", "warm_start.rounds")
+    for noise in (0.0, 1e-3):
+        steps = {}
+        for effort in (1.0, 0.5):
+            named = [f"problem={problem}", f"problem.noise={noise}", f"trainer.effort={effort}"]
+            config = composed("train", named)
+            filled = fill(config, build_problem(config["problem"]))
+            steps[effort] = [value_at(filled, place) for place in places]
+        assert [2 * half for half in steps[0.5]] == steps[1.0]
+        assert all(isinstance(half, int) for half in steps[0.5])
+        set_ = composed("train", [*named, "trainer.steps=7", "certificate.bound_steps=9"])
+        filled = fill(set_, build_problem(set_["problem"]))
+        assert (filled["trainer"]["steps"], filled["certificate"]["bound_steps"]) == (7, 9)
+
+
+@pytest.mark.parametrize("effort", ["0", "-1", "1e9", "nan", "much", "null"])
+def test_an_effort_that_is_none_is_refused_by_name(effort):
+    assert "trainer.effort" in outcome(f"trainer.effort={effort}")
 
 
 def test_commands_beside_training_have_the_defaults_of_their_functions():

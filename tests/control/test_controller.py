@@ -233,7 +233,7 @@ def test_one_flipped_bit_anywhere_is_noticed(saved, tmp_path):
 
 
 CRAFTED = {
-    "schema": [3, "1", None, 1.5],
+    "schema": [4, "1", None, 1.5],
     "problem.name": ["os.system", "../x", "builtins.eval", "Torus", 5, ["torus"]],
     "problem.parameters": [{"dim": 10**9}, {"dim": 0}, {"discount": -1.0}, {"discount": 1e300}, {"colour": 1}, 3],
     "model.name": ["os.system", "../x", None],

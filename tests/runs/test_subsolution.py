@@ -1,12 +1,15 @@
 """What a run's lower bound is of lies beside its controller: the bound is evaluated again, and nothing trained again."""
 
+import copy
 import json
 
 import pytest
 import torch
 
 from ocp_torch import load_controller
+from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.errors import InputError
+from ocp_torch.fields import Subsolution
 from ocp_torch.files.storage import load_tensors, save_tensors
 from ocp_torch.problems import Circle
 from ocp_torch.runs.build import build_certificate_settings
@@ -34,7 +37,7 @@ def run(tmp_path_factory):
     """Its bound is of `V` trained on: of any gain."""
     folder = tmp_path_factory.mktemp("run")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(f"{TIGHTENED}.ROUNDS", ((100.0, 60, 1e-2),))
+        patch.setattr(f"{TIGHTENED}.PLAN", (100.0, 60, 1e-2))
         patch.setattr(f"{TIGHTENED}.BATCH", 64)
         patch.setattr("ocp_torch.certificate.lower.sampled.WORTH", 0.0)
         certificate = session(small("certificate.mollify=true", *QUICK), folder)
@@ -116,6 +119,39 @@ def test_states_that_are_none_are_refused_in_one_sentence(run, tmp_path, worst, 
     with pytest.raises(InputError, match=words) as error:
         load_controller(tmp_path)
     assert "\n" not in str(error.value)
+
+
+def taught(value, steps: int = 300):
+    """A network of the weights of ``value`` trained towards the exact `V` of the circle."""
+    network, exact = copy.deepcopy(value).double().requires_grad_(True), Circle().exact_value
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-2)
+    x = torch.linspace(0.0, 1.0, 257, dtype=torch.float64).unsqueeze(1)
+    for _ in range(steps):
+        optimizer.zero_grad()
+        (network(x) - exact(x)).square().mean().backward()
+        optimizer.step()
+    return network.requires_grad_(False)
+
+
+def test_its_controller_is_handed_out_where_it_is_the_best(tmp_path, monkeypatch):
+    def training(problem, value, *_):
+        yield
+        with torch.enable_grad():
+            return Subsolution(taught(value), torch.zeros(0, 1, dtype=torch.float64))
+
+    monkeypatch.setattr("ocp_torch.certificate.lower.sampled.tightened", training)
+    monkeypatch.setattr("ocp_torch.certificate.lower.sampled.WORTH", 0.0)
+    how = [setting for setting in QUICK if "trajectories" not in setting]
+    how += ["method=dual", "certificate.mollify=true", "certificate.trajectories=16", "trainer.steps=2"]
+    certificate = session(small(*how), tmp_path)
+    controller = load_controller(tmp_path)
+    assert certificate.controller == controller.kind == "subsolution"
+    assert certificate.perf["subsolution"].above < certificate.perf["value"].above
+    x = torch.rand(50, 1, dtype=torch.float64)
+    W = controller.fields.subsolution.double()
+    assert torch.allclose(controller(x), ValuePolicy(controller.problem, W)(x))
+    assert torch.allclose(controller.held(x, 1e-6), controller(x), atol=1e-3)  # of the same function
+    assert again(tmp_path)["controller"] == "subsolution"
 
 
 @pytest.mark.nightly

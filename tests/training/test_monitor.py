@@ -146,7 +146,7 @@ def test_in_a_terminal_a_clock_shows_the_stage_and_how_long_all_take(capsys):
 
 
 def test_the_time_that_is_told_counts_what_the_certificate_trains(monkeypatch):
-    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.ROUNDS", ((100.0, 10, 1e-3), (1000.0, 30, 1e-3)))
+    monkeypatch.setattr("ocp_torch.certificate.lower.tightened.PLAN", (1000.0, 40, 1e-3))
     trainer = small("problem=arm", "method=dual")
     evaluator, stage = trainer.evaluator, StageSettings(steps=100, rounds=1, batch=50)
     plain = CertificateSettings(points=2048, mollify=False, stage=stage)

@@ -11,7 +11,7 @@ two in five, of six oscillators, 0.6 % off one and nothing off the other.
 """
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import torch
 from torch import nn
@@ -29,52 +29,53 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.steppers import advance, short_fit
 from ocp_torch.steppers.nonfinite import NonFiniteError
 
-# Of each round `M`, steps, and the first learning rate, which falls to 0: the slack's mean over the part `1 / M` of the torus
-# stands for its supremum. With noise kinks are rounded, and a step takes twice as long. Bounds less all peaks that were found
-# later, and seconds of one core: by rounds of M = 100, 1,000, 3,000 and 3,000 of 300, 600, 1,200 and 2,400 steps at 1e-3,
-# the usual memory and no search for peaks, and by these: two unicycles 1.3001 (116) and 1.2996 (71), 1.2917 (141) and 1.2960
-# (74), a pendulum with limited torque 2.9703 (61) and 2.9970 (71), an arm .4605 (34) and .4606 (72).
-ROUNDS, NOISY_ROUNDS = ((1000.0, 600, 5e-3), (3000.0, 1400, 3e-3)), ((3000.0, 700, 2e-3),)
+# `M`, steps, and the first learning rate, which falls to 0: the slack's mean over the part `1 / M` of the torus stands for
+# its supremum. With noise kinks are rounded, and a step takes twice as long. Bounds of a unicycle, another and a pendulum
+# with limited torque by 600 steps of M = 1,000 and 1,400 of 3,000 were 1.2961, 1.2985, 3.0278; by these, in as long, 1.2972,
+# 1.2992, 3.0311; the first and the last by 1,400 steps 1.2947, 3.0114.
+PLAN, NOISY_PLAN = (3000.0, 2000, 5e-3), (3000.0, 700, 2e-3)
 # Memory of the optimiser's moments, below the usual (.95, .95): with that, at 1e-3, one `V` of a unicycle came to 1.2959 by
 # 2,100 steps and to 1.2986 by 4,500, with this, at 5e-3, to 1.2985 by 2,000 (mean over the part 1 / 3000), as with (.8, .95).
 BETAS = (0.9, 0.95)
 BATCH = 2048  # new states of a step, at most
 
 
-def rounds_of(problem: Problem) -> tuple[tuple[float, int, float], ...]:
-    """`ROUNDS`, or those with noise."""
-    return NOISY_ROUNDS if problem.noisy else ROUNDS
+def plan_of(problem: Problem, steps: int | None) -> tuple[float, int, float]:
+    """`PLAN`, or that with noise; with so many ``steps`` where they are given."""
+    M, usual, rate = NOISY_PLAN if problem.noisy else PLAN
+    return M, usual if steps is None else steps, rate
 
 
-def new_states(problem: Problem, batch: int) -> int:
+def new_states(problem: Problem, batch: int, steps: int | None) -> int:
     """How many states `tightened` draws with up to ``batch`` a step, the worst that come again aside."""
     states = min(batch, BATCH)
-    return sum(whole * states // BATCH for _, whole, _ in rounds_of(problem)) * states
+    return plan_of(problem, steps)[1] * states // BATCH * states
 
 
-def tightened(problem: Problem, value: Field, seed: int, batch: int = BATCH) -> Iterator[Subsolution | None]:
-    """`W` for ``value`` `V`, in float64, after each round of training in float32 on up to ``batch`` states a step, and `None`
-    after each step; nothing where `V` has no weights, nothing more where these do not stay finite. Fewer states than `BATCH`
-    are for a quick evaluation, with as many times fewer steps."""
-    if not isinstance(value, nn.Module) or not any(True for _ in value.parameters()):
-        return
+def tightened(
+    problem: Problem, value: Field, seed: int, batch: int = BATCH, steps: int | None = None
+) -> Generator[None, None, Subsolution | None]:
+    """`W` for ``value`` `V`, in float64, by training in float32, ``steps`` on up to ``batch`` states each, which yields
+    after each step; `None` where `V` has no weights, there are no steps, or weights do not stay finite. Fewer states than
+    `BATCH` are for a quick evaluation, with as many times fewer steps."""
+    M, whole, rate = plan_of(problem, steps)
+    if not whole or not isinstance(value, nn.Module) or not any(True for _ in value.parameters()):
+        return None
     objective, unit = LevelledDual(problem), cost_unit(problem)
     fields = Fields({VALUE: copy.deepcopy(value).float().requires_grad_(True)})
     sampler = SobolSampler(problem.dim, derive_seed(seed, Branch.TIGHTENING), torch.float32)
     states = min(batch, BATCH)
+    count = max(1, whole * states // BATCH)
+    stepper, average = short_fit(fields, objective, rate, count, unit, betas=BETAS)
+    phase = Phase(Constants(M=M, C_V=1.0, C_u=1.0, sources={}))
     new = lambda: problem.samples(sampler.draw(states), divergences=False)
-    for k, (M, whole, rate) in enumerate(rounds_of(problem)):
-        steps = max(1, whole * states // BATCH)
-        stepper, average = short_fit(fields, objective, rate, steps, unit, betas=BETAS)
-        phase = Phase(Constants(M=M, C_V=1.0, C_u=1.0, sources={}))
-        generator = torch.Generator().manual_seed(derive_seed(seed, Branch.TIGHTENING, k))
-        draw = WorstStates(problem, fields.value, new, generator)
-        try:
-            for _ in range(steps):
-                with torch.enable_grad():
-                    advance(stepper, average, draw, phase)
-                yield None
-        except NonFiniteError:
-            return
-        fields.load_state_dict(average.module.state_dict())
-        yield Subsolution(copy.deepcopy(fields.value), draw.worst.x).requires_grad_(False).double()
+    generator = torch.Generator().manual_seed(derive_seed(seed, Branch.TIGHTENING, 0))
+    draw = WorstStates(problem, fields.value, new, generator)
+    try:
+        for _ in range(count):
+            with torch.enable_grad():
+                advance(stepper, average, draw, phase)
+            yield
+    except NonFiniteError:
+        return None
+    return Subsolution(average.module.value, draw.worst.x).requires_grad_(False).double()

@@ -41,8 +41,8 @@ def simulate_candidates(
     best_only: bool,
     remembered: dict[str, Simulated] | None = None,
 ) -> tuple[dict[str, Simulated], Estimate]:
-    """Performance of each of ``candidates``, and of doing nothing. With ``best_only``, and where that saves time, only the one
-    that is best on a quarter of the trajectories gets all of them, and one that then still looks better. Beside one that
+    """Performance of each of ``candidates``, and of doing nothing. With ``best_only``, and where that saves time, only the
+    one that is best on a quarter of the trajectories gets all of them, and one that then still looks better. Beside one that
     holds its control, and takes as long for a few trajectories, any worse one is left at that: acting at every instant it
     trembles where the other jumps, and would take minutes on fine steps. What is ``remembered`` is not simulated again."""
 

@@ -31,9 +31,9 @@ from ocp_torch.problems.simulator.simulator import Simulator
 SIZES = (7, 1, 37, 2)
 SET_BY_INIT = ("dim", "control_dim", "discount", "exponent", "control_cost")
 DECLARED = ("state_cost_bound", "occupation_bound", "control_bound", "value_bound", "exact_optimum")
-# Turns of a state round the torus within 1 / discount. Paths are simulated in steps of a fraction of a turn: more than so
-# many would take hours (a thousand take some ten minutes); the square of the turns that noise spreads it over counts as much.
-MOST_TURNS = 1e3
+# Turns of a state round the torus within 1 / discount, and the square of those that noise spreads it over. Paths are simulated
+# in steps of a fraction of a turn: a thousand take some ten minutes, ten times as many hours.
+MOST_TURNS, MOST_SPREAD = 1e3, 1e4
 # States at which typical speeds are taken, and the number of their fixed design.
 SPEED_STATES, SPEED_DESIGN = 64, 13
 
@@ -147,10 +147,10 @@ def require_units(problem: Problem) -> None:
 
     sigma = problem.noise(x)
     spread = 0.0 if sigma is None else float(sigma.square().sum(dim=(1, 2)).mean()) / problem.discount
-    if spread > MOST_TURNS:
+    if spread > MOST_SPREAD:
         raise ProblemError(
             f"the noise of {named(problem)} is too large: within 1 / discount = {1.0 / problem.discount:.3g} it would spread "
-            f"a state over {spread**0.5:.2g} turns of the torus, more than the {MOST_TURNS**0.5:g} that can be followed; "
+            f"a state over {spread**0.5:.2g} turns of the torus, more than the {MOST_SPREAD**0.5:g} that can be followed; "
             "sigma is in turns per square root of the unit of time, and a diffusion in turns squared per unit of time."
         )
 
