@@ -16,6 +16,7 @@ from ocp_torch.certificate.external.black_box import BlackBox
 from ocp_torch.certificate.external.controller import ControllerContext
 from ocp_torch.certificate.external.dataset import RecordedContext
 from ocp_torch.certificate.fields import FieldsContext, Trained
+from ocp_torch.certificate.report import CONTROLLERS
 from ocp_torch.certificate.settings import CERTIFIED, CertificateSettings, Progress, Run, silent
 from ocp_torch.certificate.simulated.outside import outside_note
 from ocp_torch.certificate.simulated.performance import Simulated
@@ -82,7 +83,7 @@ def certify(context: Context) -> Certificate:
 
 def unseen(name: str, found: Simulated) -> list[str]:
     """What the simulation ``found`` of the controller ``name`` cannot have seen, in sentences."""
-    of = f"the controller from {name}"
+    of = f"the {CONTROLLERS.get(name, name)}"
     wall = f"nothing certain is known of what {of} costs: {found.jumped_over}."
     rare = f"no path of {of} came near the dearest states; if one does, it costs up to {found.unmet:.2g} more."
     return ([wall] if found.jumped_over else []) + ([rare] if found.unmet else [])
@@ -158,6 +159,25 @@ def certify_fields(
             raise InputError(f"the network for {name} holds weights that are not finite; there is nothing to certify.")
     kind: type[FieldsContext] = RecordedContext if isinstance(problem, Dataset) else TrainedContext
     return certify(kind(problem, constants, settings, run, progress, trained=trained))
+
+
+def tightened_value(
+    problem: Problem,
+    trained: Trained,
+    constants: Constants,
+    settings: CertificateSettings,
+    run: Run,
+    progress: Progress = silent,
+) -> Subsolution | None:
+    """`V` of ``trained`` fields trained on for its bound, as their certificate would train it, where that pays and there is
+    no noise; else `None`."""
+    if isinstance(problem, Dataset) or problem.noisy or not settings.searches(constants):
+        return None
+    sampled = TrainedContext(problem, constants, settings, run, progress, trained=trained).sampled_value
+    if sampled is None:
+        return None
+    progress("lower bound")
+    return sampled.tightened
 
 
 def certify_policy(

@@ -15,7 +15,7 @@ from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.lower.slack import Peaks
-from ocp_torch.certificate.settings import CertificateSettings, Progress, Run, silent
+from ocp_torch.certificate.settings import CERTIFIED, CertificateSettings, Progress, Run, silent
 from ocp_torch.certificate.simulated.candidates import Candidate, simulate_candidates
 from ocp_torch.certificate.simulated.outside import time_outside
 from ocp_torch.certificate.simulated.performance import Simulated
@@ -166,8 +166,9 @@ class Context:
         if not candidates:
             return {}, None
         self.progress("simulation")
-        how = self.settings, self.seed, not self.external
-        return simulate_candidates(self.problem, candidates, *how, self.remembered)
+        # Where the best certified one is handed out, each may be it.
+        how = self.settings, self.seed, not self.external and self.settings.prefer != CERTIFIED
+        return simulate_candidates(self.problem, candidates, *how, self.remembered, self.kind if self.settled else None)
 
     def outside(self, name: str | None) -> Estimate | None:
         """The part of the discounted time that the controller ``name`` spends outside the box of a system."""

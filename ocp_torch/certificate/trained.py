@@ -11,6 +11,7 @@ from ocp_torch.certificate.checks.tails import sharpened
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.fields import FieldsContext, in_float64
+from ocp_torch.certificate.report import CONTROLLERS
 from ocp_torch.certificate.simulated.candidates import Candidate
 from ocp_torch.certificate.simulated.performance import Simulated
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
@@ -34,8 +35,7 @@ LOOKED_AT = 4096
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrainedContext(FieldsContext):
-    """Up to three controllers, from `V`, from `w / mu` and from the `V` of a warm start, and one more where the best
-    certified one is asked for (see `trained_policies`): all are simulated, and the best is handed out."""
+    """The controllers of `trained_policies`: all are simulated, and the best is handed out."""
 
     divergent = "J, G and the Lagrangian bound"
 
@@ -177,7 +177,7 @@ class TrainedContext(FieldsContext):
         """What a user should know of the controllers themselves."""
         found, zero = self.simulated
         notes = [
-            f"the performance of the controller from {name} is not finite; it is left out."
+            f"the performance of the {CONTROLLERS.get(name, name)} is not finite; it is left out."
             for name, simulated in found.items()
             if not simulated.perf.finite
         ]

@@ -24,6 +24,9 @@ from ocp_torch.problems.samples import Samples
 VALUE, DENSITY, TRAJECTORIES, MINIMISED = "value", "density", "trajectories", "minimised"
 BOUNDING = SUBSOLUTION
 
+# A density above it counts as infinite, in single precision too.
+LARGEST = 1e30
+
 # Multiples of it are spread evenly, and no grid or symmetric state has them as coordinates.
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
@@ -82,7 +85,7 @@ def density_policy(control_density: Field, occupation: Density, cost: PowerCost)
 
     def policy(x: Tensor) -> Tensor:
         mu = occupation(x)
-        idle = (mu <= 0) | mu.isinf()
+        idle = (mu <= 0) | (mu > LARGEST)
         mu = torch.where(idle, 1.0, mu)
         return torch.where(idle.unsqueeze(-1), 0.0, cost.within(control_density(x), mu) / mu.unsqueeze(-1))
 
@@ -130,6 +133,6 @@ def trained_policies(
             policies[MINIMISED] = density_policy(fields.control_density, mu, problem.control_cost)
     if fields.trajectory_value is not None:
         policies[TRAJECTORIES] = HeldPolicy(problem, fields.trajectory_value, Pace.of(problem))
-    if fields.subsolution is not None and (every or not problem.noisy):
+    if fields.subsolution is not None and not problem.noisy:
         policies[BOUNDING] = ValuePolicy(problem, fields.subsolution)
     return policies

@@ -20,6 +20,7 @@ MOST = {
     "certificate.trajectories": 2**13,
     "certificate.ascents": 2**10,
     "certificate.occupation_states": 2**12,
+    "certificate.bound_steps": 2**16,
     "certificate.stage.steps": 2**14,
     "certificate.stage.rounds": 4,
     "certificate.stage.batch": 2**13,

@@ -111,7 +111,7 @@ def hand_out(
         with unless_it_failed(failure, trainer):
             how = trainer.constants, trainer.objective.occupation
             followed = certificate.followed or kind, certificate.occupation
-            figures |= Shown(trainer.problem, fields, *how, *followed).figures()
+            figures |= Shown(trainer.problem, controller.fields, *how, *followed).figures()
             moved = motion(trainer.problem, policy_of(controller), trainer.seed)
             figures |= {} if moved is None else {"motion": moved}
         drawn = canvas.drawn(figures)
@@ -130,8 +130,9 @@ def glimpse(trainer: Trainer) -> dict[str, np.ndarray]:
 
 def with_subsolution(fields: Fields, certificate: Certificate, kind: str) -> Fields:
     """``fields``, and what the lower bound of ``certificate`` is of; without a subsolution that serves neither that bound nor
-    the controller, which is of ``kind``."""
-    found = certificate.subsolution or (fields.subsolution if kind == BOUNDING else None)
+    the controllers that are handed out, of ``kind``, and followed."""
+    used = BOUNDING in (kind, certificate.followed)
+    found = certificate.subsolution or (fields.subsolution if used else None)
     others = {name: network for name, network in fields.networks.items() if name != SUBSOLUTION}
     if found is None:
         return Fields(others)

@@ -80,10 +80,10 @@ SAMPLER, WORST_STATE_SAMPLER = "sobol", "uniform"
 # States at which a certificate computes the occupation density, and at most so many differences at them, `d + 1` for each:
 # with 64 coordinates 144 states took eight of a certificate's twelve minutes, with 16 a third of a minute and a half.
 OCCUPATION_STATES, OCCUPATION_DIFFERENCES = 144, 144 * 9
-# Of value iteration along trajectories.
+# Of value iteration before training, at most.
 WARM_ROUNDS = 120
-# By how much the steps of all parts that are left null may be multiplied together.
-EFFORTS = dict(at_least=0.01, at_most=100.0)
+# By how much the steps of all parts that are left null may be multiplied together: a file may ask for 40 times as many.
+EFFORTS = dict(at_least=0.01, at_most=30.0)
 # Steps between looks at most, and where one of them may end the run. A look with noise takes as long as 100 to 200 steps;
 # every 600 steps they were a third of the training of a pendulum.
 LOOKS_APART, TARGET_APART = 1200, 600
@@ -133,7 +133,7 @@ def fill(config: dict, problem: Problem) -> dict:
     steps = given if isinstance(given, int) and given > 0 else scaled(budget.steps)
     defaults["trainer.newton_steps"] = budget.newton_steps if steps >= FEWEST_STEPS else 0
     early = given is None and method_name == "dual"
-    defaults["trainer.newton_after"] = budget.newton_after if early else 0
+    defaults["trainer.newton_after"] = budget.newton_after if early and steps > budget.newton_after else 0
     apart = LOOKS_APART if config["trainer"].get("target_gap") is None else TARGET_APART
     defaults["trainer.evaluate_every"] = math.ceil(steps / math.ceil(steps / apart))
     if config.get("warm_start") is not None:

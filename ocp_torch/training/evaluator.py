@@ -5,13 +5,9 @@ import time
 from dataclasses import dataclass, replace
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, StageSettings, Trained, certify_fields
-from ocp_torch.certificate.estimate import replicated_samples
-from ocp_torch.certificate.fields import in_float64
-from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.lower.tightened import new_states
-from ocp_torch.certificate.settings import Progress, silent
 from ocp_torch.certificate.upper.policy_evaluation import LARGER
-from ocp_torch.fields import SUBSOLUTION, Fields
+from ocp_torch.fields import Fields
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
@@ -104,21 +100,6 @@ class Evaluator:
             f"handed out are the averaged fields of step {best.step}: those of step {step} are worse "
             f"({final.in_words()} against {best.in_words()})."
         )
-
-    def tightened(self, fields: Fields, run: Run, settings: CertificateSettings, tell: Progress = silent) -> Fields:
-        """``fields`` with `V` trained on for its bound beside them, where the certificate would train it: its controller may
-        be the best of all."""
-        problem = self.problem
-        searched = settings.searches(self.state.constants) and problem.has_simulator and not problem.noisy
-        if not searched or fields.value is None:
-            return fields
-        states = replicated_samples(problem, settings.points, settings.replicates, run.seed, False)
-        tell("lower bound")
-        V = in_float64(fields.value)
-        W = SampledValue(problem, V, states, settings.ascents, seed=run.seed, steps=settings.bound_steps).tightened
-        if W is None:
-            return fields
-        return Fields({**fields.networks, SUBSOLUTION: W.to(next(fields.parameters()))})
 
     def best_fields(self) -> Fields:
         """The averaged fields of the best evaluation so far."""

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 
 import pytest
 import torch
@@ -192,6 +193,11 @@ def test_a_cost_without_a_variance_widens_the_interval_of_a_mean_by_what_was_not
     "cost", [lambda x: x, lambda x: (6.0 * x).exp(), lambda x: -x.log(), lambda x: (x < 0.01).double()]
 )
 def test_where_the_largest_fall_off_fast_it_widens_nothing(cost):
-    x = torch.rand(4096, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    assert beyond_largest(cost(x), torch.ones_like(x), 1.0) == 0.0
-    assert beyond_largest(cost(x)[:200], torch.ones_like(x)[:200], 1.0) == 0.0
+    for seed, count in product(range(20), (512, 4096)):
+        x = torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        assert beyond_largest(cost(x), torch.ones_like(x), 1.0) == 0.0
+
+
+def test_of_few_states_nothing_is_said():
+    x = torch.linspace(0.01, 1.0, 200, dtype=torch.float64)
+    assert beyond_largest(x**-0.9, torch.ones_like(x), 1.0) == 0.0

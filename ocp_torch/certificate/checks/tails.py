@@ -57,7 +57,7 @@ def rarity(contributions: Tensor, size: float) -> float:
 def beyond_largest(values: Tensor, weights: Tensor, size: float) -> float:
     """What values larger than any of ``values`` ``(N,)`` add to their mean by ``weights`` ``(N,)``, if the largest fall off
     as a power so slow that they have no variance: all that were met then say little of those. 0 where they fall off faster,
-    or where that is small beside ``size``, the answer's.
+    as far as so few tell, or where that is small beside ``size``, the answer's.
 
     The power is the estimate of Hill (1975).
     """
@@ -72,7 +72,8 @@ def beyond_largest(values: Tensor, weights: Tensor, size: float) -> float:
     # Of a power these are independent and of one exponential distribution; a step is a single large one.
     spacings = -top.values.log().diff() * weight.cumsum(0) * (count / weight.sum())
     spread = float(spacings.mean())
-    if not min(spread, float(spacings.median()) / math.log(2.0)) * HEAVY > 1.0:
+    sure = 1.0 - 1.0 / math.sqrt(count)  # less the standard error
+    if not min(sure * spread, float(spacings.median()) / math.log(2.0)) * HEAVY > 1.0:
         return 0.0
     power = max(1.0 / spread, SLOWEST)
     above = float(weight.sum()) / len(away) * least * power / (power - 1.0)

@@ -22,8 +22,7 @@ from ocp_torch.problems.samples import Samples
 
 # Training for the bound is worth it where that part of it is to gain: without noise, where gaps are narrow, and with it. Of
 # two arms .39 and .85 % were to gain, and it gave .51 and 1.0 %; two dubins and a unicycle with noise had 1.1 to 7.3 %, of
-# which it gave 1.2 to 7.5 %, and .2 to .35 % after it. That is no reason to leave out its last round: of an arm too little
-# was to gain after the first, and the bound ended at .4584 where two others came to .4605.
+# which it gave 1.2 to 7.5 %, and .2 to .35 % after it.
 WORTH, NOISY_WORTH = 0.0006, 0.005
 # What is to gain is seen by the mean of the slack over its largest part of the torus, a hundredth, in place of its supremum.
 LARGEST_PART = 0.01

@@ -1,8 +1,8 @@
-r"""`V` trained on for the shifted bound alone.
+r"""`V` trained on for the shifted bound.
 
 Training fits the slack on average, for a good controller; here its largest values count. A copy of `V` goes on from where
 training left it, by the `LevelledDual`, on batches in which the worst states come again (`WorstStates`): what comes out is
-kept for the bound alone, which holds for any `W` and is measured on other states. Its slack has fewer high narrow
+kept beside `V` for the bound, which holds for any `W` and is measured on other states. Its slack has fewer high narrow
 peaks, so that the supremum is found more surely: on two independent sets of 131,072 states the bounds of an arm's `V`
 differed by 0.8 %, of `W` by 0.02 %. Those that are left stand in hollows, where ascents from the largest values do not lead:
 they hid up to 0.3 % of a bound. So peaks are sought in steep places too, in training and by the bound (`steep_peaks`): of

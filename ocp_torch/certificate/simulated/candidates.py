@@ -40,9 +40,11 @@ def simulate_candidates(
     seed: int,
     best_only: bool,
     remembered: dict[str, Simulated] | None = None,
+    chosen: str | None = None,
 ) -> tuple[dict[str, Simulated], Estimate]:
     """Performance of each of ``candidates``, and of doing nothing. With ``best_only``, and where that saves time, only the
-    one that is best on a quarter of the trajectories gets all of them, and one that then still looks better. Beside one that
+    one that is best on a quarter of the trajectories gets all of them, and one that then still looks better; and the one
+    that is ``chosen`` already. Beside one that
     holds its control, and takes as long for a few trajectories, any worse one is left at that: acting at every instant it
     trembles where the other jumps, and would take minutes on fine steps. What is ``remembered`` is not simulated again."""
 
@@ -58,7 +60,8 @@ def simulate_candidates(
 
     held = [name for name, candidate in candidates.items() if isinstance(candidate.policy, HeldPolicy)]
     many = problem.noisy or held or settings.trajectories * settings.replicates > CHEAP
-    quickly = [name for name in candidates if name not in held] if best_only and len(candidates) > 1 and many else []
+    roughly_first = [name for name in candidates if name not in held and name != chosen]
+    quickly = roughly_first if best_only and len(candidates) > 1 and many else []
     found = dict(remembered or {})
     found |= {name: simulate(c, name in quickly) for name, c in candidates.items() if name not in found}
     best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)

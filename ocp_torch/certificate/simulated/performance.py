@@ -103,15 +103,17 @@ def simulate_performance(
     """Perf of ``policy`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts, near `mu0`.
 
     With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is added;
-    unless the slack is so large that the cost itself is simulated with less effort.
-    Steps are halved, without noise ``doublings`` times at most, until a trajectory changes by less than ``tolerance``,
-    relative to the answer, or all of them by little beside the standard error. ``rounded``, the controller and `V` in single
-    precision, takes their place where it agrees well enough with them at the starts; a few trajectories are exact, and what
-    they differ by goes into the ``bias``, unless, without noise, they are not ``audited``. The ``bias`` is the error of
-    integration (`refined`, with noise `expectation`), plus, where the ``horizon`` is truncated, the discount left there times
-    the rate's supremum as met along the trajectories, with head-room, and what states that no random path met may add; and
-    all that any state may cost, where an audit shows a wall that the steps jump over (`jumped_over`). A
-    `HeldPolicy` is simulated as one: its control changes only when it is renewed, always up to a truncated horizon.
+    unless the slack is so large that the cost itself is simulated with less effort, or paths are so long that this is done
+    along fewer of them (`MOST_STEPS`). Steps are halved, without noise ``doublings`` times at most, until a trajectory
+    changes by less than ``tolerance``, relative to the answer, or all of them by little beside the standard error.
+    ``rounded``, the controller and `V` in single precision, takes their place where it agrees well enough with them at the
+    starts; a few trajectories are exact, and what they differ by goes into the ``bias``, unless, without noise, they are
+    not ``audited``. The ``bias`` is the error of integration (`refined`, with noise `expectation`), plus, where the
+    ``horizon`` is truncated, the discount left there times the rate's supremum as met along the trajectories, with
+    head-room, what states that no random path met may add, and what is left of a mean that has no variance
+    (`beyond_largest`); and all that any state may cost, where an audit shows a wall that the steps jump over
+    (`jumped_over`). A `HeldPolicy` is simulated as one: its control changes only when it is renewed, always up to a
+    truncated horizon.
     """
     dim, rho = problem.dim, problem.discount
     dynamics = loop_of(problem, policy, value)
