@@ -161,25 +161,6 @@ def certify_fields(
     return certify(kind(problem, constants, settings, run, progress, trained=trained))
 
 
-def tightened_value(
-    problem: Problem,
-    trained: Trained,
-    constants: Constants,
-    settings: CertificateSettings,
-    run: Run,
-    progress: Progress = silent,
-) -> Subsolution | None:
-    """`V` of ``trained`` fields trained on for its bound, as their certificate would train it, where that pays and there is
-    no noise; else `None`."""
-    if isinstance(problem, Dataset) or problem.noisy or not settings.searches(constants):
-        return None
-    sampled = TrainedContext(problem, constants, settings, run, progress, trained=trained).sampled_value
-    if sampled is None:
-        return None
-    progress("lower bound")
-    return sampled.tightened
-
-
 def certify_policy(
     problem: Problem,
     policy: Policy,

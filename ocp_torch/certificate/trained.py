@@ -27,6 +27,7 @@ from ocp_torch.control.policies import (
     admissible_density,
     occupation_density,
 )
+from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.problems.samples import Samples
 
 # States of each set at which the density is looked at for places without mass.
@@ -55,6 +56,16 @@ class TrainedContext(FieldsContext):
             beside = (rounded[TRAJECTORIES][0], single.trajectory_value)
             found[TRAJECTORIES] = Candidate(self.policies[TRAJECTORIES], own, initial, beside)
         return found
+
+    @property
+    def tightened(self) -> Subsolution | None:
+        """`V` trained on for its bound, as the certificate would train it, where that pays and there is no noise: its
+        controller may be the best one."""
+        sampled = self.sampled_value
+        if sampled is None or not sampled.search or self.problem.noisy:
+            return None
+        self.progress("lower bound")
+        return sampled.tightened
 
     @property
     def remembered(self) -> dict[str, Simulated]:

@@ -222,7 +222,7 @@ def _certified(
 ) -> tuple[Certificate, Fields, bool]:
     """The certificate, the fields it is of, and whether its gap is below ``target``, or there is none."""
     fields, note = trainer.evaluator.choose(trainer.run)
-    fields = trainer.tightened(settings, fields)
+    fields = trainer.evaluator.tightened(fields, trainer.run, settings, trainer.tell)
     certificate = trainer.certify(settings, fields)
     gap = certificate.gap["certified"]
     enough = target is None or (gap is not None and gap <= target)

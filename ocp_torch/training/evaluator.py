@@ -4,10 +4,19 @@ import copy
 import time
 from dataclasses import dataclass, replace
 
-from ocp_torch.certificate import Certificate, CertificateSettings, Run, StageSettings, Trained, certify_fields
+from ocp_torch.certificate import (
+    Certificate,
+    CertificateSettings,
+    Run,
+    StageSettings,
+    Trained,
+    TrainedContext,
+    certify_fields,
+)
 from ocp_torch.certificate.lower.tightened import new_states
+from ocp_torch.certificate.settings import Progress
 from ocp_torch.certificate.upper.policy_evaluation import LARGER
-from ocp_torch.fields import Fields
+from ocp_torch.fields import SUBSOLUTION, Fields
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
@@ -100,6 +109,14 @@ class Evaluator:
             f"handed out are the averaged fields of step {best.step}: those of step {step} are worse "
             f"({final.in_words()} against {best.in_words()})."
         )
+
+    def tightened(self, fields: Fields, run: Run, settings: CertificateSettings, tell: Progress) -> Fields:
+        """``fields`` with `V` trained on for its bound beside them, where that pays (`TrainedContext.tightened`)."""
+        if not self.problem.has_simulator:
+            return fields
+        how = self.problem, self.state.constants, settings, run, tell
+        W = TrainedContext(*how, trained=replace(self.trained, fields=fields)).tightened
+        return fields if W is None else Fields({**fields.networks, SUBSOLUTION: W.to(next(fields.parameters()))})
 
     def best_fields(self) -> Fields:
         """The averaged fields of the best evaluation so far."""

@@ -34,7 +34,7 @@ class TrainerSettings:
     newton_after: int = (
         0  # steps of the first round after which they are tried already, and may end training; 0 for never
     )
-    effort: float = 1.0  # steps of training and of the certificate that were left null have been multiplied by it
+    effort: float = 1.0  # by which null steps of training, warm start and certificate have been multiplied
     graphs: bool = True  # on a GPU, steps are replayed from CUDA graphs; runs from before there were any do not say
 
     def __post_init__(self) -> None:

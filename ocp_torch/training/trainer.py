@@ -7,10 +7,10 @@ from pathlib import Path
 
 from torch import nn
 
-from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields, tightened_value
+from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields
 from ocp_torch.certificate.settings import Progress, silent
 from ocp_torch.errors import InputError, first_line
-from ocp_torch.fields import SUBSOLUTION, Fields
+from ocp_torch.fields import Fields
 from ocp_torch.maths.ranks import Alone, LostError
 from ocp_torch.maths.replays import replays_on
 from ocp_torch.objectives import Objective, Phase
@@ -208,12 +208,6 @@ class Trainer:
         if not more or self.fields.value is None or not self.problem.has_simulator:
             return False
         return not self.evaluator.reaches(self.settings.good_gap, self.run)
-
-    def tightened(self, settings: CertificateSettings, fields: Fields) -> Fields:
-        """``fields`` with `V` trained on for its bound beside them, where that pays: its controller may be the best one."""
-        how = replace(self.trained, fields=fields), self.constants, settings, self.run, self.tell
-        W = tightened_value(self.problem, *how)
-        return fields if W is None else Fields({**fields.networks, SUBSOLUTION: W.to(next(fields.parameters()))})
 
     def certify(self, settings: CertificateSettings, fields: Fields | None = None) -> Certificate:
         """The full certificate of ``fields``, or of the averaged ones as they stand."""

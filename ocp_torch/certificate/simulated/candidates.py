@@ -44,9 +44,9 @@ def simulate_candidates(
 ) -> tuple[dict[str, Simulated], Estimate]:
     """Performance of each of ``candidates``, and of doing nothing. With ``best_only``, and where that saves time, only the
     one that is best on a quarter of the trajectories gets all of them, and one that then still looks better; and the one
-    that is ``chosen`` already. Beside one that
-    holds its control, and takes as long for a few trajectories, any worse one is left at that: acting at every instant it
-    trembles where the other jumps, and would take minutes on fine steps. What is ``remembered`` is not simulated again."""
+    that is ``chosen`` already. Beside one that holds its control, and takes as long for a few trajectories, any worse one is
+    left at that: acting at every instant it trembles where the other jumps, and would take minutes on fine steps. What is
+    ``remembered`` is not simulated again."""
 
     def simulate(candidate: Candidate, roughly: bool = False) -> Simulated:
         policy, value, initial, rounded = candidate
