@@ -6,7 +6,6 @@ and `E[rate(x_T)]` is the discounted integral, without a tail.
 
 import math
 from dataclasses import dataclass, replace
-from typing import cast
 
 import torch
 from torch import Tensor
@@ -14,9 +13,8 @@ from torch import Tensor
 from ocp_torch.certificate.checks.tails import beyond_largest, widened
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
-from ocp_torch.certificate.simulated.between import jumped_over
-from ocp_torch.certificate.simulated.held import held_integrals
-from ocp_torch.certificate.simulated.loops import FeedbackLoop, HeldLoop, Sliding, loop_of
+from ocp_torch.certificate.simulated.loops import HeldLoop, loop_of
+from ocp_torch.certificate.simulated.paths import Paths
 from ocp_torch.certificate.simulated.steps import Steps
 from ocp_torch.certificate.simulated.unseen import (
     SIMULATION_REPLICATE,
@@ -27,20 +25,8 @@ from ocp_torch.certificate.simulated.unseen import (
     unseen_cost,
 )
 from ocp_torch.control.policies import Policy
-from ocp_torch.maths.brownian import Grid, at_random_times, discounted, expectation
-from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.jets import Field
-from ocp_torch.maths.runge_kutta import (
-    AUDITED,
-    MAX_DOUBLINGS,
-    Dynamics,
-    Integrate,
-    discounted_integral,
-    in_finer_steps,
-    rate_at,
-    refined,
-)
-from ocp_torch.maths.seeds import Branch, derive_seed
+from ocp_torch.maths.runge_kutta import MAX_DOUBLINGS
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import initial_points
 
@@ -55,9 +41,6 @@ ROUNDED = 0.1
 # to the simulation changes faster than what it takes off. From values of trajectories it was .7 on a pendubot and 2 on a
 # quadrotor, and asked for 15,000 steps where the cost asks for 800; .003 to .08 for `V` of `dual` and `pd`.
 NO_VARIATE = 0.5
-# How many times as many steps are taken, once, where others jump over a wall: one a hundredth of a turn thick is met then;
-# and how often these are halved at most, for steps that are as fine as elsewhere in the end.
-FINER, LEFT = 8, MAX_DOUBLINGS - 3
 # Where the first steps of all paths are more than that, as with a small discount, fewer paths are taken, but so many in each
 # set, and the cost itself along them: each is so long that it sees most of what others do. A quadrotor's are 1.6e6.
 MOST_STEPS, LEAST_PATHS = 2.0e6, 4
@@ -86,6 +69,7 @@ def starting_points(
     return torch.cat([x for x, _ in sets]), torch.cat([mass for _, mass in sets])
 
 
+@torch.no_grad()
 def simulate_performance(
     problem: Problem,
     policy: Policy,
@@ -116,103 +100,72 @@ def simulate_performance(
     truncated horizon.
     """
     dim, rho = problem.dim, problem.discount
-    dynamics = loop_of(problem, policy, value)
-    random = horizon == RANDOM and not isinstance(dynamics, HeldLoop)
+    loop = loop_of(problem, policy, value)
+    held = isinstance(loop, HeldLoop)
+    random = horizon == RANDOM and not held
     points, mass = starting_points(problem, trajectories, replicates, seed, extra=int(random))
-    x0 = points[:, :dim]
+    x0, times = points[:, :dim], -torch.log1p(-points[:, dim]) / rho if random else None
     plain = None if rounded is None else (rounded[0], None)
     plainly = lambda count: simulate_performance(
         problem, policy, count, replicates, seed, None, None, horizon, tolerance, plain, doublings, audited
     )
-    along, beside = (None, value) if isinstance(dynamics, HeldLoop) else (value, None)  # of rates; of whole pieces
-    with torch.no_grad():
-        base = along(x0) if along is not None else torch.zeros_like(x0[:, 0])
-        state = dynamics.start(x0)
-        velocity, rate = dynamics(state)
-        if along is not None:
-            paid = loop_of(problem, policy, None)(state)[1]
-            if not float((mass * rate.reshape(len(x0), -1)[:, 0]).abs().mean()) <= NO_VARIATE * float(
-                (mass * paid).mean()
-            ):
-                return plainly(trajectories)
-        quick = dynamics if rounded is None else loop_of(problem, *rounded)
-        off = (quick(quick.renewed(state))[1] - rate).abs().mean()
-        velocity, rate = velocity[:, :dim], rate.reshape(len(x0), -1)[:, 0]
-        met = (mass * rate).abs()  # of starts that carry no mass nothing counts
+    along, beside = (None, value) if held else (value, None)  # of rates; of whole pieces
+    base = along(x0) if along is not None else torch.zeros_like(mass)
+    state = loop.start(x0)
+    velocity, rates = loop(state)
+    velocity, rate = velocity[:, :dim], rates.reshape(len(x0), -1)[:, 0]
+    if along is not None:
+        paid = loop_of(problem, policy, None)(state)[1]
+        if not float((mass * rate).abs().mean()) <= NO_VARIATE * float((mass * paid).mean()):
+            return plainly(trajectories)
+    quick = loop if rounded is None else loop_of(problem, *rounded)
+    off = float((quick(quick.renewed(state))[1] - rates).abs().mean())
     if not (torch.isfinite(velocity).all() and torch.isfinite(rate).all()):
         return Simulated(Estimate(math.nan, math.nan), math.nan, x0)
     # By the slack's definition `V - Q_u = f + R(u) + grad V . g / rho`: the answer's size also where `E[V mu0]` is far off.
     size = max(float((mass * (base + rate)).mean().abs()), LEAST * float((mass * problem.state_cost(x0)).mean()), 1e-12)
     largest_rate = RATE_ROOM * float(rate.abs().max())
-    quick = quick if float(off) <= ROUNDED * tolerance * size else dynamics
-    together = rounded is not None and problem.concurrent  # networks of ours are pure functions
-    times = -torch.log1p(-points[:, dim]) / rho if random else torch.zeros_like(mass)
     tail = min(max(TAIL_PART * tolerance, SMALLEST_TAIL), LARGEST_TAIL)
-    longest = float(times.max()) if random else max(math.log(max(largest_rate / (tail * size), math.e)), 1.0) / rho
-    steps = Steps.of(dynamics, longest, velocity)
+    to_the_tail = max(math.log(max(largest_rate / (tail * size), math.e)), 1.0) / rho
+    steps = Steps.of(loop, to_the_tail if times is None else float(times.max()), velocity)
     fewer = max(LEAST_PATHS, 2 ** int(math.log2(max(MOST_STEPS / (steps.count * replicates), 1.0))))
-    if fewer < trajectories and not isinstance(dynamics, HeldLoop):
+    if fewer < trajectories and not held:
         return plainly(fewer)
-    sliding = Sliding(len(x0), tolerance * size) if isinstance(dynamics, FeedbackLoop) and dynamics.summed else None
-
-    def integrated(by: Dynamics) -> Integrate:
-        def some(rows: Tensor, count: int) -> tuple[Tensor, Tensor]:
-            if random:
-                return rate_at(by, state[rows], rho, times[rows], count, wrap=False)
-            return discounted_integral(by, state[rows], rho, steps.horizon, count, wrap=False, grading=steps.grading)
-
-        finer = in_finer_steps(some, steps.multiples)
-        pieces = lambda rows, count: in_pieces(lambda n: finer(n, count), rows, together, long=True)
-        all_rows = lambda rows, count: cast(tuple[Tensor, Tensor], pieces(rows, count))
-        return all_rows if sliding is None else sliding.by(all_rows)
-
-    swift, exact = steps.taken_by(quick), None if quick is dynamics else steps.taken_by(dynamics)
-    means = lambda results: (mass * results).reshape(replicates, trajectories).mean(dim=1)
-    generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT))
-    between = lambda taken: jumped_over(quick, steps, state, taken, seed) if audited else ""
-    if problem.noisy:
-        horizons, grading = (times, 1.0) if random else (torch.full_like(mass, steps.horizon), steps.grading)
-        grid = Grid(horizons, steps.count, grading)
-        how = at_random_times(rho) if random else discounted(rho), tolerance * size, seed
-        found = expectation(swift, dynamics.noise, state, mass, replicates, grid, *how, exact, together)
-        result, refinement, end, bias, finest = found
-        wall = between(torch.full_like(mass, finest))
-        result = result if beside is None else result - beside(x0)
-    elif isinstance(dynamics, HeldLoop) and isinstance(quick, HeldLoop):
-        loops, sets = (dynamics, quick, beside), (state, mass, replicates)
-        result, end, bias = held_integrals(*loops, *sets, steps.horizon, tolerance * size, generator, together)
-        refinement, wall = torch.zeros_like(means(result)), between(torch.full_like(mass, steps.count))
-    else:
-        error = lambda results: Estimate.of(means(results).tolist()).se
-        audit = None if exact is None else integrated(exact)
-        accuracy = tolerance * size, generator, error, audit, doublings, AUDITED if audited else 0
-        result, end, bias, taken = refined(integrated(swift), mass, steps.count, *accuracy)
-        if (wall := between(taken)) and doublings == MAX_DOUBLINGS:
-            steps = replace(steps, count=FINER * steps.count)
-            accuracy = tolerance * size, generator, error, audit, LEFT, AUDITED
-            result, end, bias, taken = refined(integrated(swift), mass, steps.count, *accuracy)
-            wall = between(taken)
-        bias += 0.0 if audited or exact is None else float(off)  # rounding alone must not look like a contradiction
-        refinement = torch.zeros_like(means(result))
+    allowed = tolerance * size
+    paths = Paths(
+        loop,
+        quick if off <= ROUNDED * allowed else loop,
+        steps,
+        state,
+        mass,
+        replicates,
+        times=times,
+        allowed=allowed,
+        seed=seed,
+        together=rounded is not None and problem.concurrent,  # networks of ours are pure functions
+        doublings=doublings,
+        audited=audited,
+        rounding=off,
+        value=beside,
+    )
+    result, end, refinement, bias, wall = paths.followed()
     ended = end[:, :dim].remainder(1.0)
-    with torch.no_grad():
-        rate = dynamics(end)[1]
-        rate = rate if sliding is None else sliding.corrected(rate, torch.arange(len(rate)))
+    if times is None:
         left = 0.0 if beside is None else beside(ended).abs()
-        largest_rate = max(largest_rate, RATE_ROOM * float((rate.abs() + left).max()))
-    if not random:
+        largest_rate = max(largest_rate, RATE_ROOM * float((paths.rates(end).abs() + left).max()))
         bias += math.exp(-rho * steps.horizon) * largest_rate * float(mass.mean())
     bias += UNSEEN_ROOM * unseen_cost(problem, x0, mass, seed)
     bias += largest_rate_of(loop_of(problem, policy, None)) if wall else 0.0
-    chance, met = problem.noisy or random, torch.maximum(met, (mass * result).abs())
-    rare = unmet_cost(quick, float(met.max()), len(met), size) if chance or audited else 0.0
-    bias += rare if chance else 0.0  # starts are spread evenly, and their paths follow from them
-    parts = (means(result) + refinement).tolist()
+    # Starts are spread evenly, and without noise their paths follow from them.
+    chance, met = problem.noisy or random, (mass * torch.maximum(rate.abs(), result.abs())).max()
+    rare = unmet_cost(paths.quick, float(met), len(mass), size) if chance or audited else 0.0
+    bias += rare if chance else 0.0
+    parts = (paths.means(result) + refinement).tolist()
     totals = [part + (initial[r % len(initial)] if initial else 0.0) for r, part in enumerate(parts)]
     bias += beyond_largest(result, mass, size)
     perf = Estimate.of(totals, bias=bias)
     perf = widened(replace(perf, se=max(perf.se, stratum_error(mass * result, replicates))), [mass * result])
     # One path with noise is off its mean, `V^u`; the largest of `N` by some `sqrt(2 log N)` standard deviations.
     above = float(result.std()) * math.sqrt(2.0 * math.log(len(result))) if problem.noisy else 0.0
-    largest = None if random or isinstance(dynamics, HeldLoop) else float((base + result).max()) - above
+    largest = None if random or held else float((base + result).max()) - above
     return Simulated(perf, largest, ended, wall, 0.0 if chance else rare)

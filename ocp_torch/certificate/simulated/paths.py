@@ -1,0 +1,158 @@
+"""The paths of one simulation, followed to their ends: along smooth trajectories, with noise, and where a control is held."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, cast
+
+import torch
+from torch import Tensor
+
+from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.simulated.between import jumped_over
+from ocp_torch.certificate.simulated.held import held_integrals
+from ocp_torch.certificate.simulated.loops import FeedbackLoop, HeldLoop, Loop, Sliding
+from ocp_torch.certificate.simulated.steps import Steps
+from ocp_torch.maths.brownian import Grid, at_random_times, discounted, expectation
+from ocp_torch.maths.cores import in_pieces
+from ocp_torch.maths.jets import Field
+from ocp_torch.maths.runge_kutta import (
+    AUDITED,
+    MAX_DOUBLINGS,
+    Integrate,
+    discounted_integral,
+    in_finer_steps,
+    rate_at,
+    refined,
+)
+from ocp_torch.maths.seeds import Branch, derive_seed
+
+# How many times as many steps are taken, once, where others jump over a wall: one a hundredth of a turn thick is met then;
+# and how often these are halved at most, for steps that are as fine as elsewhere in the end.
+FINER, LEFT = 8, MAX_DOUBLINGS - 3
+
+
+class Followed(NamedTuple):
+    """What ``results`` ``(N,)`` and ``ends`` ``(N, k)`` paths have, what finer steps add to the mean of each replicate, a
+    bound on the error of the mean, and what the steps jumped over, in words."""
+
+    results: Tensor
+    ends: Tensor
+    refinement: Tensor
+    error: float
+    wall: str
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """Paths of ``loop`` from ``state`` ``(N, k)``, ``replicates`` sets one after the other, each of which stands for some
+    ``mass`` ``(N,)``; they end at ``times`` ``(N,)`` of their own, or where the ``steps`` do.
+
+    ``quick`` is the loop in single precision, or itself. Steps are halved until a trajectory changes by less than what is
+    ``allowed``, without noise ``doublings`` times at most. Paths are followed ``together`` on all cores where the loop is
+    pure. Where they are not ``audited``, ``rounding`` is what single precision is off by. The worth of states at both ends
+    of pieces is taken off by ``value`` where a control is held.
+    """
+
+    loop: Loop
+    quick: Loop
+    steps: Steps
+    state: Tensor
+    mass: Tensor
+    replicates: int
+    times: Tensor | None
+    allowed: float
+    seed: int
+    together: bool
+    doublings: int
+    audited: bool
+    rounding: float
+    value: Field | None
+
+    def followed(self) -> Followed:
+        """All of them to their ends."""
+        if self.loop.problem.noisy:
+            return self._with_noise()
+        if isinstance(self.loop, HeldLoop) and isinstance(self.quick, HeldLoop):
+            return self._held(self.loop, self.quick)
+        return self._smooth()
+
+    @cached_property
+    def sliding(self) -> Sliding | None:
+        """Which of them slide, where the loop has a coordinate that shows it."""
+        shown = isinstance(self.loop, FeedbackLoop) and self.loop.summed
+        return Sliding(len(self.mass), self.allowed) if shown else None
+
+    def means(self, results: Tensor) -> Tensor:
+        """Those of each replicate, for ``results`` ``(N,)``."""
+        return (self.mass * results).unflatten(0, (self.replicates, -1)).mean(dim=1)
+
+    def rates(self, ends: Tensor) -> Tensor:
+        """Those of the loop at ``ends`` ``(N, k)``, as results are."""
+        rates = self.loop(ends)[1]
+        return rates if self.sliding is None else self.sliding.corrected(rates, torch.arange(len(rates)))
+
+    @property
+    def _nothing(self) -> Tensor:
+        """For each replicate."""
+        return torch.zeros(self.replicates, dtype=self.mass.dtype)
+
+    @property
+    def _is_rounded(self) -> bool:
+        return self.quick is not self.loop
+
+    @cached_property
+    def _generator(self) -> torch.Generator:
+        return torch.Generator().manual_seed(derive_seed(self.seed, Branch.AUDIT))
+
+    def _wall(self, taken: Tensor | int) -> str:
+        """What steps jumped over of which so many were ``taken``."""
+        taken = torch.as_tensor(taken).expand(len(self.mass))
+        return jumped_over(self.quick, self.steps, self.state, taken, self.seed) if self.audited else ""
+
+    def _with_noise(self) -> Followed:
+        rho, steps, times = self.loop.problem.discount, self.steps, self.times
+        if times is None:
+            grid, weight = Grid(torch.full_like(self.mass, steps.horizon), steps.count, steps.grading), discounted(rho)
+        else:
+            grid, weight = Grid(times, steps.count, 1.0), at_random_times(rho)
+        of = self.loop.noise, self.state, self.mass, self.replicates, grid, weight, self.allowed, self.seed
+        exact = steps.taken_by(self.loop) if self._is_rounded else None
+        results, refinement, ends, error, finest = expectation(steps.taken_by(self.quick), *of, exact, self.together)
+        worth = 0.0 if self.value is None else self.value(self.state[:, : self.loop.problem.dim])
+        return Followed(results - worth, ends, refinement, error, self._wall(finest))
+
+    def _held(self, loop: HeldLoop, quick: HeldLoop) -> Followed:
+        of = loop, quick, self.value, self.state, self.mass, self.replicates
+        results, ends, error = held_integrals(*of, self.steps.horizon, self.allowed, self._generator, self.together)
+        return Followed(results, ends, self._nothing, error, self._wall(self.steps.count))
+
+    def _smooth(self) -> Followed:
+        """On steps that are finer from the start where the usual ones jump over a wall."""
+        followed = self._refined(self.steps.count, self.doublings)
+        if followed.wall and self.doublings == MAX_DOUBLINGS:
+            followed = self._refined(FINER * self.steps.count, LEFT)
+        # Rounding alone must not look like a contradiction.
+        return followed._replace(
+            error=followed.error + (self.rounding if self._is_rounded and not self.audited else 0.0)
+        )
+
+    def _refined(self, steps: int, doublings: int) -> Followed:
+        error = lambda results: Estimate.of(self.means(results).tolist()).se
+        audit = self._integrated(self.loop) if self._is_rounded else None
+        how = self.allowed, self._generator, error, audit, doublings, AUDITED if self.audited else 0
+        results, ends, off, taken = refined(self._integrated(self.quick), self.mass, steps, *how)
+        return Followed(results, ends, self._nothing, off, self._wall(taken))
+
+    def _integrated(self, by: Loop) -> Integrate:
+        """Results of some of the paths, with so many steps."""
+        rho, steps, state, times = by.problem.discount, self.steps, self.state, self.times
+
+        def some(rows: Tensor, count: int) -> tuple[Tensor, Tensor]:
+            if times is not None:
+                return rate_at(by, state[rows], rho, times[rows], count, wrap=False)
+            return discounted_integral(by, state[rows], rho, steps.horizon, count, wrap=False, grading=steps.grading)
+
+        finer = in_finer_steps(some, steps.multiples)
+        pieces = lambda rows, count: in_pieces(lambda n: finer(n, count), rows, self.together, long=True)
+        all_rows = lambda rows, count: cast(tuple[Tensor, Tensor], pieces(rows, count))
+        return all_rows if self.sliding is None else self.sliding.by(all_rows)
