@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 # Frames of a video at most, and steps of an episode: an environment may have no end.
 MOST_FRAMES, MOST_STEPS = 600, 100_000
+# The environment of a problem of one's own.
+OWN = "ocp_torch/Problem-v0"
 # What environments call the time of a step: ours, Pendulum-v1, MuJoCo's and Acrobot-v1, CartPole-v1.
 STEP_NAMES = ("time_step", "dt", "tau")
 
@@ -95,23 +97,29 @@ class RolloutJob:
         if self.video is not None and self.video.suffix != ".gif":
             raise InputError(f"video is {str(self.video)!r}, but must be a file whose name ends in .gif.")
         self.env = str(config["env"])
-        with closing(made(self.env)) as env:
+        with closing(self.environment()) as env:
             Agent(self.controller, env, self.env).act(env.reset(seed=0)[0])
         self.episodes = require_integer("episodes", config["episodes"], 1, maximum=10**6)
         self.seed = require_integer("seed", config["seed"], 0)
 
     def run(self) -> Rollouts:
         """Play and print; then film the first episode again, if asked to."""
-        with closing(made(self.env)) as env:
+        with closing(self.environment()) as env:
             found = play(self.controller, env, self.env, self.episodes, self.seed)
         log.info("%s: %s", self.env, found)
         if self.video is not None:
             frames: list[np.ndarray] = []
-            with closing(made(self.env, render_mode="rgb_array")) as env:
+            with closing(self.environment(render_mode="rgb_array")) as env:
                 play(self.controller, env, self.env, 1, self.seed, frames)
                 save_gif(self.video, frames, env.metadata.get("render_fps", 15))
             log.info("%d frames in %s", len(frames), self.video)
         return found
+
+    def environment(self, **options):
+        """The environment; `Problem-v0` and that of the class of the controller's problem are of this very problem."""
+        problem = self.controller.problem
+        own = (f"ocp_torch/{type(problem).__name__}-v0", OWN)
+        return made(self.env, **({"problem": problem} if self.env in own else {}), **options)
 
 
 def made(name: str, **options):

@@ -3,6 +3,7 @@
 import math
 import sys
 import warnings
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -157,6 +158,19 @@ def test_a_controller_acts_in_an_environment_of_ours(gymnasium, run, tmp_path):
         idle.append(total)
     assert found.returns.mean() > np.mean(idle)
     assert "standard error of 8 episodes" in str(found)
+
+
+def test_the_environment_is_of_the_controllers_own_problem(gymnasium, run, tmp_path):
+    """An episode takes five discount times, of 50 steps: with a discount of 8 each is a quarter as long as by default."""
+    quick = ("certificate.points=64", "certificate.trajectories=4", "certificate.ascents=2", "trainer.figures=false")
+    other = tmp_path / "other"
+    session(small("problem=circle", "problem.discount=8", "problem.control_limit=0.02", "method=dual", *quick), other)
+    for name in ("Circle", "Problem"):
+        for folder, discount in ((run, 2.0), (other, 8.0)):
+            job = asked(folder, env=f"ocp_torch/{name}-v0", episodes=1)
+            with closing(job.environment()) as env:
+                assert env.unwrapped.problem.discount == discount
+            assert job.run().lengths.tolist() == [50]
 
 
 def test_wrong_requests_are_one_sentence(gymnasium, run):
