@@ -16,6 +16,9 @@ SURE = 6.0
 FORGIVEN = 1e-3
 # Rounding of states and costs, relative to their size: files may be in single precision.
 ROUNDING = 1e-6
+# Copies are looked for in cubes of two sizes, in which chance puts so many samples beside another: one in a thousand files,
+# and one in a hundred samples. Rounding puts all that is nearer than that into one place.
+ONCE, SELDOM, GRAIN = 1e-3, 1e-2, 2.0**-23
 
 
 def samples_of(path: Path, arrays: dict[str, np.ndarray], wrap: bool) -> Samples:
@@ -79,13 +82,29 @@ def _require_distribution(path: Path, samples: Samples, given: bool) -> None:
             raise InputError(f"{path}: {together} not follow {law}.")
 
 
+def copies(samples: Samples) -> int:
+    """How many samples are beside another, at the same state or about so near to it as rounding or a little noise has them,
+    beyond what chance explains."""
+    count, dim = samples.x.shape
+    pairs = (
+        0.5 * count * (count - 1) * float((1.0 / samples.weight).mean())
+    )  # that share a cube of volume 1, on average
+    found = 0
+    for wanted in (ONCE, SELDOM * count):
+        side = max((wanted / pairs) ** (1.0 / dim), GRAIN)
+        beside, chance = count - len((samples.x / side).floor().unique(dim=0)), pairs * side**dim
+        if beside > chance + SURE * chance**0.5:
+            found = max(found, round(beside - chance))
+    return found
+
+
 def dependence_notes(path: Path, samples: Samples) -> tuple[str, ...]:
     """Signs that the samples are no independent draws: copies, and the correlation of consecutive state costs."""
-    notes, copies = list[str](), len(samples) - len(samples.x.unique(dim=0))
-    if copies:
+    notes = list[str]()
+    if count := copies(samples):
         notes.append(
-            f"{copies:,} samples of {path.name} are at the same state as another: they are no independent draws, some are "
-            "trained on and held out, and bounds may be wrong by more than their intervals."
+            f"{count:,} samples of {path.name} are at the same state as another, or nearer than chance explains: they are no "
+            "independent draws, some are trained on and held out, and bounds may be wrong by more than their intervals."
         )
     centred = samples.f - samples.f.mean()
     spread = float(centred.square().sum())
