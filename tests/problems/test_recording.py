@@ -520,6 +520,19 @@ def test_twenty_thousand_samples_certify_the_optimum(tmp_path):
     assert certificate.gap["certified"] <= 0.06
 
 
+@pytest.mark.parametrize("name", ["manufactured 2-d B(x)", "noisy 2-d sigma(x)"])
+def test_a_divergence_of_another_column_is_told(tmp_path, name):
+    """A drift, a control matrix or noise whose coordinates are in another order than the divergences beside them."""
+    path = record(tmp_path, zoo.build(name), 4000)
+    arrays = arrays_of(path)
+    assert recording.read(path).notes == ()
+    told = {"a": "div_a", "B": "div_B"} if "B(x)" in name else {"a": "div_a", "noise": "div_D"}
+    for column, divergence in told.items():
+        np.savez(tmp_path / "a.npz", **{**arrays, column: arrays[column][:, ::-1]})
+        notes = recording.read(tmp_path / "a.npz").notes
+        assert f"{divergence} of a.npz is not the divergence of its {column}" in notes[0]
+
+
 @pytest.mark.parametrize("noise", [0.0, 1e-7])
 def test_copies_among_the_samples_are_told(tmp_path, plain, noise):
     arrays = dict(np.load(plain))

@@ -82,6 +82,36 @@ def _require_distribution(path: Path, samples: Samples, given: bool) -> None:
             raise InputError(f"{path}: {together} not follow {law}.")
 
 
+def stray_divergences(samples: Samples) -> dict[str, str]:
+    """Columns of divergences, and of what each is not the divergence: `E[phi div F + F . grad phi] = 0` by parts, for plane
+    waves `phi`, unless some of `div F` is hidden in jumps of `F`."""
+    D = None if samples.noise is None else 0.5 * samples.noise @ samples.noise.mT
+    columns = {
+        ("div_a", "a"): (samples.a.unsqueeze(-1), samples.div_a),
+        ("div_B", "B"): (samples.B, samples.div_B),
+        ("div_D", "noise"): (D, samples.div_D),
+        ("div_div_D", "div_D"): (samples.div_D, samples.div_div_D),
+    }
+    waves, count = 2.0 * torch.pi * plane_waves(samples.x.shape[1]), len(samples)
+    found = {}
+    for (name, of), (field, divergence) in columns.items():
+        if field is None or divergence is None:
+            continue
+        F, div_F, weight = (
+            field.reshape(*samples.x.shape, -1),
+            divergence.reshape(count, -1),
+            samples.weight.unsqueeze(-1),
+        )
+        for k in waves:
+            phase, along = torch.polar(weight, -(samples.x @ k).unsqueeze(-1)), torch.einsum("ndm,d->nm", F, k)
+            terms = torch.view_as_real(phase * torch.complex(div_F, -along))
+            error, size = terms.std(dim=0) / count**0.5, terms.abs().mean(dim=0)
+            if bool((terms.mean(dim=0).abs() > SURE * error + FORGIVEN * size).any()):
+                found[name] = of
+                break
+    return found
+
+
 def copies(samples: Samples) -> int:
     """How many samples are beside another, at the same state or about so near to it as rounding or a little noise has them,
     beyond what chance explains."""
@@ -98,9 +128,14 @@ def copies(samples: Samples) -> int:
     return found
 
 
-def dependence_notes(path: Path, samples: Samples) -> tuple[str, ...]:
-    """Signs that the samples are no independent draws: copies, and the correlation of consecutive state costs."""
-    notes = list[str]()
+def remarks(path: Path, samples: Samples) -> tuple[str, ...]:
+    """What a user should be told of the ``samples`` of ``path``: divergences that are not, and signs that they are no
+    independent draws, which are copies and the correlation of consecutive state costs."""
+    notes = [
+        f"{name} of {path.name} is not the divergence of its {of}: one of them is in another order or unit, or {of} jumps; "
+        "bounds take it as it is."
+        for name, of in stray_divergences(samples).items()
+    ]
     if count := copies(samples):
         notes.append(
             f"{count:,} samples of {path.name} are at the same state as another, or nearer than chance explains: they are no "
