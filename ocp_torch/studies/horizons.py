@@ -23,8 +23,8 @@ from ocp_torch.runs.evaluate import load_run
 log = logging.getLogger(__name__)
 
 # A control is held for that part of a discount time, and the closed loop is followed for so many discount times, unless asked
-# otherwise; integration takes so many steps while it is held.
-STEP, TIME, WITHIN = 0.05, 6.0, 5
+# otherwise; integration takes so many steps while it is held, and there are so many controls at most.
+STEP, TIME, WITHIN, MOST = 0.05, 6.0, 5, 10_000
 
 
 Control = Callable[[np.ndarray], np.ndarray]  # of one state
@@ -67,10 +67,12 @@ def horizons(config: dict) -> Callable[[], dict[str, Played]]:
         idle = idle_noise(problem)
         hint = f" ({idle})" if idle else ""
         raise InputError(f"a receding horizon needs a problem that can be simulated, without noise{hint}.")
-    sizes = {name: require_integer(name, config[name], 1, maximum=10_000) for name in ("steps", "longer", "starts")}
-    step = STEP / problem.discount if config["step"] is None else require_number("step", config["step"], above=0.0)
-    asked = config["time"]
-    lasts = TIME / problem.discount if asked is None else require_number("time", asked, above=0.0)
+    sizes = {name: require_integer(name, config[name], 1, maximum=MOST) for name in ("steps", "longer", "starts")}
+    longest = 1.0 / problem.discount  # what a few steps of the integration can follow
+    step = STEP * longest if config["step"] is None else config["step"]
+    step = require_number("step", step, above=0.0, at_most=longest)
+    lasts = TIME * longest if config["time"] is None else config["time"]
+    lasts = require_number("time", lasts, above=0.0, at_most=MOST * step)
     seed = require_integer("seed", config["seed"], 0)
     count = max(1, round(lasts / step))
 

@@ -119,6 +119,22 @@ def test_noise_is_refused_and_what_is_0_is_told_to_be_left_out(problem, monkeypa
     assert (hint in str(refused.value)) == isinstance(problem, Calm)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        (dict(step=0.6), "step is 0.6, but must be above 0 and at most 0.5"),
+        (dict(time=300.0), "time is 300, but must be above 0 and at most 250"),
+        (dict(step=1e-5, time=None), "time is 3, but must be above 0 and at most 0.1"),
+    ],
+)
+def test_a_step_too_long_to_be_followed_and_a_time_without_end_are_refused(wrong, sentence, tmp_path):
+    """The discount time is a half, a step a twentieth of it."""
+    file = tmp_path / "controller.safetensors"
+    controllers("dual")[0].save(file)
+    with pytest.raises(InputError, match=sentence):
+        horizons(asked(file, **wrong))
+
+
 @pytest.mark.nightly
 def test_the_comparison_of_a_run(tmp_path, caplog):
     file = tmp_path / "controller.safetensors"
