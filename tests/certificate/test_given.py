@@ -165,6 +165,17 @@ def test_derivatives_of_a_black_box_are_those_of_its_function(dtype):
     torch.testing.assert_close(box(x + 3.0), policy(x), rtol=0.0, atol=1e-5)
 
 
+@pytest.mark.parametrize("kind", [torch.from_numpy, np.asarray])
+def test_a_controller_that_writes_into_its_argument_is_a_function_of_the_state(kind):
+    def shifted(states):
+        states -= 0.25
+        return kind(np.sin(TURN * np.asarray(states)))
+
+    x = torch.rand(20, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    wanted = (TURN * (x - 0.25)).sin()
+    torch.testing.assert_close(BlackBox(shifted, Circle())(x), wanted, rtol=1e-12, atol=1e-12)
+
+
 class Sine(torch.nn.Module):
     def forward(self, x):
         return 0.3 * torch.sin(6.283185307179586 * x)

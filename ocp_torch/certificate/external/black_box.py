@@ -60,7 +60,7 @@ class BlackBox:
 
     def _ask(self, convert: Callable[[Tensor], object], x: Tensor) -> Tensor:
         with torch.no_grad():
-            out = self.function(convert(x))
+            out = self.function(convert(x.clone()))  # it may write into its argument
         if isinstance(out, np.ndarray) and isinstance(convert(x[:1]), Tensor):
             raise _WantsArrays
         out = torch.as_tensor(out if isinstance(out, Tensor) else np.asarray(out)).detach().cpu()
