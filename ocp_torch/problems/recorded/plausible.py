@@ -97,11 +97,8 @@ def stray_divergences(samples: Samples) -> dict[str, str]:
     for (name, of), (field, divergence) in columns.items():
         if field is None or divergence is None:
             continue
-        F, div_F, weight = (
-            field.reshape(*samples.x.shape, -1),
-            divergence.reshape(count, -1),
-            samples.weight.unsqueeze(-1),
-        )
+        F, div_F = field.reshape(*samples.x.shape, -1), divergence.reshape(count, -1)
+        weight = samples.weight.unsqueeze(-1)
         for k in waves:
             phase, along = torch.polar(weight, -(samples.x @ k).unsqueeze(-1)), torch.einsum("ndm,d->nm", F, k)
             terms = torch.view_as_real(phase * torch.complex(div_F, -along))
@@ -116,9 +113,7 @@ def copies(samples: Samples) -> int:
     """How many samples are beside another, at the same state or about so near to it as rounding or a little noise has them,
     beyond what chance explains."""
     count, dim = samples.x.shape
-    pairs = (
-        0.5 * count * (count - 1) * float((1.0 / samples.weight).mean())
-    )  # that share a cube of volume 1, on average
+    pairs = 0.5 * count * (count - 1) * float((1.0 / samples.weight).mean())  # in a cube of volume 1, on average
     found = 0
     for wanted in (ONCE, SELDOM * count):
         side = max((wanted / pairs) ** (1.0 / dim), GRAIN)
