@@ -17,7 +17,7 @@ FORGIVEN = 1e-3
 # Rounding of states and costs, relative to their size: files may be in single precision.
 ROUNDING = 1e-6
 # Copies are looked for in cubes of two sizes, in which chance puts so many samples beside another: one in a thousand files,
-# and one in a hundred samples. Rounding puts all that is nearer than that into one place.
+# and one in a hundred samples. Rounding puts all that is nearer than the third number into one place.
 ONCE, SELDOM, GRAIN = 1e-3, 1e-2, 2.0**-23
 
 
@@ -109,32 +109,45 @@ def stray_divergences(samples: Samples) -> dict[str, str]:
     return found
 
 
-def copies(samples: Samples) -> int:
-    """How many samples are beside another, at the same state or about so near to it as rounding or a little noise has them,
-    beyond what chance explains."""
+def without_copies(samples: Samples) -> Samples:
+    """``samples`` without those at the state of an earlier one, or as near to it as rounding or a little noise has them; all
+    of them where chance explains these."""
+    for shift in (0.0, 0.5):  # a pair that one division into cubes parts is in one cube of the other
+        near, chance = _beside(samples, ONCE, shift)
+        samples = samples.take(~near) if _beyond(near, chance) else samples
+    return samples
+
+
+def _beyond(near: Tensor, chance: float) -> int:
+    """How many more are ``near`` ``(N,)`` than by ``chance``, 0 where that may be."""
+    count = int(near.sum())
+    return round(count - chance) if count > chance + SURE * chance**0.5 else 0
+
+
+def _beside(samples: Samples, wanted: float, shift: float = 0.0) -> tuple[Tensor, float]:
+    """Which samples ``(N,)`` share a cube with an earlier one, and how many would by chance: as many as are ``wanted``, or
+    more where cubes are as small as rounding has them."""
     count, dim = samples.x.shape
     pairs = 0.5 * count * (count - 1) * float((1.0 / samples.weight).mean())  # in a cube of volume 1, on average
-    found = 0
-    for wanted in (ONCE, SELDOM * count):
-        side = max((wanted / pairs) ** (1.0 / dim), GRAIN)
-        beside, chance = count - len((samples.x / side).floor().unique(dim=0)), pairs * side**dim
-        if beside > chance + SURE * chance**0.5:
-            found = max(found, round(beside - chance))
-    return found
+    side = max((wanted / pairs) ** (1.0 / dim), GRAIN)
+    cubes, cube = (samples.x / side + shift).floor().unique(dim=0, return_inverse=True)
+    rows = torch.arange(count)
+    first = torch.full((len(cubes),), count).scatter_reduce(0, cube, rows, "amin")
+    return rows != first[cube], pairs * side**dim
 
 
 def remarks(path: Path, samples: Samples) -> tuple[str, ...]:
     """What a user should be told of the ``samples`` of ``path``: divergences that are not, and signs that they are no
-    independent draws, which are copies and the correlation of consecutive state costs."""
+    independent draws, which are near copies and the correlation of consecutive state costs."""
     notes = [
         f"{name} of {path.name} is not the divergence of its {of}: one of them is in another order or unit, or {of} jumps; "
         "bounds take it as it is."
         for name, of in stray_divergences(samples).items()
     ]
-    if count := copies(samples):
+    if count := max(_beyond(*_beside(samples, wanted)) for wanted in (ONCE, SELDOM * len(samples))):
         notes.append(
-            f"{count:,} samples of {path.name} are at the same state as another, or nearer than chance explains: they are no "
-            "independent draws, some are trained on and held out, and bounds may be wrong by more than their intervals."
+            f"{count:,} samples of {path.name} are nearer to another than chance explains: they are no independent draws, "
+            "some are trained on and held out, and bounds may be wrong by more than their intervals."
         )
     centred = samples.f - samples.f.mean()
     spread = float(centred.square().sum())

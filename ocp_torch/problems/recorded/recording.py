@@ -25,7 +25,7 @@ from ocp_torch.files.plain import NotPlain, json_object
 from ocp_torch.files.reading import kind
 from ocp_torch.files.storage import read_safetensors, write_atomically
 from ocp_torch.problems.physical.measures import Measures
-from ocp_torch.problems.recorded.plausible import remarks, samples_of
+from ocp_torch.problems.recorded.plausible import remarks, samples_of, without_copies
 from ocp_torch.problems.samples import Samples
 
 REQUIRED = {"x": "Nd", "f": "N", "a": "Nd", "B": "Ndm"}
@@ -92,7 +92,10 @@ def read(path: str | Path, wrap: bool = False) -> Recording:
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(arrays[name]).data)
     measures, notes = (None, ()) if units is None else _measures(path, units, *samples.B.shape[1:])
-    return Recording(samples, numbers, digest.hexdigest(), remarks(path, samples) + notes, measures)
+    kept = without_copies(samples)
+    if copies := len(samples) - len(kept):
+        notes = (f"{copies:,} samples of {path.name} are at the state of another, and are left out.", *notes)
+    return Recording(kept, numbers, digest.hexdigest(), remarks(path, kept) + notes, measures)
 
 
 def _measures(path: Path, units: np.ndarray, dim: int, control_dim: int) -> tuple[Measures | None, tuple[str, ...]]:
