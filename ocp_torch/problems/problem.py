@@ -66,6 +66,13 @@ class Problem(Reproducible, Placed, Played):
     incidental: tuple[str, ...] = ()
     # What coordinates and controls are called and measured in, where they have names.
     measures: Measures | None = None
+    # What a subclass may know: set in its body, in its `__init__` or after it.
+    state_cost_bound: float | None = None
+    occupation_bound: float | None = None
+    control_bound: float | None = None
+    value_bound: float | None = None
+    exact_optimum: float | None = None
+    lipschitz: Lipschitz | None = None
 
     def __init__(
         self,
@@ -84,12 +91,6 @@ class Problem(Reproducible, Placed, Played):
         self.exponent = require_number("problem.exponent", exponent, above=1.0, at_most=2.0)
         self.control_cost = control_cost(self.exponent, control_limit, self.control_dim)
         self.control_limit = self.control_cost.limit
-        self.state_cost_bound: float | None = None
-        self.occupation_bound: float | None = None
-        self.control_bound: float | None = None
-        self.value_bound: float | None = None
-        self.exact_optimum: float | None = None
-        self.lipschitz: Lipschitz | None = None
         self.diffusion = constant_diffusion(noise, self.dim)
         self._sigma = column_matrix(self.diffusion)
 

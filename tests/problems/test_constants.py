@@ -8,6 +8,7 @@ import torch
 from ocp_torch.problems import Problem
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import resolve_constants, state_cost_supremum
+from ocp_torch.problems.needs import GIVEN
 from support import zoo
 from support.exact import ROUNDING, exact_slack
 
@@ -67,3 +68,22 @@ def test_no_state_costs_more_than_the_supremum_whatever_is_declared(declared):
     assert resolve_constants(problem).C_V == found
     if declared is not None and declared >= 2.0:
         assert found == declared
+
+
+def test_what_a_class_declares_in_its_body_is_taken():
+    """And what it sets before `Problem.__init__` is called."""
+
+    class Declared(Problem):
+        occupation_bound, state_cost_bound = 3.0, 1.0
+
+        def __init__(self):
+            self.control_bound = 2.0
+            super().__init__(1)
+
+        def state_cost(self, x):
+            return torch.ones_like(x[:, 0])
+
+    problem = Declared()
+    assert (problem.occupation_bound, problem.state_cost_bound, problem.control_bound) == (3.0, 1.0, 2.0)
+    found = resolve_constants(problem)
+    assert (found.M, found.C_u, found.basis("M")) == (3.0, 2.0, GIVEN)
