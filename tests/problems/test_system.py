@@ -55,6 +55,26 @@ def test_one_evaluation_gives_what_the_methods_and_autograd_through_them_do(make
         torch.testing.assert_close(found, expected, **CLOSE)
 
 
+def test_what_is_put_in_the_place_of_one_of_the_methods_is_what_samples_hold():
+    """As a divergence that autograd cannot find, or none where it is not known."""
+
+    class Numeric(Cart):
+        def dynamics(self, s):
+            return tuple(part.detach() for part in super().dynamics(s))
+
+        def drift_divergence(self, x):
+            return Cart().drift_divergence(x)
+
+        def control_divergence(self, x):
+            return None
+
+    x = zoo.states(Cart(), 50)
+    data, expected = Samples.of(Numeric(), x), Samples.of(Cart(), x)
+    for name in ("a", "B", "div_a"):
+        torch.testing.assert_close(getattr(data, name), getattr(expected, name), **CLOSE)
+    assert data.div_B is None
+
+
 @pytest.mark.nightly
 def test_the_flow_on_the_torus_is_the_flow_in_physical_units():
     """The same controls take the same states as far, by Runge and Kutta's method in either, as long as the box holds them."""
