@@ -101,6 +101,10 @@ MISTAKES = {
         r"cost of my_module.Mistaken cannot be differentiated by the state, .* \(RuntimeError: derivative for "
         r"aten::floor_divide is not implemented\): use functions that have a derivative in torch",
     ),
+    "noise by another name": (
+        dict(distrubance=lambda self, s: torch.ones_like(s).unsqueeze(-1)),
+        "^my_module.Mistaken defines distrubance, which nothing asks for; did you mean disturbance?",
+    ),
     "nothing made": (
         dict(__init__=lambda self: None),
         r"its __init__ must call super\(\).__init__\(coordinates, controls, ..\)",
@@ -122,6 +126,11 @@ def test_a_mistake_is_told_in_the_words_of_the_user(name):
 
 def test_a_sound_one_passes():
     check_once(Sound())
+
+
+def test_helpers_may_be_called_almost_as_what_is_there_and_anything_with_an_underscore():
+    helper = lambda self, s: s
+    check_once(mistaken(costs=helper, _disturbances=helper, gust=helper)())
 
 
 @pytest.mark.parametrize(("method", "says"), [("cost", "define cost"), ("dynamics", "define dynamics")])

@@ -277,6 +277,7 @@ REFUSED = {
     "raises": (lambda: with_(state_cost=raises), r"state_cost .* KeyError: .no table. at x = \[0\.9.*s.py, line"),
     "raises always": (lambda: with_(drift=lambda self, x: math.sqrt(-1.0)), r"raised ValueError: .*problems.py, line"),
     "exits": (lambda: with_(drift=lambda self, x: sys.exit(3)), "drift .* raised SystemExit: 3"),
+    "misspelt": (lambda: with_(initial_densty=plain_cost), "defines initial_densty, .* did you mean initial_density"),
     "div a": (lambda: with_(drift_divergence=lambda self, x: 0.0 * x[:, 0]), "drift_divergence .* by differences of drift"),
     "detached": (lambda: with_(control_matrix=lambda self, x: Good.control_matrix(self, x.detach())),
                  "control_divergence .* by differences of control_matrix"),

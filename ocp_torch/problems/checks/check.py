@@ -4,6 +4,8 @@ What is refused is certainly wrong. Rough and discontinuous functions are legal,
 are the same to the bit, in single precision too, and away from where functions like to jump.
 """
 
+import difflib
+import inspect
 import math
 
 import torch
@@ -30,6 +32,11 @@ from ocp_torch.problems.simulator.simulator import Simulator
 # Sizes of the batches that shapes are checked with: none a likely d or m, and one a single state.
 SIZES = (7, 1, 37, 2)
 SET_BY_INIT = ("dim", "control_dim", "discount", "exponent", "control_cost")
+# Methods that users write, and how alike the name of another must be to be taken for one of them, by `difflib`: drfit for
+# drift is 0.8.
+OF_SYSTEMS = ("cost", "dynamics", "disturbance")
+OF_PROBLEMS = ("state_cost", "drift", "control_matrix", "noise", "initial_density")
+ALIKE = 0.8
 DECLARED = ("state_cost_bound", "occupation_bound", "control_bound", "value_bound", "exact_optimum")
 # Turns of a state round the torus within 1 / discount, and the square of those that noise spreads it over. Paths are
 # simulated in steps of a fraction of a turn, which are halved: for 300 turns 15,000 and 31,000 of them took two minutes on a
@@ -49,6 +56,7 @@ def check_once(problem: Problem) -> None:
         return
     simulator = isinstance(problem, Simulator)
     if simulator or not shipped(type(problem)):
+        require_spelling(problem)
         with torch.random.fork_rng(devices=[]), torch.no_grad():
             if isinstance(problem, System):
                 require_system(SystemFunctions(problem))
@@ -127,6 +135,25 @@ def require_made(problem: Problem) -> None:
         if bound is not None and not infinite:
             number = bound.item() if isinstance(bound, Tensor) and bound.ndim == 0 else bound
             require_number(f"{name} of {named(problem)}", number)
+
+
+def require_spelling(problem: Problem) -> None:
+    """No method is called almost like one that users write and this class does not: nothing would call it."""
+    own = {
+        name
+        for kind in type(problem).__mro__
+        if not shipped(kind)
+        for name, value in vars(kind).items()
+        if inspect.isfunction(value)
+    }
+    base, written = (System, OF_SYSTEMS) if isinstance(problem, System) else (Problem, OF_PROBLEMS)
+    for name in sorted(own):
+        close = difflib.get_close_matches(name, {*written} - own, n=1, cutoff=ALIKE)
+        if close and not name.startswith("_") and not hasattr(base, name):
+            raise ProblemError(
+                f"{named(problem)} defines {name}, which nothing asks for; did you mean {close[0]}? If not, give it a name "
+                "that is less alike, or one that begins with _."
+            )
 
 
 def require_units(problem: Problem) -> None:
