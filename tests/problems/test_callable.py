@@ -151,6 +151,14 @@ HOSTILE = {
     ),
     "infinite": (broken(B=lambda x, B: B * np.inf), r"the oracle's B is not finite at x = \["),
     "f of shape (N, 1)": (broken(f=lambda x, f: f[:, None]), r"the oracle's f has shape \(5, 1\)"),
+    "a state, whose f has shape (1,)": (
+        lambda x: (1.0 - np.cos(x[:1]), np.zeros(2), np.ones((2, 1))),
+        r"the oracle's f has shape \(1,\) for a state of shape \(2,\) \(x = .*\), but must have \(\)",
+    ),
+    "a state, whose sigma has no column": (
+        lambda x: (1.0 - np.cos(x[0]), np.zeros(2), np.ones((2, 1)), np.ones((2, 1, 1))),
+        r"shape \(2, 1, 1\) for a state of shape \(2,\)",
+    ),
     "one column too many": (broken(B=lambda x, B: np.ones((len(x), 2, 3))), r"the oracle's B has shape \(5, 2, 3\)"),
     "an exception": (raises_beyond(0.5), r"raised ZeroDivisionError at x = \[0\.[5-9].*no mass\.$"),
     "words": (broken(a=lambda x, a: np.full(a.shape, "left")), "the oracle's a is no array of real numbers"),

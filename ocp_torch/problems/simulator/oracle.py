@@ -106,9 +106,10 @@ class Oracle:
             if name == "B" and m == 1 and given.shape == (count, d):
                 given = given[:, :, None]
             if given.shape != form:
+                of, first = ("a state", 1) if self.one_by_one else ("states", 0)
                 raise InputError(
-                    f"the oracle's {name} has shape {given.shape} for states of shape {x.shape} (x = {x[0].tolist()} the "
-                    f"first), but must have {form}."
+                    f"the oracle's {name} has shape {given.shape[first:]} for {of} of shape {x.shape[first:]} (x = "
+                    f"{x[0].tolist()}{'' if first else ' the first'}), but must have {form[first:]}."
                 )
             found[name] = torch.from_numpy(given.astype(np.float64, order="C"))
         return found
@@ -140,15 +141,18 @@ class Oracle:
         for one_by_one in (False, True):
             # As many copies of a state as no coordinate has: a batch that cannot be taken for anything else.
             for batch in (x, *(np.repeat(state[None], len(x), axis=0) for state in x)):
+                self.one_by_one, answer = one_by_one, None
                 try:
-                    self._shaped(asked(self._function, batch, one_by_one), batch)
+                    answer = asked(self._function, batch, one_by_one)
+                    self._shaped(answer, batch)
                     return one_by_one
                 except Exception as error:  # whatever a stranger's code may raise
-                    complaints.append(error)
-        # A function of batches is not to be told that it cannot take single states, nor the other way round.
-        raise next((e for e in complaints if isinstance(e, InputError)), None) or InputError(
-            self._failure(x, complaints[0])
-        ) from None
+                    fitting = _fitting(answer, len(batch), self._dim, self._control_dim)
+                    complaints.append((isinstance(error, InputError), fitting, error))
+        # A function of batches is not to be told that it cannot take single states, nor the other way round: the complaint
+        # is of the way in which most of what it gives is right.
+        told, _, complaint = max(complaints, key=lambda c: c[:2])
+        raise (complaint if told else InputError(self._failure(x, complaint))) from None
 
     def _check_the_seam(self) -> None:
         everywhere = self.checked(scrambled_sobol(SIZED, self._dim, 0, torch.float64))
@@ -167,6 +171,18 @@ class Oracle:
                         f"the oracle's {name} jumps by {float(change[worst]):.3g} where coordinate {i} passes from 1 to 0, "
                         f"at x = {after[worst].tolist()}, but it must have period 1 in each coordinate."
                     )
+
+
+def _fitting(answer: object, count: int, d: int, m: int) -> int:
+    """How many of `f`, `a` and `B` in the ``answer`` at ``count`` states have the shape they must have."""
+    if not isinstance(answer, tuple | list):
+        return 0
+    try:
+        return sum(
+            np.shape(part) == form for part, form in zip(answer, ((count,), (count, d), (count, d, m)), strict=False)
+        )
+    except ValueError:  # rows of unlike lengths
+        return 0
 
 
 def _columns(part: object) -> int:
