@@ -7,7 +7,7 @@ import torch
 
 from ocp_torch.errors import ProblemError, require_number
 from ocp_torch.maths.supremum import supremum
-from ocp_torch.problems.blame import place
+from ocp_torch.problems.blame import named, place
 from ocp_torch.problems.idle_noise import idle_noise
 from ocp_torch.problems.needs import GIVEN, GUESSED, SEARCHED
 from ocp_torch.problems.problem import MARGIN, Problem
@@ -104,7 +104,8 @@ def resolve_constants(
         elif declared is not None and math.isfinite(declared):
             # J bounds the cost of a controller that is not quite optimal only if C_V leaves it room above V*.
             room = MARGIN if name == "C_V" else 1.0
-            chosen[name], sources[name] = room * float(declared), FROM_PROBLEM
+            whose = f"{field.removeprefix('method.')} of {named(problem)}"
+            chosen[name], sources[name] = room * require_number(whose, float(declared), above=0.0), FROM_PROBLEM
         else:
             (chosen[name], why), sources[name] = estimate(problem), ESTIMATED
             notes.append(f"{name} is not known: {chosen[name]:.4g} is {why}; {field} sets it.")
@@ -142,7 +143,15 @@ def state_cost_supremum(problem: Problem) -> float:
 
 
 def _estimate_value_bound(problem: Problem) -> tuple[float, str]:
-    return state_cost_supremum(problem), "the largest state cost met at sampled states, which bounds V*"
+    largest = state_cost_supremum(problem)
+    if largest == 0.0:
+        raise ProblemError(
+            f"the state cost of {named(problem)} is 0 at all states that were tried, so that doing nothing is optimal; it "
+            "must be above 0 somewhere."
+        )
+    return require_number(f"the state cost of {named(problem)}", largest), (
+        "the largest state cost met at sampled states, which bounds V*"
+    )
 
 
 def _estimate_control_bound(problem: Problem) -> tuple[float, str]:

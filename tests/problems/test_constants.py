@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from ocp_torch.errors import InputError
 from ocp_torch.problems import Problem
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import resolve_constants, state_cost_supremum
@@ -87,3 +88,18 @@ def test_what_a_class_declares_in_its_body_is_taken():
     assert (problem.occupation_bound, problem.state_cost_bound, problem.control_bound) == (3.0, 1.0, 2.0)
     found = resolve_constants(problem)
     assert (found.M, found.C_u, found.basis("M")) == (3.0, 2.0, GIVEN)
+
+
+@pytest.mark.parametrize(
+    ("cost", "declared", "says"),
+    [
+        (0.0, {}, r"^the state cost of .*Even is 0 at all states that were tried, .*; it must be above 0 somewhere\.$"),
+        (1e30, {}, r"^the state cost of .*Even is 1.05e\+30, but must be a number of at most 1e\+30 in size\.$"),
+        (1.0, {"occupation_bound": -3.0}, r"^occupation_bound of .*Even is -3, but must be above 0\.$"),
+        (1.0, {"value_bound": 0.0}, r"^value_bound of .*Even is 0, but must be above 0\.$"),
+    ],
+)
+def test_what_cannot_be_a_constant_is_named_as_the_user_wrote_it(cost, declared, says):
+    Even = type("Even", (Problem,), {"state_cost": lambda self, x: torch.full_like(x[:, 0], cost), **declared})
+    with pytest.raises(InputError, match=says):
+        resolve_constants(Even(1))
