@@ -119,9 +119,9 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
         guesses = dict.fromkeys(visible(b["if"]) for b in certificate["lower"].values() if b and "if" in b)
         lines.append(f"gap, if {' and '.join(guesses)}: {gap_in_words(gap['conditional'])}, which rests on a guess")
     if (outside := certificate.get("outside_box")) is not None:
-        half = outside["interval"][1] - outside["value"]
+        half = min(outside["interval"][1] - outside["value"], 1.0)
         lines.append(
-            f"outside the box: {100.0 * outside['value']:.3g} % of the discounted time (+- {100.0 * half:.1g})"
+            f"outside the box: {100.0 * outside['value']:.3g} % of the discounted time (+- {100.0 * half:.3g})"
         )
     lines += searches
     lines += [f"warning: {warning}" for warning in dict.fromkeys(map(visible, certificate["warnings"]))]

@@ -136,6 +136,8 @@ def run_data(data: dict, overrides: list[str], roots: tuple[Path, ...] = ()) -> 
         # What an experiment sets is another problem's as well.
         mine = {name.split(".")[1] for name in named if name.startswith("problem.")}
         data = {**data, "problem": {k: v for k, v in data["problem"].items() if k in mine}}
+    if data.get("resume") == "":
+        raise InputError("resume is empty, but must be a run's folder, a checkpoint, auto or null.")
     if data.get("resume") == "auto":
         run = find_run(data, (*roots, place("outputs")))
         data = {**data, "resume": str(run) if run else None}

@@ -158,6 +158,7 @@ def test_what_a_callback_raises_is_raised():
         (lambda: train("circle", settings={"trainer.stepz": 3}), "trainer.stepz=3"),
         (lambda: train("circle", settings={"trainer": {"batch": 0}}), "trainer.batch=0"),
         (lambda: train("circle", resume="nowhere"), "resume=nowhere"),
+        (lambda: train("circle", resume=""), "resume="),
     ],
 )
 def test_a_mistake_is_told_as_on_the_command_line(asked, override):

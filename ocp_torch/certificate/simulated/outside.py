@@ -66,10 +66,10 @@ def outside_note(problem: Problem, found: Estimate | None) -> list[str]:
     assert isinstance(problem, System)
     names = " and ".join(problem.coordinates[i].name for i in problem.chart.boxed)
     where = f"of the discounted time outside the box of {names}, where the model is not yours"
-    part, half = 100.0 * found.value, 100.0 * found.half_width(CONFIDENCE)
+    part, half = 100.0 * found.value, 100.0 * min(found.half_width(CONFIDENCE), 1.0)
     if found.value > MUCH:
-        return [f"the controller spends {part:.2g} % (+- {half:.1g}) {where}: widen the box, or raise failure_cost."]
+        return [f"the controller spends {part:.2g} % (+- {half:.3g}) {where}: widen the box, or raise failure_cost."]
     return [
-        f"the controller may spend up to {100.0 * found.above:.2g} % {where}, though {part:.2g} % was seen: raise "
+        f"the controller may spend up to {100.0 * min(found.above, 1.0):.3g} % {where}, though {part:.2g} % was seen: raise "
         "certificate.trajectories to know, or widen the box."
     ]
