@@ -161,6 +161,7 @@ HOSTILE = {
     ),
     "one column too many": (broken(B=lambda x, B: np.ones((len(x), 2, 3))), r"the oracle's B has shape \(5, 2, 3\)"),
     "an exception": (raises_beyond(0.5), r"raised ZeroDivisionError at x = \[0\.[5-9].*no mass\.$"),
+    "an exception everywhere": (broken(f=lambda x, f: f / (x[:, 0] @ {}["mass"])), "raised KeyError at x = .*: 'mass'"),
     "words": (broken(a=lambda x, a: np.full(a.shape, "left")), "the oracle's a is no array of real numbers"),
     "nothing": (lambda x: None, "gave a NoneType, but must give f, a, B"),
     "six things": (lambda x: (1, 2, 3, 4, 5, 6), "gave a tuple"),

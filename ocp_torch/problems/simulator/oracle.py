@@ -148,10 +148,10 @@ class Oracle:
                     return one_by_one
                 except Exception as error:  # whatever a stranger's code may raise
                     fitting = _fitting(answer, len(batch), self._dim, self._control_dim)
-                    complaints.append((isinstance(error, InputError), fitting, error))
+                    complaints.append((isinstance(error, InputError), fitting, error, one_by_one))
         # A function of batches is not to be told that it cannot take single states, nor the other way round: the complaint
         # is of the way in which most of what it gives is right.
-        told, _, complaint = max(complaints, key=lambda c: c[:2])
+        told, _, complaint, self.one_by_one = max(complaints, key=lambda c: c[:2])
         raise (complaint if told else InputError(self._failure(x, complaint))) from None
 
     def _check_the_seam(self) -> None:
