@@ -566,6 +566,27 @@ def test_independent_draws_in_single_precision_are_no_copies(tmp_path, dim, cont
         assert 11000 < sum(int(note.split()[0].replace(",", "")) for note in notes) < 14100  # a few by chance
 
 
+@pytest.mark.parametrize(("dim", "same"), [(1, 19000), (2, 400), (3, 0)])
+def test_independent_draws_in_three_decimals_are_all_kept(tmp_path, dim, same):
+    """Most of those on a circle are at the state of another: without these the others would follow another law."""
+    arrays = arrays_of(record(tmp_path, Manufactured(dim=dim), 20000, contrast=0.9))
+    np.savez(tmp_path / "a.npz", **{**arrays, "x": arrays["x"].round(3)})
+    found = recording.read(tmp_path / "a.npz")
+    assert len(found.samples) == 20000
+    assert all("at the state of another, as x has few digits" in note for note in found.notes)
+    assert sum(int(note.split()[0].replace(",", "")) for note in found.notes) == pytest.approx(same, rel=0.05)
+
+
+def test_states_along_a_path_are_no_copies(tmp_path):
+    """Consecutive ones of twelve coordinates are .04 apart, which is nearer than chance explains: that is told."""
+    x = (0.01 * np.arange(20000)[:, None] * np.sqrt([2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37])) % 1.0
+    one = np.ones(len(x))
+    np.savez(tmp_path / "a.npz", x=x, f=one, a=0.0 * x, B=np.ones((len(x), 12, 1)), discount=1.0)
+    found = recording.read(tmp_path / "a.npz")
+    assert len(found.samples) == 20000
+    assert any("nearer to another than chance explains" in note for note in found.notes)
+
+
 def test_a_violation_that_only_trained_samples_show_is_in_the_interval(tmp_path):
     """`f` is 1, and 0 in a hole that no held-out sample met: `OPT` is .999, and `V = 1` has no slack elsewhere."""
     for seed in range(20):

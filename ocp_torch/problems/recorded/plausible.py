@@ -17,8 +17,9 @@ FORGIVEN = 1e-3
 # Rounding of states and costs, relative to their size: files may be in single precision.
 ROUNDING = 1e-6
 # Copies are looked for in cubes of two sizes, in which chance puts so many samples beside another: one in a thousand files,
-# and one in a hundred samples. Rounding puts all that is nearer than the third number into one place.
-ONCE, SELDOM, GRAIN = 1e-3, 1e-2, 2.0**-23
+# and one in a hundred samples. Those that are left out are no farther apart than the third number, in turns; rounding puts
+# all that is nearer than the fourth into one place.
+ONCE, SELDOM, LITTLE, GRAIN = 1e-3, 1e-2, 1e-4, 2.0**-23
 
 
 def samples_of(path: Path, arrays: dict[str, np.ndarray], wrap: bool) -> Samples:
@@ -112,8 +113,8 @@ def stray_divergences(samples: Samples) -> dict[str, str]:
 def without_copies(samples: Samples) -> Samples:
     """``samples`` without those at the state of an earlier one, or as near to it as rounding or a little noise has them; all
     of them where chance explains these."""
-    for shift in (0.0, 0.5):  # a pair that one division into cubes parts is in one cube of the other
-        near, chance = _beside(samples, ONCE, shift)
+    for shift in (0.25, 0.75):  # a pair that one division into cubes parts is in one cube of the other
+        near, chance = _beside(samples, ONCE, shift, LITTLE)
         samples = samples.take(~near) if _beyond(near, chance) else samples
     return samples
 
@@ -124,16 +125,24 @@ def _beyond(near: Tensor, chance: float) -> int:
     return round(count - chance) if count > chance + SURE * chance**0.5 else 0
 
 
-def _beside(samples: Samples, wanted: float, shift: float = 0.0) -> tuple[Tensor, float]:
-    """Which samples ``(N,)`` share a cube with an earlier one, and how many would by chance: as many as are ``wanted``, or
-    more where cubes are as small as rounding has them."""
+def _beside(samples: Samples, wanted: float, shift: float = 0.25, largest: float = 1.0) -> tuple[Tensor, float]:
+    """Which samples ``(N,)`` share a cube with an earlier one, and how many would by chance: as many as are ``wanted``, fewer
+    where cubes are the ``largest``, and more where they are as small as states are recorded."""
     count, dim = samples.x.shape
     pairs = 0.5 * count * (count - 1) * float((1.0 / samples.weight).mean())  # in a cube of volume 1, on average
-    side = max((wanted / pairs) ** (1.0 / dim), GRAIN)
-    cubes, cube = (samples.x / side + shift).floor().unique(dim=0, return_inverse=True)
+    grain = _grain(samples.x)
+    sides = grain * (min((wanted / pairs) ** (1.0 / dim), largest) / grain).ceil()
+    cubes, cube = (samples.x / sides + shift).floor().unique(dim=0, return_inverse=True)
     rows = torch.arange(count)
     first = torch.full((len(cubes),), count).scatter_reduce(0, cube, rows, "amin")
-    return rows != first[cube], pairs * side**dim
+    return rows != first[cube], pairs * float(sides.prod())
+
+
+def _grain(x: Tensor) -> Tensor:
+    """How finely each coordinate is recorded, ``(d,)``, as to three decimals: hardly any of its values are nearer to the next
+    than that."""
+    steps = [column[column > GRAIN] for column in x.sort(dim=0).values.diff(dim=0).T]
+    return torch.stack([s.kthvalue(1 + len(s) // 100).values if len(s) else s.new_tensor(GRAIN) for s in steps])
 
 
 def remarks(path: Path, samples: Samples) -> tuple[str, ...]:
@@ -144,6 +153,12 @@ def remarks(path: Path, samples: Samples) -> tuple[str, ...]:
         "bounds take it as it is."
         for name, of in stray_divergences(samples).items()
     ]
+    same = len(samples) - len(samples.x.unique(dim=0))
+    if same > SELDOM * len(samples):
+        notes.append(
+            f"{same:,} samples of {path.name} are at the state of another, as x has few digits: some are trained on and held "
+            "out, and bounds may be wrong by more than their intervals."
+        )
     if count := max(_beyond(*_beside(samples, wanted)) for wanted in (ONCE, SELDOM * len(samples))):
         notes.append(
             f"{count:,} samples of {path.name} are nearer to another than chance explains: they are no independent draws, "
