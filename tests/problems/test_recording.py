@@ -25,7 +25,7 @@ from ocp_torch.objectives import Dual, primal, saddle
 from ocp_torch.problems import Circle, Dataset, Manufactured, PhaseNeurons, Unicycle
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import resolve_constants
-from ocp_torch.problems.recorded import recording
+from ocp_torch.problems.recorded import plausible, recording
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs import record as recording_command
 from ocp_torch.runs.build import build_certificate_settings
@@ -521,8 +521,10 @@ def test_twenty_thousand_samples_certify_the_optimum(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["manufactured 2-d B(x)", "noisy 2-d sigma(x)"])
-def test_a_divergence_of_another_column_is_told(tmp_path, name):
-    """A drift, a control matrix or noise whose coordinates are in another order than the divergences beside them."""
+def test_a_divergence_of_another_column_is_told(tmp_path, monkeypatch, name):
+    """A drift, a control matrix or noise whose coordinates are in another order than the divergences beside them; of so many
+    samples every second is looked at."""
+    monkeypatch.setattr(plausible, "TESTED", 2000)
     path = record(tmp_path, zoo.build(name), 4000)
     arrays = arrays_of(path)
     assert recording.read(path).notes == ()
