@@ -89,7 +89,7 @@ def _require_distribution(path: Path, samples: Samples, given: bool) -> None:
 
 def stray_divergences(samples: Samples) -> dict[str, str]:
     """Columns of divergences, and of what each is not the divergence: `E[phi div F + F . grad phi] = 0` by parts, for plane
-    waves `phi`, unless some of `div F` is hidden in jumps of `F`."""
+    waves `phi`, unless some of `div F` is hidden in jumps of `F`, or in places too small for a sample to be in one."""
     samples = samples.take(slice(None, None, max(1, len(samples) // TESTED)))
     D = None if samples.noise is None else 0.5 * samples.noise @ samples.noise.mT
     columns = {
@@ -156,8 +156,8 @@ def remarks(path: Path, samples: Samples) -> tuple[str, ...]:
     """What a user should be told of the ``samples`` of ``path``: divergences that are not, and signs that they are no
     independent draws, which are near copies and the correlation of consecutive state costs."""
     notes = [
-        f"{name} of {path.name} is not the divergence of its {of}: one of them is in another order or unit, or {of} jumps; "
-        "bounds take it as it is."
+        f"by these samples {name} of {path.name} is not the divergence of its {of}: one of them is in another order or unit, "
+        f"or {of} jumps, or nearly so where none of them is; bounds take it as it is."
         for name, of in stray_divergences(samples).items()
     ]
     same = len(samples) - len(samples.x.unique(dim=0))
