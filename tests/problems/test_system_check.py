@@ -133,6 +133,12 @@ def test_helpers_may_be_called_almost_as_what_is_there_and_anything_with_an_unde
     check_once(mistaken(costs=helper, _disturbances=helper, gust=helper)())
 
 
+@pytest.mark.parametrize("wrapped", [lambda f: f, property, torch.no_grad()])
+def test_helpers_that_the_class_itself_asks_for_may_be_called_anything(wrapped):
+    called = wrapped(lambda self: [self.disturbances(s) for s in ()])
+    check_once(mistaken(disturbances=lambda self, s: s, gusts=called)())
+
+
 @pytest.mark.parametrize(("method", "says"), [("cost", "define cost"), ("dynamics", "define dynamics")])
 def test_what_is_left_out_is_asked_for(method, says):
     with pytest.raises(InputError, match=f"must {says}"):

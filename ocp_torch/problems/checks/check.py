@@ -7,6 +7,7 @@ are the same to the bit, in single precision too, and away from where functions 
 import difflib
 import inspect
 import math
+from types import CodeType
 
 import torch
 from torch import Tensor
@@ -138,22 +139,25 @@ def require_made(problem: Problem) -> None:
 
 
 def require_spelling(problem: Problem) -> None:
-    """No method is called almost like one that users write and this class does not: nothing would call it."""
-    own = {
-        name
-        for kind in type(problem).__mro__
-        if not shipped(kind)
-        for name, value in vars(kind).items()
-        if inspect.isfunction(value)
-    }
+    """No method is called almost like one that users write and this class does not, unless the class itself asks for it:
+    nothing would call it."""
+    members = [member for kind in type(problem).__mro__ if not shipped(kind) for member in vars(kind).items()]
+    own = {name for name, value in members if inspect.isfunction(value)}
+    functions = [inspect.unwrap(getattr(value, "fget", None) or value) for _, value in members]
+    helpers = set[str]().union(*(_asked_for(f.__code__) for f in functions if inspect.isfunction(f)))
     base, written = (System, OF_SYSTEMS) if isinstance(problem, System) else (Problem, OF_PROBLEMS)
-    for name in sorted(own):
+    for name in sorted(own - helpers):
         close = difflib.get_close_matches(name, {*written} - own, n=1, cutoff=ALIKE)
         if close and not name.startswith("_") and not hasattr(base, name):
             raise ProblemError(
                 f"{named(problem)} defines {name}, which nothing asks for; did you mean {close[0]}? If not, give it a name "
                 "that is less alike, or one that begins with _."
             )
+
+
+def _asked_for(code: CodeType) -> set[str]:
+    """What ``code`` asks for by name, in functions within it too."""
+    return {*code.co_names}.union(*(_asked_for(inner) for inner in code.co_consts if isinstance(inner, CodeType)))
 
 
 def require_units(problem: Problem) -> None:
