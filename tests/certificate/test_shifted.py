@@ -84,6 +84,21 @@ def test_a_peak_that_was_found_is_looked_at_in_averages_too(monkeypatch):
     assert mollified_shift(own).bound < own.looked.bound - 0.02
 
 
+def test_averages_take_off_narrow_spikes_and_are_not_asked_for_without_any():
+    problem = zoo.build("circle rho=2")
+    spike = lambda x: torch.exp(-(((x[:, 0] - 0.3) / 0.003) ** 2))
+    sets = replicated_samples(problem, 64, 4, seed=0, divergences=False)
+    own, spiked = (
+        Shift(problem, value, sets, ascents=2, beside=[])
+        for value in (problem.exact_value, lambda x: problem.exact_value(x) + 5e-4 * spike(x))
+    )
+    averaged = mollified_shift(spiked)
+    assert averaged.radius > 0.0
+    assert averaged.bound - spiked.bound > 0.5 * (own.bound - spiked.bound) > 1e-3
+    assert averaged.bound <= problem.exact_optimum + 6.0 * averaged.estimate.se
+    assert mollified_shift(own) is own
+
+
 @zoo.on(zoo.FEW)
 def test_the_multiple_is_the_best_on_a_line_of_multiples(problem):
     parts, initial = parts_of(problem, near(problem, 4, 0.2)), problem.exact_optimum
