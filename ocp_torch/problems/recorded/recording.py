@@ -25,7 +25,8 @@ from ocp_torch.files.plain import NotPlain, json_object
 from ocp_torch.files.reading import kind
 from ocp_torch.files.storage import read_safetensors, write_atomically
 from ocp_torch.problems.physical.measures import Measures
-from ocp_torch.problems.recorded.plausible import remarks, samples_of, without_copies
+from ocp_torch.problems.recorded.independence import dependence_notes, without_copies
+from ocp_torch.problems.recorded.plausible import divergence_notes, samples_of
 from ocp_torch.problems.samples import Samples
 
 REQUIRED = {"x": "Nd", "f": "N", "a": "Nd", "B": "Ndm"}
@@ -91,11 +92,12 @@ def read(path: str | Path, wrap: bool = False) -> Recording:
     for name in sorted(arrays):
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(arrays[name]).data)
-    measures, notes = (None, ()) if units is None else _measures(path, units, *samples.B.shape[1:])
+    measures, of_units = (None, ()) if units is None else _measures(path, units, *samples.B.shape[1:])
     kept = without_copies(samples)
+    notes = divergence_notes(path, kept) + dependence_notes(path, kept) + of_units
     if copies := len(samples) - len(kept):
         notes = (f"{copies:,} samples of {path.name} are at the state of another, and are left out.", *notes)
-    return Recording(kept, numbers, digest.hexdigest(), remarks(path, kept) + notes, measures)
+    return Recording(kept, numbers, digest.hexdigest(), notes, measures)
 
 
 def _measures(path: Path, units: np.ndarray, dim: int, control_dim: int) -> tuple[Measures | None, tuple[str, ...]]:
