@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 SCHEMA = 2
 # A gap above this says nothing as a percentage, and is told as a multiple.
 MEANS = 1.0
+# Of numbers of which the largest is not between these eight decimals show too little, or too much.
+DECIMALS = (1e-3, 1e4)
 # What the controllers of a run are called in sentences.
 CONTROLLERS = {
     "value": "controller from V",
@@ -68,6 +71,12 @@ def to_dict(certificate: Certificate) -> dict:
     }
 
 
+def _form(numbers: Sequence[float]) -> str:
+    """How the table writes its ``numbers``: with eight decimals, or with eight digits where the largest is small or long."""
+    largest = max((abs(number) for number in numbers if math.isfinite(number)), default=1.0)
+    return "14.8f" if DECIMALS[0] <= largest < DECIMALS[1] else "14.7e"
+
+
 def table(certificate: dict, searches: Sequence[str] = ()) -> str:
     """The certificate (as a dict of its schema) for the terminal: what it comes to, the numbers as a table, and how its
     suprema were found."""
@@ -77,6 +86,7 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
     covered = f"± {100.0 * certificate['confidence']:.6g} %" if "confidence" in certificate else "± se"
     header = f"{'':26}{'value':>14}{covered:>11}{'of it bias':>11}" + (f"{'vs OPT':>12}" if exact else "")
     lines += [header, "-" * len(header)]
+    form = _form([e["value"] for side in (LOWER, "perf", UPPER) for e in certificate[side].values() if e])
 
     def row(label: str, estimate: dict | None) -> None:
         if estimate is None:
@@ -84,7 +94,7 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
         bias = f"{estimate['bias']:11.1e}" if "bias" in estimate else " " * 11
         against = _against(estimate["value"] / exact) if exact else ""
         half = estimate["interval"][1] - estimate["value"] if "interval" in estimate else estimate["se"]
-        lines.append(f"{label:26}{estimate['value']:14.8f}{half:11.1e}{bias}{against}")
+        lines.append(f"{label:26}{estimate['value']:{form}}{half:11.1e}{bias}{against}")
 
     def rows(side: str, order=list) -> None:
         for kind, listed in order(bounds.on(side).items()):
@@ -94,7 +104,7 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
 
     rows(LOWER)
     if exact is not None:
-        lines.append(f"{'OPT (exact)':26}{exact:14.8f}")
+        lines.append(f"{'OPT (exact)':26}{exact:{form}}")
     row("Perf: controller from V", certificate["perf"].get("value"))
     row("Perf: controller w/mu", certificate["perf"].get("density"))
     row("Perf: w/mu, mu of Lemma 2", certificate["perf"].get("minimised"))

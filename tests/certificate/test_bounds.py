@@ -214,6 +214,20 @@ def test_a_certificate_of_the_first_schema_is_still_shown():
     assert shown[5:] == ["gap, certified: 2.0000%", "gap, simulated: 1.0000%", "warning: C_V is not known."]
 
 
+@pytest.mark.parametrize("unit", [1e-9, 1e-4, 1.0, 1e4, 1e9])
+def test_the_table_tells_bounds_apart_in_any_unit_of_cost(unit):
+    said = certificate().to_dict()
+    for side in ("lower", "perf", "upper"):
+        for estimate in filter(None, said[side].values()):
+            estimate |= {"value": unit * estimate["value"], "interval": [unit * end for end in estimate["interval"]]}
+    said["exact"] = unit * said["exact"]
+    shown = [
+        line[26:40] for line in table(said).splitlines() if line.startswith(("lower: F_M", "OPT", "Perf: controller"))
+    ]
+    true = [said["lower"]["F_M"]["value"], said["exact"], said["perf"]["value"]["value"]]
+    assert [float(number) for number in shown] == pytest.approx(true, rel=1e-6)
+
+
 def test_what_means_nothing_as_a_percentage_is_said_otherwise_and_a_warning_once():
     said = certificate().to_dict()
     said |= {
