@@ -70,6 +70,6 @@ def outside_note(problem: Problem, found: Estimate | None) -> list[str]:
     if found.value > MUCH:
         return [f"the controller spends {part:.2g} % (+- {half:.3g}) {where}: widen the box, or raise failure_cost."]
     return [
-        f"the controller may spend up to {100.0 * min(found.above, 1.0):.3g} % {where}, though {part:.2g} % was seen: raise "
+        f"the controller may spend up to {100.0 * found.above:.2g} % {where}, though {part:.2g} % was seen: raise "
         "certificate.trajectories to know, or widen the box."
     ]
