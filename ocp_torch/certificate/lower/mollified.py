@@ -24,7 +24,8 @@ from ocp_torch.problems.samples import Samples
 # on few of the states and on the worst for V itself, beside which its averages are worst too.
 RADII, FEW, WORST, FEW_ASCENTS = tuple(2.0 ** (0.5 * k) for k in range(-15, -8)), 2048, 2048, 8
 # All states are asked where these promise that part of the bound, and again, for another radius, where they promise as much
-# beyond what the first came to: that takes up to a tenth of a run.
+# beyond what the first came to. At half effort that took 30 of 250 s of a unicycle and gave .14 %, 60 of 230 of six
+# oscillators and .45 %.
 WORTH = 3e-4
 # Directions at most along which neighbours lie, and evaluations of V at most.
 DIRECTIONS, EVALUATIONS = 8, 2**20

@@ -92,8 +92,8 @@ class Paths:
         return rates if self.sliding is None else self.sliding.corrected(rates, torch.arange(len(rates)))
 
     @property
-    def _nothing(self) -> Tensor:
-        """For each replicate."""
+    def _no_refinement(self) -> Tensor:
+        """0 for each replicate: without noise results themselves are on the finest steps."""
         return torch.zeros(self.replicates, dtype=self.mass.dtype)
 
     @property
@@ -124,7 +124,7 @@ class Paths:
     def _held(self, loop: HeldLoop, quick: HeldLoop) -> Followed:
         of = loop, quick, self.value, self.state, self.mass, self.replicates
         results, ends, error = held_integrals(*of, self.steps.horizon, self.allowed, self._generator, self.together)
-        return Followed(results, ends, self._nothing, error, self._wall(self.steps.count))
+        return Followed(results, ends, self._no_refinement, error, self._wall(self.steps.count))
 
     def _smooth(self) -> Followed:
         """On steps that are finer from the start where the usual ones jump over a wall."""
@@ -141,7 +141,7 @@ class Paths:
         audit = self._integrated(self.loop) if self._is_rounded else None
         how = self.allowed, self._generator, error, audit, doublings, AUDITED if self.audited else 0
         results, ends, off, taken = refined(self._integrated(self.quick), self.mass, steps, *how)
-        return Followed(results, ends, self._nothing, off, self._wall(taken))
+        return Followed(results, ends, self._no_refinement, off, self._wall(taken))
 
     def _integrated(self, by: Loop) -> Integrate:
         """Results of some of the paths, with so many steps."""
