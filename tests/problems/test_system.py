@@ -290,10 +290,14 @@ def test_a_mistake_is_told_in_one_sentence(name):
 
 
 @pytest.mark.parametrize(
-    "unit", ["", "rad/s", "m/s^2", "m/s²", "N m", "kg m^2", "1/s", "V", "deg", "%", "mA", "rad/s/s"]
+    "unit", ["", "rad/s", "m/s^2", "m/s²", "N m", "kg m^2", "1/s", "V", "deg", "%", "mA", "rad/s/s", "kt/yr", "EUR/day"]
 )
 def test_units_people_write_are_read(unit):
     assert Interval("v", 0, 1, unit).unit == unit
+
+
+def test_a_unit_of_ones_own_stands_in_the_name():
+    assert Interval("queue (cars)", 0, 80).label == "queue (cars)"
 
 
 def test_weight_and_limit_may_be_of_controls_in_units_of_nominal_ones():

@@ -4,9 +4,10 @@ import re
 
 from ocp_torch.errors import InputError, shown
 
-# SI's units of mechanics, electricity and heat, and others in common use; and the prefixes that those of SI may have.
-SI = "m g s A K mol rad Hz N Pa J W C V F Ohm S Wb T H L bar".split()
-OTHERS = "deg turn rev rpm min h d kg degC % 1".split()
+# SI's units of mechanics, electricity and heat, with tonnes, and others in common use; and the prefixes that those of SI may
+# have.
+SI = "m g t s A K mol rad Hz N Pa J W C V F Ohm S Wb T H L bar eV".split()
+OTHERS = "deg turn rev rpm min h d day wk yr kg degC % ppm dB EUR USD 1".split()
 PREFIXES = ("", *"n u m c d k M G".split())
 SYMBOLS = {prefix + unit for prefix in PREFIXES for unit in SI} | set(OTHERS)
 # Full turns, by the unit of an angle.
@@ -24,7 +25,8 @@ def require_unit(name: str, unit: object) -> str:
         if term and not (symbol and symbol[1] in SYMBOLS):
             raise InputError(
                 f"{name} is {shown(unit)}, of which {shown(term)} is no unit known here; write it with symbols such as m, s, "
-                "kg, N, V, A, Hz, rad and deg, as in rad/s, m/s^2 or N m, or '' for none."
+                "kg, N, V, A, Hz, rad and deg, as in rad/s, m/s^2 or N m, or '' for none; another may "
+                "stand in the name, as in 'queue (cars)'."
             )
     return unit
 
