@@ -33,6 +33,19 @@ def with_(dim: int = 2, **functions) -> Problem:
     return type("Mine", (Good,), functions)(dim)
 
 
+class FarApart(Problem):
+    """Two actuators as fast at their limits, of which one is small and moves much."""
+
+    def __init__(self) -> None:
+        super().__init__(2, control_limit=[1.0, 1e-4])
+
+    def state_cost(self, x):
+        return 2.0 + torch.cos(TURN * x).sum(dim=-1)
+
+    def control_matrix(self, x):
+        return torch.diag(x.new_tensor([1.0, 1e4])).expand(len(x), 2, 2)
+
+
 class NoSuper(Problem):
     def __init__(self) -> None:
         self.weight = 1.0
@@ -335,6 +348,7 @@ LEGAL = {
     "kinks": lambda: with_(drift=lambda self, x: torch.sin(TURN * x).abs().sqrt()),
     "a step of a detached state": lambda: with_(state_cost=lambda self, x: step_of(x[:, 0].detach())),
     "mu0 without a derivative": lambda: with_(initial_density=lambda self, x: 2.0 * step_of(x[:, 0])),
+    "limits and gains far apart": FarApart,
     "flat": lambda: with_(state_cost=lambda self, x: torch.zeros_like(x[:, 0])),
     "a hole": lambda: with_(state_cost=lambda self, x: 1.0 - bump(0.0025, 0.5)(self, x)),
     "a spike": lambda: with_(state_cost=lambda self, x: 5000.0 * bump(0.0025, 0.5)(self, x)),

@@ -165,8 +165,8 @@ def require_units(problem: Problem) -> None:
     x, f, a, B = problem.probe(SPEED_STATES, SPEED_DESIGN, "x", "f", "a", "B")
     # A control that costs as much as the state cost varies.
     u = (problem.exponent * float(f.std())) ** (1.0 / problem.exponent)
-    u = min(u, problem.control_cost.reach)
-    drift, push = float(a.norm(dim=-1).mean()), u * float(B.flatten(1).norm(dim=-1).mean())
+    each = torch.as_tensor(problem.control_cost.sides).clamp_max(u).to(B)
+    drift, push = float(a.norm(dim=-1).mean()), float((B * each).flatten(1).norm(dim=-1).mean())
     turns = (drift + push) / problem.discount
     if turns > MOST_TURNS:
         time = 1.0 / problem.discount
