@@ -15,6 +15,7 @@ from ocp_torch.errors import InputError, first_line
 from ocp_torch.files.reading import FOLDER, kind, require_file
 from ocp_torch.problems import PROBLEMS, Problem
 from ocp_torch.problems.simulator.target import resolved
+from ocp_torch.runs.onnx_controller import onnx_controller
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +47,7 @@ def load_policy(source: str, problem: Problem) -> Callable | Controller:
     if found == FOLDER or path.suffix == ".safetensors":
         return load_saved(path, problem)
     require_file(path)
-    return _onnx(path) if path.suffix == ".onnx" else _torchscript(path)
+    return onnx_controller(path, problem) if path.suffix == ".onnx" else _torchscript(path)
 
 
 def load_saved(path: Path, problem: Problem) -> Controller:
@@ -58,20 +59,6 @@ def load_saved(path: Path, problem: Problem) -> Controller:
     if type(found.problem) is not type(problem):
         raise InputError(f"{file} belongs to {problem_name(found.problem)!r}, not to {problem_name(problem)!r}.")
     return found
-
-
-def _onnx(path: Path) -> Callable:
-    try:
-        import onnxruntime
-    except ImportError:
-        raise InputError(f"{path} needs onnxruntime: pip install onnxruntime.") from None
-    try:
-        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-        (entry,) = session.get_inputs()
-    except Exception as error:  # the runtime has no one type for a bad file
-        raise InputError(f"{path} is not a model with one input that onnxruntime can run: {error}.") from None
-    dtype = torch.float64 if "double" in entry.type else torch.float32
-    return lambda x: torch.from_numpy(session.run(None, {entry.name: x.to(dtype).numpy()})[0])
 
 
 def _torchscript(path: Path) -> Callable:
