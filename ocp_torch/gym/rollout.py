@@ -16,6 +16,7 @@ from ocp_torch.control.policies import TRAJECTORIES
 from ocp_torch.errors import InputError, first_line, require_integer
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.gym.environment import require_gymnasium
+from ocp_torch.problems.blame import in_their_words
 from ocp_torch.runs.evaluate import load_run
 
 log = logging.getLogger(__name__)
@@ -53,16 +54,21 @@ class Agent:
     def act(self, observation) -> np.ndarray:
         """The action for ``observation``."""
         d = self.controller.problem.dim
-        state = np.asarray(self._state(observation), dtype=np.float64)
+        asked = lambda what, function: in_their_words(
+            function, f"{what} for {self.name}", type(self.controller.problem)
+        )
+        state = asked("from_observation", lambda: np.asarray(self._state(observation), dtype=np.float64))
         if state.shape != (d,) or not np.isfinite(state).all():
             raise InputError(f"from_observation gave {state} for {self.name}, but must give {d} finite coordinates.")
         step = self.step if self.controller.kind == TRAJECTORIES else None
         control = (self.controller(state[None]) if step is None else self.controller.held(state[None], step))[0]
-        action = np.asarray(self._action(control), dtype=self.space.dtype)
+        action = asked("to_action", lambda: np.asarray(self._action(control), dtype=self.space.dtype))
         if action.shape != self.space.shape:
             raise InputError(
                 f"to_action gave shape {action.shape} for {self.name}, whose actions have shape {self.space.shape}."
             )
+        if not np.isfinite(action).all():
+            raise InputError(f"to_action gave {action} for {self.name}, but must give finite numbers.")
         return np.clip(action, self.space.low, self.space.high) if hasattr(self.space, "low") else action
 
 
@@ -98,7 +104,7 @@ class RolloutJob:
             raise InputError(f"video is {str(self.video)!r}, but must be a file whose name ends in .gif.")
         self.env = str(config["env"])
         with closing(self.environment()) as env:
-            Agent(self.controller, env, self.env).act(env.reset(seed=0)[0])
+            Agent(self.controller, env, self.env).act(started(env, self.env, 0))
         self.episodes = require_integer("episodes", config["episodes"], 1, maximum=10**6)
         self.seed = require_integer("seed", config["seed"], 0)
 
@@ -138,16 +144,36 @@ def play(controller: Controller, env, name: str, episodes: int, seed: int, frame
     agent = Agent(controller, env, name)
     returns, lengths = [], []
     for k in range(episodes):
-        observation, _ = env.reset(seed=seed + k)
+        observation = started(env, name, seed + k)
         total, count, over = 0.0, 0, False
         while not over and count < MOST_STEPS:
             if frames is not None and len(frames) < MOST_FRAMES:
                 frames.append(_picture(env, name))
-            observation, reward, ended, cut, _ = env.step(agent.act(observation))
-            total, count, over = total + float(reward), count + 1, ended or cut
+            observation, reward, over = stepped(env, name, agent.act(observation))
+            total, count = total + reward, count + 1
+        if not over:
+            log.warning("warning: %s, episode %d: no end within %s steps, and it is cut there.", name, k, f"{count:,}")
         returns.append(total)
         lengths.append(count)
     return Rollouts(np.array(returns), np.array(lengths))
+
+
+def started(env, name: str, seed: int):
+    """The first observation of an episode of ``env``."""
+    return in_their_words(lambda: env.reset(seed=seed)[0], name)
+
+
+def stepped(env, name: str, action: np.ndarray) -> tuple[Any, float, bool]:
+    """Observation, reward and whether the episode is over after a step of ``env``. Raises `InputError` where it fails."""
+
+    def found() -> tuple[Any, float, bool]:
+        observation, reward, ended, cut, _ = env.step(action)
+        return observation, float(reward), bool(ended or cut)
+
+    observation, reward, over = in_their_words(found, name)
+    if not math.isfinite(reward):
+        raise InputError(f"{name} gave the reward {reward}, but must give finite numbers.")
+    return observation, reward, over
 
 
 def _picture(env, name: str) -> np.ndarray:

@@ -94,8 +94,12 @@ class System(Disturbed):
         """What is beyond a seam is taken at it."""
         if env != self.gymnasium:
             return super().from_observation(env, observation)
-        s = self.observed(np.asarray(observation, dtype=np.float64))
-        return self.chart.clipped(torch.as_tensor(s, dtype=torch.float64).unsqueeze(0))[0].numpy()
+        s = np.asarray(self.observed(np.asarray(observation, dtype=np.float64)), dtype=np.float64)
+        if s.shape != (self.dim,):  # one number would be taken for all coordinates
+            raise InputError(
+                f"observed of {type(self).__name__} gave shape {s.shape}, but must give ({self.dim},), a physical state."
+            )
+        return self.chart.clipped(torch.as_tensor(s).unsqueeze(0))[0].numpy()
 
     def to_action(self, env: str, control: np.ndarray) -> np.ndarray:
         if env != self.gymnasium:

@@ -1,0 +1,92 @@
+"""Environments and maps to them that somebody else wrote: each of their faults is one sentence, and none is a return."""
+
+import logging
+
+import numpy as np
+import pytest
+
+import ocp_torch.gym.rollout
+from ocp_torch import InputError
+from ocp_torch.gym.rollout import play
+from ocp_torch.problems import Pendulum
+
+gymnasium = pytest.importorskip("gymnasium")
+NAME = "Pendulum-v1"
+
+
+class Theirs(gymnasium.Env):
+    """Shows an upright pendulum for four steps, but for what ``faults`` put in the place of ``reset`` or ``step``."""
+
+    action_space = gymnasium.spaces.Box(-2.0, 2.0, (1,), np.float32)
+
+    def __init__(self, **faults) -> None:
+        self.count = 0
+        vars(self).update(faults)
+
+    def reset(self, seed=None):
+        self.count = 0
+        return np.array([1.0, 0.0, 0.0]), {}
+
+    def step(self, action):
+        self.count += 1
+        return np.array([1.0, 0.0, 0.0]), -1.0, False, self.count == 4, {}
+
+
+class Player:
+    """Does nothing with a pendulum whose maps are those of ``faults`` where they name some."""
+
+    kind = "a test's"
+
+    def __init__(self, **faults) -> None:
+        self.problem = type("Mine", (Pendulum,), faults)()
+
+    def __call__(self, x):
+        return np.zeros((len(x), 1))
+
+
+def broken(*_, **__):
+    raise RuntimeError("no display\nat all")
+
+
+SHOWN = np.array([1.0, 0.0, 0.0])
+ENVIRONMENTS = {
+    "reset raises": (dict(reset=broken), "raised RuntimeError: no display at all"),
+    "step raises": (dict(step=broken), "raised RuntimeError: no display at all"),
+    "of an older kind": (dict(step=lambda action: (SHOWN, 0.0, False, {})), "raised ValueError: not enough values"),
+    "reward": (dict(step=lambda action: (SHOWN, np.nan, False, True, {})), "Pendulum-v1 gave the reward nan"),
+}
+MAPS = {
+    "observed raises": (dict(observed=broken), r"raised RuntimeError: no display at all \(.*, line"),
+    "one number": (
+        dict(observed=lambda self, seen: seen[:1]),
+        r"observed of Mine gave shape \(1,\), but must give \(2,\)",
+    ),
+    "nothing": (dict(observed=lambda self, seen: None), r"observed of Mine gave shape \(\), but must give \(2,\)"),
+    "action raises": (dict(action=broken), r"raised RuntimeError: no display at all \(.*, line"),
+    "no number": (dict(action=lambda self, u: u * np.nan), r"to_action gave \[nan\] for Pendulum-v1"),
+}
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_what_an_environment_does_wrong_is_one_sentence(name):
+    faults, words = ENVIRONMENTS[name]
+    with pytest.raises(InputError, match=words):
+        play(Player(), Theirs(**faults), NAME, 1, 0)
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_what_a_map_does_wrong_is_one_sentence(name):
+    """One number had been taken for all coordinates, and a return was told of another state."""
+    faults, words = MAPS[name]
+    with pytest.raises(InputError, match=words):
+        play(Player(**faults), Theirs(), NAME, 1, 0)
+
+
+def test_an_episode_without_end_is_told(monkeypatch, caplog):
+    monkeypatch.setattr(ocp_torch.gym.rollout, "MOST_STEPS", 3)
+    with caplog.at_level(logging.WARNING):
+        assert play(Player(), Theirs(), NAME, 2, 0).lengths.tolist() == [3, 3]
+        assert caplog.text.count("no end within 3 steps") == 2
+        monkeypatch.setattr(ocp_torch.gym.rollout, "MOST_STEPS", 9)
+        assert play(Player(), Theirs(), NAME, 1, 0).lengths.tolist() == [4]
+        assert caplog.text.count("no end") == 2
