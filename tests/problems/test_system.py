@@ -273,6 +273,7 @@ SAYS = {
     "function": (lambda: begun(lambda s: 1.0 + 0.0 * s[:, 0]), r"% of start is outside the box"),
     "nowhere": (lambda: begun(lambda s: 0.0 * s[:, 0]), "is 0 at all states of the box"),
     "negative": (lambda: begun(lambda s: -1.0 + 0.0 * s[:, 0]), "is below 0, but must be at least 0"),
+    "no number": (lambda: begun(lambda s: math.nan * s[:, 0]), "density given as start is not finite"),
     "other": (lambda: begun(3), "start is 3, but must be ranges"),
 }
 

@@ -139,7 +139,8 @@ class _Scaled:
         beyond = lambda s: torch.where(chart.outside(s), function(s), 0.0)
         (inside, half), (lost, _) = (_mass(chart, f) for f in (self, beyond))
         if not inside > 0.0:
-            found = "below 0" if inside < 0.0 else "0 at all states of the box that were tried"
+            wrong = "below 0" if inside < 0.0 else "not finite"
+            found = "0 at all states of the box that were tried" if inside == 0.0 else wrong
             raise InputError(f"the density given as start is {found}, but must be at least 0, and above 0 somewhere.")
         if lost > OUTSIDE * inside:
             part = lost / (lost + inside)
