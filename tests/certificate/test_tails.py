@@ -11,6 +11,7 @@ import torch
 from ocp_torch.certificate import Run, Trained, certify_fields
 from ocp_torch.certificate.checks.tails import beyond_largest, rarity, sharpened, widened
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
+from ocp_torch.certificate.simulated import performance
 from ocp_torch.certificate.simulated.performance import simulate_performance
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.policies import NETWORK, zero_policy
@@ -196,6 +197,41 @@ def test_where_the_largest_fall_off_fast_it_widens_nothing(cost):
     for seed, count in product(range(20), (512, 4096)):
         x = torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
         assert beyond_largest(cost(x), torch.ones_like(x), 1.0) == 0.0
+
+
+class Singular(Problem):
+    """Nothing moves; in two coordinates a cost that rises as `r^-1.6` about the middle, where the starts are importance
+    samples of widely different weights."""
+
+    def __init__(self):
+        super().__init__(dim=2, control_dim=1, discount=1.0)
+
+    def state_cost(self, x):
+        return ((x - 0.5).norm(dim=1) + 1e-9) ** -1.6
+
+    def drift(self, x):
+        return torch.zeros_like(x)
+
+    def control_matrix(self, x):
+        return torch.ones(len(x), 2, 1, dtype=x.dtype)
+
+    def initial_density(self, x):
+        return torch.ones_like(x[:, 0])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_cost_without_a_variance_is_noticed_among_starts_of_different_weights(seed):
+    found = simulate_performance(Singular(), zero_policy(Singular()), 256, 8, seed, tolerance=1e-2).perf
+    assert found.bias > 0.01 * found.value
+
+
+def test_what_falls_off_slowly_counts_no_further_than_the_largest_rate(monkeypatch):
+    """No path costs more than 2, so that 3 / 2,048 of them are all that is left."""
+    monkeypatch.setattr(performance, "beyond_largest", lambda results, weights, size: 1.0)
+    problem = Singular()
+    problem.state_cost = lambda x: 1.0 + (TURN * x[:, 0]).cos()
+    found = simulate_performance(problem, zero_policy(problem), 256, 8, 0, tolerance=1e-3).perf
+    assert 0.5 * 3.0 / 2048 < found.bias < 5.0 * 3.0 / 2048
 
 
 def test_of_few_states_nothing_is_said():

@@ -67,17 +67,19 @@ def beyond_largest(values: Tensor, weights: Tensor, size: float) -> float:
     if count < LEAST_TAIL or not bool(away.isfinite().all()):
         return 0.0
     top = away.topk(count + 1)
-    least, largest, weight = float(top.values[-1]), float(top.values[0]), weights[top.indices[:-1]].double()
+    least, largest = float(top.values[-1]), float(top.values[0])
     if not least > 0.0:
         return 0.0
+    weight = weights[top.indices].double()
+    mass = weight.cumsum(0)[:-1]
     # Of a power these are independent and of one exponential distribution; a step is a single large one.
-    spacings = -top.values.log().diff() * weight.cumsum(0) * (count / weight.sum())
+    spacings = -top.values.log().diff() * mass / weight[1:]
     spread = float(spacings.mean())
     sure = 1.0 - 1.0 / math.sqrt(count)  # less the standard error
     if not min(sure * spread, float(spacings.median()) / math.log(2.0)) * HEAVY > 1.0:
         return 0.0
     power = max(1.0 / spread, SLOWEST)
-    above = float(weight.sum()) / len(away) * least * power / (power - 1.0)
+    above = float(mass[-1]) / len(away) * least * power / (power - 1.0)
     more = ROOM * above * (largest / least) ** (1.0 - power)
     return more if more > MATERIAL * abs(size) else 0.0
 
