@@ -112,6 +112,19 @@ def integral(samples: Samples, integrand: Tensor) -> float:
     return float(samples.mean(integrand))
 
 
+def starting_level(samples: Samples, values: Tensor) -> float:
+    """The mean of ``values`` ``(N,)`` by `mu0`, as its mass among the ``samples`` has it; 0 where they show none."""
+    mass = integral(samples, samples.mu0)
+    return integral(samples, values * samples.mu0) / mass if mass > 0.0 else 0.0
+
+
+def starting_mean(samples: Samples, values: Tensor, level: float) -> float:
+    """`E[V mu0]` for ``values`` ``(N,)`` of `V`, from a ``level`` that other samples say: `mu0` has mass 1, so it is
+    `c + E[(V - c) mu0]` for every `c`. With `c` near the answer neither how much of `mu0` these ``samples`` met matters, nor
+    a factor that is wrong by less than they show."""
+    return level + integral(samples, (values - level) * samples.mu0)
+
+
 def integrals(states: list[Tensor], values: list[Tensor], weights: list[Tensor] | None = None) -> list[float]:
     """The mean of each of ``values`` ``(N,)`` over its set of ``states`` ``(N, d)``, with the noise of plane waves taken off
     where the states are uniform; else ``weights`` ``(N,)`` are one over their density, and no wave explains a narrow peak."""

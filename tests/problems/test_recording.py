@@ -604,3 +604,20 @@ def test_a_violation_that_only_trained_samples_show_is_in_the_interval(tmp_path)
     found = certify_fields(problem, trained, constants, settings, Run("dataset", "dual")).lower["F_M"]
     assert found.value == 1.0
     assert found.interval(0.95)[0] <= 0.999
+
+
+@pytest.mark.parametrize("factor", [0.75, 1.4])
+def test_a_factor_that_a_start_density_has_too_much_moves_no_bound(tmp_path, factor):
+    """So few samples do not show that a narrow `mu0` integrates to 0.75 or 1.4: `F_M` at the exact `V` was so many times
+    `OPT`, beyond its interval."""
+    problem = zoo.build("manufactured 2-d mu0")
+    with np.load(record(tmp_path, problem, 6000)) as arrays:
+        plain = dict(arrays)
+    values = problem.exact_value(torch.from_numpy(plain["x"])).numpy()
+    away = plain["x"] - plain["x"][values.argmax()]
+    near = np.abs(away - away.round()).max(axis=1) < 0.1
+    np.savez(tmp_path / "narrow.npz", **{**plain, "mu0": factor * near / near.mean()})
+    data, true = Dataset(str(tmp_path / "narrow.npz")), float(values[near].mean())
+    low, high = certificate_of(data, problem, 0).lower["F_M"].interval(0.95)
+    assert low <= true <= high
+    assert high - low < 0.2 * true

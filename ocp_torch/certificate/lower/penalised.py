@@ -14,7 +14,7 @@ from ocp_torch.certificate.bound import LOWER, Bound, recorded
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.checks.tails import rarity, unmet
 from ocp_torch.certificate.context import Context
-from ocp_torch.certificate.estimate import Estimate, integral
+from ocp_torch.certificate.estimate import Estimate, starting_level, starting_mean
 from ocp_torch.certificate.lower.levels import best_level
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.lower.shifted import Shift
@@ -56,17 +56,22 @@ class RecordedDual(PenalisedDual):
         if context.value is None:
             return None
         sets, M, problem = recorded(context).sets, context.informed.M, recorded(context).problem
+        trained = Generator.of(problem, problem.training.take(slice(MOST_TRAINED)))
+        known = trained.chunked_jet(context.value)
+        level = starting_level(trained.data, known.value)
         seen = [(generator := Generator.of(problem, s), generator.chunked_jet(context.value)) for s in sets]
-        initial = [integral(g.data, V.value * g.data.mu0) for g, V in seen]
+        initial = [starting_mean(g.data, V.value, level) for g, V in seen]
         slacks = [g.hjb_slack(V) for g, V in seen]
         found = _penalised(initial, sets, slacks, [0.0] * len(sets), M)
-        # A violation that only samples which were trained on show is one that the others met by chance in no row.
-        violated = lambda samples, slack: float((samples.weight * slack.clamp_min(0.0)).max())
-        trained = Generator.of(problem, problem.training.take(slice(MOST_TRAINED)))
-        largest = violated(trained.data, trained.hjb_slack(trained.chunked_jet(context.value)))
-        if largest <= max(map(violated, sets, slacks)):
-            return found
-        return replace(found, bias=(found.bias or 0.0) + M * unmet(largest, sum(map(len, sets))))
+        # What only samples which were trained on show, a violation or a start, others met by chance in no row.
+        violated = lambda data, V, slack: float((data.weight * slack.clamp_min(0.0)).max())
+        started = lambda data, V, slack: float((data.weight * data.mu0 * (V.value - level).abs()).max())
+        missed = 0.0
+        for shown, counted in ((violated, M), (started, 1.0)):
+            largest = shown(trained.data, known, trained.hjb_slack(known))
+            if largest > max(shown(g.data, V, slack) for (g, V), slack in zip(seen, slacks, strict=True)):
+                missed += counted * unmet(largest, sum(map(len, sets)))
+        return replace(found, bias=(found.bias or 0.0) + missed) if missed else found
 
 
 def penalised(V: SampledValue, M: float) -> Estimate:

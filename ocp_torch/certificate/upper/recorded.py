@@ -14,7 +14,7 @@ from torch import Tensor
 from ocp_torch.certificate.bound import recorded
 from ocp_torch.certificate.checks.hidden import Hidden, hidden_divergence
 from ocp_torch.certificate.checks.tails import widened
-from ocp_torch.certificate.estimate import Estimate, integral
+from ocp_torch.certificate.estimate import Estimate, starting_level, starting_mean
 from ocp_torch.certificate.fields import in_float64
 from ocp_torch.certificate.upper.multiples import best_multiples, terms_on
 from ocp_torch.certificate.upper.penalised import PenalisedPrimal
@@ -108,7 +108,8 @@ def fit_recorded(context: "RecordedContext", kind: str) -> RecordedFit:
     deepest = max(0.0, *(float(-q.min()) for q in (*slacks, slack)))
     C_V = max(constants.C_V, MARGIN * (largest + deepest))
     excess = best_multiples(terms, lambda t, s: t.J(s, C_V))
-    J = [integral(t.samples, t.v * t.samples.mu0) + e for t, e in zip(terms, excess, strict=True)]
+    level = starting_level(seen, V.value)
+    J = [starting_mean(t.samples, t.v, level) + e for t, e in zip(terms, excess, strict=True)]
     highest = highest_occupation(torch.cat(densities), Samples.concatenate(loops), rho)
     estimate = widened(Estimate.of(J, controller=kind), [t.samples.weight * t.J(1.0, C_V) for t in terms])
     return RecordedFit(estimate, C_V, highest, hidden_divergence(list(fluxes)))
