@@ -26,6 +26,7 @@ from ocp_torch.files.reading import kind
 from ocp_torch.files.storage import read_safetensors, write_atomically
 from ocp_torch.problems.physical.measures import Measures
 from ocp_torch.problems.recorded.independence import dependence_notes, without_copies
+from ocp_torch.problems.recorded.neighbours import neighbour_notes
 from ocp_torch.problems.recorded.plausible import divergence_notes, samples_of
 from ocp_torch.problems.samples import Samples
 
@@ -94,7 +95,7 @@ def read(path: str | Path, wrap: bool = False) -> Recording:
         digest.update(np.ascontiguousarray(arrays[name]).data)
     measures, of_units = (None, ()) if units is None else _measures(path, units, *samples.B.shape[1:])
     kept = without_copies(samples)
-    notes = divergence_notes(path, kept) + dependence_notes(path, kept) + of_units
+    notes = divergence_notes(path, kept) + neighbour_notes(path, kept) + dependence_notes(path, kept) + of_units
     if copies := len(samples) - len(kept):
         notes = (f"{copies:,} samples of {path.name} are at the state of another, and are left out.", *notes)
     return Recording(kept, numbers, digest.hexdigest(), notes, measures)

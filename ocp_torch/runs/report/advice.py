@@ -34,6 +34,7 @@ ADVICE = {
     "is not finite; it is left out": "Nothing, where another controller is there; else train with a smaller `optimizer.lr`.",
     "held-out samples, taken for": "Nothing, if samples were drawn like that; else record the density that they have.",
     "is not the divergence of its": "Put the columns in one order and unit; smooth what jumps over a short distance.",
+    "has nothing to do with x": "Put the rows of all columns in one order; record more where it varies fast.",
     "as x has few digits": "Record states with more digits.",
     "no independent draws": "Record states that are drawn independently of each other, each of them once.",
     "at the state of another, and are left out": "Nothing: the others are used.",

@@ -1,0 +1,69 @@
+"""Whether recorded columns are functions of the state: then samples that are neighbours have values that are alike."""
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ocp_torch.problems.recorded.plausible import TESTED
+from ocp_torch.problems.samples import Samples
+
+COLUMNS = ("f", "a", "B", "mu0", "noise")
+# Samples whose neighbours are looked for, and so many at once; and how few that do not have the commonest value say nothing.
+ASKED, AT_ONCE, FEWEST = 2**10, 2**9, 64
+# Neighbours are near where waves of that many periods in a turn lose so much of the mean square of a difference. It is none
+# that a column loses, where that part of it is more than so many standard errors away.
+PERIODS, NEAR, PART, SURELY = 4, 0.5, 0.3, 3.0
+# Values that differ by less, relative to 1 + the largest, are the same: files may be in single precision.
+CONSTANT = 1e-5
+
+
+def neighbour_notes(path: Path, samples: Samples) -> tuple[str, ...]:
+    """What a user should be told of columns in ``path`` in which neighbours are no more alike than any two ``samples``."""
+    return tuple(
+        f"{name} of {path.name} has nothing to do with x by these samples, as it differs between neighbours as much as "
+        "between any two: its rows are in another order, or it varies faster than they show; bounds take it as it is."
+        for name in unrelated(samples)
+    )
+
+
+def unrelated(samples: Samples) -> list[str]:
+    """Names of such columns, with the entry where only some of them are."""
+    samples = samples.take(slice(None, None, max(1, len(samples) // TESTED)))
+    turns = 2.0 * torch.pi * samples.x
+    circles = lambda periods: torch.cat([(periods * turns).cos(), (periods * turns).sin()], dim=1)
+    asked = torch.arange(0, len(samples), max(1, len(samples) // ASKED))
+    nearest = torch.cat([_nearest(circles(1), rows) for rows in asked.split(AT_ONCE)])
+    waves = circles(PERIODS)
+    left = (waves[asked] - waves[nearest]).square().mean(dim=0)
+    if bool((left > (1.0 - NEAR) * 2.0 * waves.var(dim=0)).any()):
+        return []
+    found = list[str]()
+    for name in COLUMNS:
+        column = getattr(samples, name)
+        entries = [] if column is None else list(column.reshape(len(samples), -1).T)
+        wrong = [k for k, values in enumerate(entries) if _strange(values, asked, nearest)]
+        which = "" if len(wrong) == len(entries) else " at " + ", ".join(map(str, wrong))
+        found += [name + which] if wrong else []
+    return found
+
+
+def _nearest(points: Tensor, rows: Tensor) -> Tensor:
+    """The row of ``points`` ``(N, k)`` that is nearest to each of ``rows`` ``(K,)`` and another."""
+    apart = torch.cdist(points[rows], points)
+    apart[torch.arange(len(rows)), rows] = torch.inf
+    return apart.argmin(dim=1)
+
+
+def _strange(values: Tensor, asked: Tensor, nearest: Tensor) -> bool:
+    """Whether ``values`` ``(N,)``, by their ranks, differ between neighbours as much as between any two samples."""
+    if float(values.max() - values.min()) <= CONSTANT * (1.0 + float(values.abs().max())):
+        return False
+    _, place, counts = values.unique(return_inverse=True, return_counts=True)
+    ranks = (counts.cumsum(0) - 0.5 * counts.double())[place] / len(values)
+    here = ranks[asked]
+    if int((here != here.mode().values).sum()) < FEWEST:
+        return False
+    any_two, beside = (here - ranks[nearest.roll(len(nearest) // 2)]).square(), (here - ranks[nearest]).square()
+    lost = any_two - beside
+    return float(lost.mean()) + SURELY * float(lost.std()) / len(lost) ** 0.5 < PART * float(any_two.mean())
