@@ -3,8 +3,11 @@
 import pytest
 import torch
 
+from ocp_torch.certificate.lower.tightened import hidden_peaks, tightened
 from ocp_torch.certificate.lower.worst import WorstStates
+from ocp_torch.fields import PeriodicMLP
 from ocp_torch.fields.fields import VALUE, Fields
+from ocp_torch.maths.ahead import Ahead
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.objectives.levelled import LevelledDual
 from ocp_torch.objectives.objective import Phase
@@ -12,7 +15,7 @@ from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from support import zoo
-from support.hidden_peak import HILLS, Still, hidden_peak, top
+from support.hidden_peak import HILLS, PLACE, Still, hidden_peak, top
 
 NEW = 64
 
@@ -117,3 +120,28 @@ def test_peaks_in_hollows_are_sought_now_and_then(every, monkeypatch):
     assert largest[0] < 1.001 * HILLS
     assert (max(largest) > 0.99 * top()) == (every == 2)
     assert (max(largest) < 1.001 * HILLS) == (every == 1000)
+
+
+class Peaked(torch.nn.Module):
+    """The cost and the peak, as a network is called."""
+
+    def forward(self, x):
+        return Still().state_cost(x) + hidden_peak(x)
+
+
+def test_peaks_that_training_has_not_met_are_sought_before_it_ends_and_are_among_the_worst_then(monkeypatch):
+    problem, place = Still(), torch.tensor([PLACE])
+    assert bool(((hidden_peaks(problem, Peaked(), place + 0.3, 512) - place).abs() < 1e-3).all(dim=1).any())
+    assert len(hidden_peaks(problem, Peaked(), place, 512)) == 0  # it is known
+
+    value = PeriodicMLP(2, width=8, depth=1)
+    sought, found = [], torch.tensor([[0.125, 0.875]], dtype=torch.float64)
+    remembered = lambda *how: sought.append(how[-1]) or found
+    monkeypatch.setattr(f"{tightened.__module__}.hidden_peaks", remembered)
+    monkeypatch.setattr(f"{tightened.__module__}.PLAN", (40.0, 14, 1e-3))
+    seen = []
+    taken = WorstStates.remember
+    monkeypatch.setattr(WorstStates, "remember", lambda draw, x: (taken(draw, x), seen.append(draw.worst.x[-1])))
+    Ahead(tightened(problem, value, 0)).answer()
+    assert sought == [2048]
+    assert torch.equal(seen[-1], found[0].float())

@@ -14,10 +14,12 @@ import copy
 from collections.abc import Generator
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
+from ocp_torch.certificate.lower.slack import STARTS, slack_function, steep_peaks
 from ocp_torch.certificate.lower.worst import WorstStates
 from ocp_torch.fields.fields import VALUE, Fields, cost_unit
+from ocp_torch.fields.rounded import rounded
 from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import SobolSampler
@@ -38,6 +40,10 @@ PLAN, NOISY_PLAN = (3000.0, 2000, 5e-3), (3000.0, 700, 2e-3)
 # 2,100 steps and to 1.2986 by 4,500, with this, at 5e-3, to 1.2985 by 2,000 (mean over the part 1 / 3000), as with (.8, .95).
 BETAS = (0.9, 0.95)
 BATCH = 2048  # new states of a step, at most
+# When that part of the steps is left peaks are sought once as the bound will seek them, from as many starts: what is found is
+# mended in the steps that are left, at rates that are low already. Of three unicycles with noise one had kept a peak that
+# took 2.1 % off its bound (1.2820; 1.3100 with this, in 2 % more time); another seed had 1.3086, and 1.3084 with it.
+LAST, ASCENTS = 7, 32
 
 
 def plan_of(problem: Problem, steps: int | None) -> tuple[float, int, float]:
@@ -72,10 +78,22 @@ def tightened(
     generator = torch.Generator().manual_seed(derive_seed(seed, Branch.TIGHTENING, 0))
     draw = WorstStates(problem, fields.value, new, generator)
     try:
-        for _ in range(count):
+        for step in range(count):
+            if step == count - count // LAST:
+                starts = STARTS * ASCENTS * states // BATCH
+                draw.remember(hidden_peaks(problem, average.module.value, draw.worst.x, starts))
             with torch.enable_grad():
                 advance(stepper, average, draw, phase)
             yield
     except NonFiniteError:
         return None
     return Subsolution(average.module.value, draw.worst.x).requires_grad_(False).double()
+
+
+def hidden_peaks(problem: Problem, network: nn.Module, worst: Tensor, starts: int) -> Tensor:
+    """Where the slack of ``network`` is higher than at the ``worst`` states that are known, ``(K, d)``, by so many ``starts``
+    in steep places."""
+    W = copy.deepcopy(network).double()
+    slack, rough = slack_function(problem, W), slack_function(problem, rounded(W))
+    known = float(slack(worst.double()).max()) if len(worst) else 0.0
+    return steep_peaks(slack, rough, problem.dim, starts, known, cost_unit(problem)).x

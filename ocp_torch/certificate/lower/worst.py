@@ -74,8 +74,11 @@ class WorstStates:
     def _seek(self, count: int) -> None:
         """Peaks of the slack in steep places of ``count`` states are among the worst from now on."""
         x = torch.rand(count, self.problem.dim, generator=self.generator).to(self.worst.x)
-        peaks, _ = peaks_in_reach(slack_function(self.problem, self.value), x, max(1, int(STARTS * count)))
-        found = self.problem.samples(peaks, divergences=False)
+        self.remember(peaks_in_reach(slack_function(self.problem, self.value), x, max(1, int(STARTS * count)))[0])
+
+    def remember(self, peaks: Tensor) -> None:
+        """The states ``peaks`` ``(K, d)`` are among the worst from now on."""
+        found = self.problem.samples(peaks.to(self.worst.x), divergences=False)
         self.worst = Samples.concatenate([self.worst, found])
         self.ages = torch.cat([self.ages, torch.zeros_like(found.weight)])
 
