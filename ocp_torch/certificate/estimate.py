@@ -26,6 +26,8 @@ from ocp_torch.problems.starts import evaluation_distribution
 CONFIDENCE = 0.95
 # Waves in a fit, and states evaluated at once.
 WAVES, CHUNK = 96, 8192
+# Below so many recorded starts that carry a mean these say nothing of it.
+FEWEST_STARTS = 16
 
 
 @cache
@@ -113,9 +115,10 @@ def integral(samples: Samples, integrand: Tensor) -> float:
 
 
 def starting_level(samples: Samples, values: Tensor) -> float:
-    """The mean of ``values`` ``(N,)`` by `mu0`, as its mass among the ``samples`` has it; 0 where they show none."""
-    mass = integral(samples, samples.mu0)
-    return integral(samples, values * samples.mu0) / mass if mass > 0.0 else 0.0
+    """The mean of ``values`` ``(N,)`` by `mu0`, as its mass among the ``samples`` has it; 0 where few of them have any."""
+    shares = samples.weight * samples.mu0
+    behind = float(shares.sum()) ** 2 / max(float(shares.square().sum()), 1e-300)
+    return float((shares * values).sum() / shares.sum()) if behind >= FEWEST_STARTS else 0.0
 
 
 def starting_mean(samples: Samples, values: Tensor, level: float) -> float:

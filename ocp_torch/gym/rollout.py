@@ -62,13 +62,14 @@ class Agent:
             raise InputError(f"from_observation gave {state} for {self.name}, but must give {d} finite coordinates.")
         step = self.step if self.controller.kind == TRAJECTORIES else None
         control = (self.controller(state[None]) if step is None else self.controller.held(state[None], step))[0]
-        action = asked("to_action", lambda: np.asarray(self._action(control), dtype=self.space.dtype))
-        if action.shape != self.space.shape:
+        given = asked("to_action", lambda: np.asarray(self._action(control), dtype=np.float64))
+        if given.shape != self.space.shape:
             raise InputError(
-                f"to_action gave shape {action.shape} for {self.name}, whose actions have shape {self.space.shape}."
+                f"to_action gave shape {given.shape} for {self.name}, whose actions have shape {self.space.shape}."
             )
-        if not np.isfinite(action).all():
-            raise InputError(f"to_action gave {action} for {self.name}, but must give finite numbers.")
+        if not np.isfinite(given).all():
+            raise InputError(f"to_action gave {given} for {self.name}, but must give finite numbers.")
+        action = given.astype(self.space.dtype)
         return np.clip(action, self.space.low, self.space.high) if hasattr(self.space, "low") else action
 
 
@@ -142,7 +143,7 @@ def made(name: str, **options):
 def play(controller: Controller, env, name: str, episodes: int, seed: int, frames: list | None = None) -> Rollouts:
     """``episodes`` of them, seeded ``seed``, ``seed + 1``, ...; pictures of all states are put into ``frames``."""
     agent = Agent(controller, env, name)
-    returns, lengths = [], []
+    returns, lengths, endless = [], [], 0
     for k in range(episodes):
         observation = started(env, name, seed + k)
         total, count, over = 0.0, 0, False
@@ -151,10 +152,13 @@ def play(controller: Controller, env, name: str, episodes: int, seed: int, frame
                 frames.append(_picture(env, name))
             observation, reward, over = stepped(env, name, agent.act(observation))
             total, count = total + reward, count + 1
-        if not over:
-            log.warning("warning: %s, episode %d: no end within %s steps, and it is cut there.", name, k, f"{count:,}")
+        endless += not over
         returns.append(total)
         lengths.append(count)
+    if endless:
+        log.warning(
+            "warning: %s: %d of %d episodes had no end within %s steps.", name, endless, episodes, f"{MOST_STEPS:,}"
+        )
     return Rollouts(np.array(returns), np.array(lengths))
 
 

@@ -32,16 +32,16 @@ def onnx_controller(path: Path, problem: Problem) -> Callable[[Tensor], Tensor]:
         raise InputError(f"{path} is not a model that onnxruntime can run: {error}.") from None
     given, precision, output = *_input(session, path, problem.dim), _output(session, path)
 
-    def on_torus(x: Tensor) -> Tensor:
+    def model(x: Tensor) -> Tensor:
         return torch.from_numpy(session.run([output], {given: x.to(precision).numpy()})[0])
 
     if not _physical(session):
-        return on_torus
+        return model
     if not isinstance(problem, System):
         raise InputError(
             f"{path} is in physical units, which the problem does not have; export with coordinates=torus."
         )
-    return lambda x: problem.to_controls(on_torus(problem.from_torus(x)))
+    return lambda x: problem.to_controls(model(problem.from_torus(x)))
 
 
 def _input(session: Any, path: Path, dim: int) -> tuple[str, torch.dtype]:
@@ -64,12 +64,14 @@ def _input(session: Any, path: Path, dim: int) -> tuple[str, torch.dtype]:
 
 def _output(session: Any, path: Path) -> str:
     """The name of the control among the outputs."""
-    names = [output.name for output in session.get_outputs()]
-    if len(names) > 1 and CONTROL not in names:
-        raise InputError(
-            f"{path} has the outputs {_names(session.get_outputs())}; which is the control? Call it {CONTROL}."
-        )
-    return CONTROL if CONTROL in names else names[0]
+    outputs = session.get_outputs()
+    called = [output for output in outputs if output.name == CONTROL]
+    if len(outputs) > 1 and not called:
+        raise InputError(f"{path} has the outputs {_names(outputs)}; which is the control? Call it {CONTROL}.")
+    entry = (called or outputs)[0]
+    if entry.type not in PRECISIONS:
+        raise InputError(f"{path} gives {entry.type}, but must give {' or '.join(PRECISIONS)}.")
+    return entry.name
 
 
 def _names(entries: Any) -> str:

@@ -131,12 +131,12 @@ class Peaked(torch.nn.Module):
 
 def test_peaks_that_training_has_not_met_are_sought_before_it_ends_and_are_among_the_worst_then(monkeypatch):
     problem, place = Still(), torch.tensor([PLACE])
-    assert bool(((hidden_peaks(problem, Peaked(), place + 0.3, 512) - place).abs() < 1e-3).all(dim=1).any())
-    assert len(hidden_peaks(problem, Peaked(), place, 512)) == 0  # it is known
+    peaks = hidden_peaks(problem, Peaked(), place + 0.3, 512, fixed_generator(1))
+    assert bool(((peaks - place).abs() < 1e-3).all(dim=1).any())
 
     value = PeriodicMLP(2, width=8, depth=1)
     sought, found = [], torch.tensor([[0.125, 0.875]], dtype=torch.float64)
-    remembered = lambda *how: sought.append(how[-1]) or found
+    remembered = lambda *how: sought.append(how[3]) or found
     monkeypatch.setattr(f"{tightened.__module__}.hidden_peaks", remembered)
     monkeypatch.setattr(f"{tightened.__module__}.PLAN", (40.0, 14, 1e-3))
     seen = []
@@ -145,3 +145,18 @@ def test_peaks_that_training_has_not_met_are_sought_before_it_ends_and_are_among
     Ahead(tightened(problem, value, 0)).answer()
     assert sought == [2048]
     assert torch.equal(seen[-1], found[0].float())
+
+
+def test_where_no_peak_is_found_no_function_is_asked_for_no_state():
+    class Careful(Still):
+        def state_cost(self, x):
+            assert len(x)
+            return super().state_cost(x)
+
+    problem = Careful()
+    given = batches(problem, 2)
+    draw = WorstStates(problem, zoo.rough_network(2, seed=3), iter(given).__next__, fixed_generator())
+    draw(phase_of(4.0))
+    before = draw.worst
+    draw.remember(torch.zeros(0, 2))
+    assert draw.worst is before

@@ -5,6 +5,7 @@ import contextlib
 import dataclasses
 import io
 import json
+import math
 import pickle
 import zipfile
 
@@ -21,6 +22,7 @@ from ocp_torch.control.controller import load_controller
 from ocp_torch.control.policies import NETWORK, trained_policies
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
+from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.objectives import Dual, primal, saddle
 from ocp_torch.problems import Circle, Dataset, Manufactured, PhaseNeurons, Unicycle
 from ocp_torch.problems.closed_loop import ClosedLoop
@@ -623,6 +625,19 @@ def test_a_factor_that_a_start_density_has_too_much_moves_no_bound(tmp_path, fac
     assert high - low < 0.2 * true
 
 
+def test_a_single_start_among_the_samples_is_no_level_without_scatter(tmp_path):
+    """Of mass 1 at one row: where that is trained on, the held-out ones show none, and the interval was of width 0."""
+    problem = zoo.build("manufactured 2-d mu0")
+    with np.load(record(tmp_path, problem, 6000)) as arrays:
+        plain = dict(arrays)
+    for row in range(3):
+        mu0 = np.zeros(6000)
+        mu0[997 * row] = 6000.0
+        np.savez(tmp_path / "one.npz", **{**plain, "mu0": mu0})
+        low, high = certificate_of(Dataset(str(tmp_path / "one.npz")), problem, 0).lower["F_M"].interval(0.95)
+        assert low <= 0.0 or high - low > 0.1
+
+
 @pytest.mark.parametrize("name", ["f", "a", "B", "mu0"])
 def test_a_column_whose_rows_are_in_another_order_is_told(tmp_path, name):
     """The mean of `V` by a start density in another order is that over all states: `F_M` was above `OPT` without a word."""
@@ -657,4 +672,15 @@ def test_functions_of_the_state_are_not_taken_for_rows_in_another_order(tmp_path
         mu0 = near / near.mean()
         np.savez(tmp_path / "data.npz", x=x, f=f, a=a, B=B.astype(np.float32), mu0=mu0, discount=1.0)
         told = Dataset(str(tmp_path / "data.npz"), held_out=0.3).recording.notes
+        assert not [note for note in told if "nothing to do with x" in note]
+
+
+@pytest.mark.parametrize("order", ["Sobol", "lattice"])
+def test_evenly_spread_states_in_their_order_are_not_taken_for_rows_in_another(tmp_path, order):
+    axis = torch.arange(64, dtype=torch.float64) / 64
+    x = torch.cartesian_prod(axis, axis) if order == "lattice" else scrambled_sobol(4096, 2, 0, torch.float64)
+    for k in range(2):
+        f = 1.0 + (2.0 * math.pi * x[:, k]).cos()
+        np.savez(tmp_path / "data.npz", x=x, f=f, a=0.0 * x, B=torch.ones(4096, 2, 1), discount=1.0)
+        told = Dataset(str(tmp_path / "data.npz")).recording.notes
         assert not [note for note in told if "nothing to do with x" in note]

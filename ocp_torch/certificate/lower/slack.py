@@ -84,12 +84,21 @@ class Peaks(NamedTuple):
     ascents: int
 
 
-def steep_peaks(slack: Field, rough: Field, dim: int, starts: int, known: float, unit: float) -> Peaks:
+def steep_peaks(
+    slack: Field,
+    rough: Field,
+    dim: int,
+    starts: int,
+    known: float,
+    unit: float,
+    generator: torch.Generator | None = None,
+) -> Peaks:
     """Where ascents of ``slack`` end from the ``starts`` steepest of random states, as far as more than ``known`` may be
     within their reach, and from others, until `FRUITLESS` searches in a row have found nothing higher. What is `NEGLIGIBLE`
-    beside ``unit`` is not sought. ``rough`` is ``slack`` in single precision: that leads near the tops, in half the time."""
+    beside ``unit`` is not sought. ``rough`` is ``slack`` in single precision: that leads near the tops, in half the time.
+    Bounds draw the same states each time; who trains for them gives another ``generator``."""
     found: list[Tensor] = []
-    generator, fruitless = fixed_generator(), 0
+    generator, fruitless = generator or fixed_generator(), 0
     while fruitless < FRUITLESS and len(found) < SEARCHES:
         x = torch.rand(STEEPEST * starts, dim, generator=generator, dtype=torch.float64)
         enough = known + NEGLIGIBLE * abs(unit)

@@ -40,8 +40,8 @@ PLAN, NOISY_PLAN = (3000.0, 2000, 5e-3), (3000.0, 700, 2e-3)
 # 2,100 steps and to 1.2986 by 4,500, with this, at 5e-3, to 1.2985 by 2,000 (mean over the part 1 / 3000), as with (.8, .95).
 BETAS = (0.9, 0.95)
 BATCH = 2048  # new states of a step, at most
-# When that part of the steps is left peaks are sought once as the bound will seek them, from as many starts: what is found is
-# mended in the steps that are left, at rates that are low already. Of three unicycles with noise one had kept a peak that
+# When that part of the steps is left peaks are sought as long as the bound will seek them, from other states: what is found
+# is mended in the steps that are left, at rates that are low already. Of three unicycles with noise one had kept a peak that
 # took 2.1 % off its bound (1.2820; 1.3100 with this, in 2 % more time); another seed had 1.3086, and 1.3084 with it.
 LAST, ASCENTS = 7, 32
 
@@ -81,7 +81,7 @@ def tightened(
         for step in range(count):
             if step == count - count // LAST:
                 starts = STARTS * ASCENTS * states // BATCH
-                draw.remember(hidden_peaks(problem, average.module.value, draw.worst.x, starts))
+                draw.remember(hidden_peaks(problem, average.module.value, draw.worst.x, starts, generator))
             with torch.enable_grad():
                 advance(stepper, average, draw, phase)
             yield
@@ -90,10 +90,13 @@ def tightened(
     return Subsolution(average.module.value, draw.worst.x).requires_grad_(False).double()
 
 
-def hidden_peaks(problem: Problem, network: nn.Module, worst: Tensor, starts: int) -> Tensor:
+@torch.no_grad()
+def hidden_peaks(
+    problem: Problem, network: nn.Module, worst: Tensor, starts: int, generator: torch.Generator
+) -> Tensor:
     """Where the slack of ``network`` is higher than at the ``worst`` states that are known, ``(K, d)``, by so many ``starts``
     in steep places."""
     W = copy.deepcopy(network).double()
     slack, rough = slack_function(problem, W), slack_function(problem, rounded(W))
     known = float(slack(worst.double()).max()) if len(worst) else 0.0
-    return steep_peaks(slack, rough, problem.dim, starts, known, cost_unit(problem)).x
+    return steep_peaks(slack, rough, problem.dim, starts, known, cost_unit(problem), generator).x

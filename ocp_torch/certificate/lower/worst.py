@@ -78,6 +78,8 @@ class WorstStates:
 
     def remember(self, peaks: Tensor) -> None:
         """The states ``peaks`` ``(K, d)`` are among the worst from now on."""
+        if not len(peaks):  # nobody's functions are asked for no state
+            return
         found = self.problem.samples(peaks.to(self.worst.x), divergences=False)
         self.worst = Samples.concatenate([self.worst, found])
         self.ages = torch.cat([self.ages, torch.zeros_like(found.weight)])

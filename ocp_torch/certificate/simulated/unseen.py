@@ -36,9 +36,9 @@ def unseen_cost(problem: Problem, x0: Tensor, mass: Tensor, seed: int) -> float:
 
 
 @torch.no_grad()
-def largest_rate_of(loop: Loop) -> float:
-    """The largest rate of ``loop`` at evenly spread states, whatever its sign."""
-    x = scrambled_sobol(COMPARED, loop.problem.dim, 0, torch.float64)
+def largest_rate_of(loop: Loop, states: int = COMPARED) -> float:
+    """The largest rate of ``loop`` at so many evenly spread ``states``, whatever its sign."""
+    x = scrambled_sobol(states, loop.problem.dim, 0, torch.float64)
     return float(batched(lambda at: loop(loop.start(at))[1].reshape(len(at), -1)[:, 0].abs(), x).max())
 
 

@@ -111,7 +111,10 @@ def fit_recorded(context: "RecordedContext", kind: str) -> RecordedFit:
     level = starting_level(seen, V.value)
     J = [starting_mean(t.samples, t.v, level) + e for t, e in zip(terms, excess, strict=True)]
     highest = highest_occupation(torch.cat(densities), Samples.concatenate(loops), rho)
-    estimate = widened(Estimate.of(J, controller=kind), [t.samples.weight * t.J(1.0, C_V) for t in terms])
+    estimate = widened(
+        Estimate.of(J, controller=kind),
+        [t.samples.weight * (t.J(1.0, C_V) + (t.v - level) * t.samples.mu0) for t in terms],
+    )
     return RecordedFit(estimate, C_V, highest, hidden_divergence(list(fluxes)))
 
 
