@@ -234,6 +234,12 @@ def test_what_falls_off_slowly_counts_no_further_than_the_largest_rate(monkeypat
     assert 0.5 * 3.0 / 2048 < found.bias < 5.0 * 3.0 / 2048
 
 
+def test_of_rates_without_a_largest_one_all_counts(monkeypatch):
+    monkeypatch.setattr(performance, "beyond_largest", lambda results, weights, size: 100.0)
+    found = simulate_performance(Singular(), zero_policy(Singular()), 256, 8, 0, tolerance=1e-2).perf
+    assert found.bias >= 100.0
+
+
 def test_of_few_states_nothing_is_said():
     x = torch.linspace(0.01, 1.0, 200, dtype=torch.float64)
     assert beyond_largest(x**-0.9, torch.ones_like(x), 1.0) == 0.0

@@ -8,7 +8,7 @@ from torch import Tensor
 from ocp_torch.certificate.checks.tails import unmet
 from ocp_torch.certificate.simulated.loops import Loop
 from ocp_torch.maths.sampling import scrambled_sobol
-from ocp_torch.maths.supremum import batched
+from ocp_torch.maths.supremum import batched, supremum
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import initial_points
 
@@ -36,10 +36,11 @@ def unseen_cost(problem: Problem, x0: Tensor, mass: Tensor, seed: int) -> float:
 
 
 @torch.no_grad()
-def largest_rate_of(loop: Loop, states: int = COMPARED) -> float:
-    """The largest rate of ``loop`` at so many evenly spread ``states``, whatever its sign."""
-    x = scrambled_sobol(states, loop.problem.dim, 0, torch.float64)
-    return float(batched(lambda at: loop(loop.start(at))[1].reshape(len(at), -1)[:, 0].abs(), x).max())
+def largest_rate_of(loop: Loop, ascents: int = 0) -> float:
+    """The largest rate of ``loop``, whatever its sign, at evenly spread states, and on so many ``ascents`` from these."""
+    x = scrambled_sobol(COMPARED, loop.problem.dim, 0, torch.float64)
+    rate = lambda at: loop(loop.start(at))[1].reshape(len(at), -1)[:, 0].abs()
+    return supremum(rate, x, ascents, differentiable=False).value if ascents else float(batched(rate, x).max())
 
 
 def unmet_cost(loop: Loop, met: float, draws: int, size: float) -> float:
