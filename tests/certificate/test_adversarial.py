@@ -10,7 +10,7 @@ import torch
 
 from ocp_torch.certificate import StageSettings
 from ocp_torch.certificate.report import table
-from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.simulated.performance import Simulation
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.problems import Dataset
 from ocp_torch.problems.constants import resolve_constants
@@ -176,7 +176,7 @@ def test_a_controller_that_slides_on_a_kink_of_V_costs_what_it_costs(tilt, horiz
     x = (torch.arange(2**14, dtype=torch.float64).unsqueeze(-1) + 0.5) / 2**14
     initial = [float(V(x).mean())] * 8
     policy = ValuePolicy(problem, V)
-    perf = lambda value, initial: simulate_performance(problem, policy, 16, 8, 0, value, initial, horizon, 1e-2).perf
+    perf = lambda value, initial: Simulation(problem, policy, 16, 8, 0, value, initial, horizon, 1e-2).run().perf
     (low, high), (least, most) = perf(V, initial).interval(0.999), perf(None, None).interval(0.999)
     assert high >= problem.truth[0]
     assert low <= most

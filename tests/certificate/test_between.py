@@ -8,7 +8,7 @@ import torch
 
 from ocp_torch import certify
 from ocp_torch.certificate.simulated.between import stopped
-from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.simulated.performance import Simulation
 from ocp_torch.control.policies import ValuePolicy, zero_policy
 from ocp_torch.problems import Circle
 from ocp_torch.problems.problem import Problem
@@ -48,7 +48,7 @@ def cost_of_staying(paid: float = 0.0) -> float:
 
 
 def simulated(problem, policy, trajectories=64, **how):
-    return simulate_performance(problem, policy, trajectories, 4, seed=0, tolerance=5e-3, **how)
+    return Simulation(problem, policy, trajectories, 4, seed=0, tolerance=5e-3, **how).run()
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
-from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.simulated.performance import Simulation
 from ocp_torch.certificate.upper import policy_evaluation
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.certificate.upper.multiples import Terms, best_multiples, terms_on
@@ -94,7 +94,7 @@ def test_the_bounds_of_a_poor_controller_are_above_its_own_performance(problem):
     log_mu = lambda x: problem.exact_occupation(x).log() + 0.3 * bump(x)
     constants = closed_loop_bounds(loop, value, log_mu, [Samples.of(loop, s.x) for s in sets], 8, "value")
     initial = [float((value(s.x) * s.mu0).mean()) for s in sets]
-    perf = simulate_performance(problem, policy, 64, 8, 0, value=value, initial=initial, tolerance=1e-3).perf
+    perf = Simulation(problem, policy, 64, 8, 0, value=value, initial=initial, tolerance=1e-3).run().perf
     assert perf.value - 3.0 * perf.se > problem.exact_optimum
     for bound in (constants.lagrangian, constants.J):
         assert bound.value >= perf.value - perf.bias - 4.0 * (perf.se + bound.se)

@@ -9,7 +9,7 @@ from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.simulated import candidates, held
 from ocp_torch.certificate.simulated.candidates import Candidate
 from ocp_torch.certificate.simulated.outside import time_outside
-from ocp_torch.certificate.simulated.performance import simulate_performance, starting_points
+from ocp_torch.certificate.simulated.performance import Simulation, starting_points
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.pace import Pace
 from ocp_torch.maths.runge_kutta import MAX_DOUBLINGS
@@ -48,7 +48,7 @@ def held_cost(problem: Circle, step: float) -> float:
 def test_on_the_circle_it_costs_what_sampled_feedback_costs(step, variate):
     problem = Circle()
     with_V = (problem.exact_value, [problem.exact_optimum] * 8) if variate else (None, None)
-    perf = simulate_performance(problem, optimal_held(problem, step), 64, 8, 0, *with_V).perf
+    perf = Simulation(problem, optimal_held(problem, step), 64, 8, 0, *with_V).run().perf
     exact = held_cost(problem, step)
     assert perf.interval(0.999)[0] < exact < perf.interval(0.999)[1]
     assert perf.half_width(0.95) < (2e-3 if variate else 0.03) * exact
@@ -60,7 +60,7 @@ def test_what_is_thinned_out_is_right_in_the_mean(monkeypatch):
     """On the pendulum, against the same starts followed to the end, and in the mean over seeds."""
     problem = Pendulum(control_limit=1.0)
     policy = Held(problem, 0.1, lambda x: (2.0 * math.pi * x[:, :1]).sin().sign(), 2)
-    run = lambda seed: simulate_performance(problem, policy, 64, 4, seed, tolerance=1e-3).perf
+    run = lambda seed: Simulation(problem, policy, 64, 4, seed, tolerance=1e-3).run().perf
     thinned = [run(seed) for seed in range(6)]
     monkeypatch.setattr(held, "FEWEST", 64)
     whole = run(0)
@@ -76,10 +76,10 @@ def test_a_good_value_takes_most_of_the_error_and_a_bad_one_none_of_the_truth():
     policy, exact = optimal_held(problem, 0.1), held_cost(problem, 0.1)
     bad = lambda x: (6.0 * math.pi * x).cos().sum(dim=-1)
     plain, good = (
-        simulate_performance(problem, policy, 32, 8, 1, V, initial).perf
+        Simulation(problem, policy, 32, 8, 1, V, initial).run().perf
         for V, initial in ((None, None), (problem.exact_value, [problem.exact_optimum] * 8))
     )
-    wild = simulate_performance(problem, policy, 32, 8, 1, bad, [0.0] * 8).perf
+    wild = Simulation(problem, policy, 32, 8, 1, bad, [0.0] * 8).run().perf
     assert good.se < 0.2 * plain.se
     for perf in (plain, good, wild):
         assert perf.interval(0.999)[0] < exact < perf.interval(0.999)[1]
@@ -99,7 +99,7 @@ class Stream(Problem):
 def test_steps_within_a_hold_are_halved_where_they_are_too_long():
     problem = Stream(dim=1, discount=2.0)
     policies = [Held(problem, 0.2, lambda x: (2.0 * math.pi * x).cos(), substeps) for substeps in (1, 16)]
-    long, short = (simulate_performance(problem, policy, 32, 4, 0, tolerance=1e-5).perf for policy in policies)
+    long, short = (Simulation(problem, policy, 32, 4, 0, tolerance=1e-5).run().perf for policy in policies)
     assert abs(long.value - short.value) < long.bias + short.bias
     assert long.bias < 0.15 * long.se < 2e-3 * long.value
 
@@ -109,9 +109,9 @@ def test_steps_within_a_hold_are_halved_where_they_are_too_long():
 def test_the_shorter_it_is_held_the_nearer_it_is_to_feedback(noise):
     problem = Circle(noise=noise)
     control = lambda x: -0.5 * (2.0 * math.pi * x).sin()
-    feedback = simulate_performance(problem, control, 128, 8, 0, tolerance=1e-3).perf
+    feedback = Simulation(problem, control, 128, 8, 0, tolerance=1e-3).run().perf
     policies = [Held(problem, step, control) for step in (0.4, 0.02)]
-    far, near = (simulate_performance(problem, policy, 128, 8, 0, tolerance=1e-3).perf for policy in policies)
+    far, near = (Simulation(problem, policy, 128, 8, 0, tolerance=1e-3).run().perf for policy in policies)
     assert abs(near.value - feedback.value) < 3.0 * math.hypot(near.se, feedback.se) + 0.02 * feedback.value
     assert noise or abs(near.value - feedback.value) < 0.2 * abs(far.value - feedback.value)
 
@@ -119,7 +119,7 @@ def test_the_shorter_it_is_held_the_nearer_it_is_to_feedback(noise):
 def test_with_noise_it_is_what_a_plain_simulation_gives():
     problem, step, finer = Circle(noise=0.05), 0.25, 50
     policy = Held(problem, step, lambda x: -0.5 * (2.0 * math.pi * x).sin())
-    perf = simulate_performance(problem, policy, 256, 8, 0, tolerance=1e-3).perf
+    perf = Simulation(problem, policy, 256, 8, 0, tolerance=1e-3).run().perf
     x, _ = starting_points(problem, 4096, 2, seed=5)
     sigma, h, cost = problem.noise(x[:1])[0, 0, 0], step / finer, 0.0
     generator = torch.Generator().manual_seed(0)
@@ -143,9 +143,9 @@ def test_beside_a_held_control_a_worse_controller_stays_rough_and_what_is_rememb
         *_, doublings, audited = rest
         assert audited
         efforts.append((policy, trajectories, doublings))
-        return simulate_performance(problem, policy, trajectories, *rest)
+        return Simulation(problem, policy, trajectories, *rest)
 
-    monkeypatch.setattr(candidates, "simulate_performance", simulated)
+    monkeypatch.setattr(candidates, "Simulation", simulated)
     held_one, away = optimal_held(problem, 0.05), lambda x: -problem.exact_control(x)
     settings = CertificateSettings(trajectories=32, replicates=4, tolerance=1e-3)
     asked = lambda policy: [(count, doublings) for one, count, doublings in efforts if one is policy]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ocp_torch.certificate.checks.observed import largest_jump
-from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.simulated.performance import Simulation
 from ocp_torch.problems import Circle, Problem
 from ocp_torch.runs.build import build_certificate_settings
 from support import zoo
@@ -28,7 +28,7 @@ def assert_within(perf, truth: float):
 @pytest.mark.parametrize("horizon", ["truncated", "random"])
 @pytest.mark.parametrize(("left", "right"), [(1.0, 1.0), (0.2, 0.9)])
 def test_a_sliding_mode_costs_what_the_mixture_of_its_two_sides_costs(left, right, horizon):
-    perf = simulate_performance(Circle(), switched(left, right), 16, 8, seed=1, horizon=horizon).perf
+    perf = Simulation(Circle(), switched(left, right), 16, 8, seed=1, horizon=horizon).run().perf
     assert_within(perf, cost_of_switching(left, right))
     if horizon == "truncated":
         assert perf.bias < 0.05 * perf.value
@@ -51,13 +51,13 @@ class Bump(Problem):
 @pytest.mark.parametrize("width", [0.05, 0.01])
 def test_what_both_grids_miss_is_in_the_bias(width):
     problem = Bump(width)
-    perf = simulate_performance(problem, lambda x: torch.zeros_like(x), 64, 8, seed=0).perf
+    perf = Simulation(problem, lambda x: torch.zeros_like(x), 64, 8, seed=0).run().perf
     assert_within(perf, 1.0)
 
 
 @zoo.on(("circle rho=2", "torus 2-d chain"))
 def test_the_optimal_jumps_cost_no_accuracy(problem):
-    perf = simulate_performance(problem, problem.exact_control, 256, 8, seed=3).perf
+    perf = Simulation(problem, problem.exact_control, 256, 8, seed=3).run().perf
     assert_within(perf, problem.exact_optimum)
     assert perf.bias <= 1e-4 * problem.exact_optimum
 
@@ -67,7 +67,7 @@ def test_the_optimal_jumps_cost_no_accuracy(problem):
 def test_the_random_horizon_agrees_with_the_truncated_one(problem):
     kinds = ("truncated", "random")
     truncated, random = (
-        simulate_performance(problem, problem.exact_control, 64, 8, seed=5, horizon=kind).perf for kind in kinds
+        Simulation(problem, problem.exact_control, 64, 8, seed=5, horizon=kind).run().perf for kind in kinds
     )
     allowed = 4.5 * math.hypot(truncated.se, random.se) + truncated.bias + random.bias
     assert abs(truncated.value - random.value) <= allowed

@@ -8,7 +8,7 @@ import torch
 from ocp_torch.certificate.simulated import candidates
 from ocp_torch.certificate.simulated.backward import _noisy_piece, backward_flow
 from ocp_torch.certificate.simulated.candidates import Candidate, simulate_candidates
-from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.simulated.performance import Simulation
 from ocp_torch.maths.differences import STEPS
 from ocp_torch.problems import Manufactured, Problem
 from ocp_torch.problems.generator import Generator
@@ -29,9 +29,9 @@ def test_with_noise_a_controller_that_is_clearly_worse_is_followed_shortly_even_
 
     def simulated(problem, policy, trajectories, *rest):
         made.append(trajectories)
-        return simulate_performance(problem, policy, trajectories, *rest)
+        return Simulation(problem, policy, trajectories, *rest)
 
-    monkeypatch.setattr(candidates, "simulate_performance", simulated)
+    monkeypatch.setattr(candidates, "Simulation", simulated)
     wild = lambda x: torch.full_like(x, 30.0)
     both = {"worse": Candidate(wild, None, None), "good": Candidate(problem.exact_control, None, None)}
     settings = replace(QUICK, tolerance=0.05)
@@ -78,9 +78,7 @@ def test_what_is_simulated_beside_a_control_variate_has_its_curvature():
     bent = Generator.of(problem, Samples.of(problem, x)).jet(value).curvature
     curvature = float((problem.exact_occupation(x) * bent).mean().detach()) / problem.discount
     initial = [float((value(x) * problem.initial_density(x)).mean())] * 4
-    found = simulate_performance(
-        problem, problem.exact_control, 1024, 4, 0, value=value, initial=initial, tolerance=3e-2
-    )
+    found = Simulation(problem, problem.exact_control, 1024, 4, 0, value=value, initial=initial, tolerance=3e-2).run()
     low, high = found.perf.interval(0.999)
     assert low <= problem.exact_optimum <= high
     assert abs(found.perf.value - problem.exact_optimum) < 0.15 * abs(curvature)

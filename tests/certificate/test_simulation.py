@@ -10,7 +10,7 @@ import torch
 
 from ocp_torch.certificate import CertificateSettings
 from ocp_torch.certificate.simulated.backward import backward_flow, settled_occupation
-from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
+from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, Simulation, starting_points
 from ocp_torch.control.policies import ValuePolicy, zero_policy
 from ocp_torch.errors import InputError, call
 from ocp_torch.maths import cores
@@ -63,7 +63,7 @@ def wrong_policy(problem):
 @pytest.mark.nightly
 @zoo.on((*zoo.FEW_SMOOTH, "manufactured 1-d q=1.2", "manufactured 2-d q=1.5", "manufactured 3-d interaction=3"))
 def test_the_exact_controller_performs_at_the_optimum(problem):
-    perf = simulate_performance(problem, problem.exact_control, trajectories=64, replicates=8, seed=0).perf
+    perf = Simulation(problem, problem.exact_control, trajectories=64, replicates=8, seed=0).run().perf
     assert abs(perf.value - problem.exact_optimum) <= 4.0 * perf.se + perf.bias
     # An error bar that covers everything proves nothing; paths with noise scatter more.
     assert 4.0 * perf.se + perf.bias < (0.05 if problem.noisy else 0.02) * problem.exact_optimum
@@ -71,7 +71,7 @@ def test_the_exact_controller_performs_at_the_optimum(problem):
 
 @zoo.on(zoo.KINKED)
 def test_the_exact_controller_performs_at_the_optimum_with_kinks(problem):
-    perf = simulate_performance(problem, problem.exact_control, trajectories=64, replicates=8, seed=0).perf
+    perf = Simulation(problem, problem.exact_control, trajectories=64, replicates=8, seed=0).run().perf
     assert abs(perf.value - problem.exact_optimum) <= 4.0 * perf.se + perf.bias
     assert 4.0 * perf.se + perf.bias < 0.05 * problem.exact_optimum
 
@@ -79,9 +79,9 @@ def test_the_exact_controller_performs_at_the_optimum_with_kinks(problem):
 @zoo.on(zoo.SMOOTH)
 def test_the_exact_value_as_control_variate_leaves_nothing_to_simulate(problem):
     """Its Bellman slack under the exact controller is zero, so `E[V* mu0]` alone is the answer."""
-    simulated = simulate_performance(
+    simulated = Simulation(
         problem, problem.exact_control, 8, 2, seed=0, value=problem.exact_value, initial=[problem.exact_optimum] * 2
-    )
+    ).run()
     assert simulated.perf.value == pytest.approx(problem.exact_optimum, rel=1e-10)
     assert simulated.perf.se + simulated.perf.bias < 1e-10
     starts = torch.cat([evaluation_points(8, problem.dim, SIMULATION_REPLICATE + r, seed=0) for r in range(2)])
@@ -97,8 +97,8 @@ def test_a_control_variate_does_not_change_the_answer(problem):
     policy = wrong_policy(problem) if problem.exact_optimum else lambda x: 0.5 * (TURN * x[:, :1]).sin()
     starts = [evaluation_points(8, problem.dim, SIMULATION_REPLICATE + r, seed=0) for r in range(2)]
     initial = [float((network(x) * problem.initial_density(x)).mean()) for x in starts]
-    plain = simulate_performance(problem, policy, trajectories=8, replicates=2, seed=0).perf
-    varied = simulate_performance(problem, policy, 8, 2, seed=0, value=network, initial=initial).perf
+    plain = Simulation(problem, policy, trajectories=8, replicates=2, seed=0).run().perf
+    varied = Simulation(problem, policy, 8, 2, seed=0, value=network, initial=initial).run().perf
     assert abs(plain.value - varied.value) <= plain.bias + varied.bias
     assert plain.bias + varied.bias < 1e-3 * plain.value
     assert varied.se == pytest.approx(plain.se, rel=0.05)
@@ -109,7 +109,7 @@ def test_a_control_variate_does_not_change_the_answer(problem):
 def test_a_controller_loses_half_its_squared_distance_from_the_optimal_one(problem):
     """`Perf(u) - OPT = E_{mu^u} |u - u*|^2 / 2` for `q = 2` and smooth `V*`; the right side simulated by itself."""
     policy = wrong_policy(problem)
-    perf = simulate_performance(problem, policy, trajectories=64, replicates=8, seed=0).perf
+    perf = Simulation(problem, policy, trajectories=64, replicates=8, seed=0).run().perf
     half_square = lambda x: 0.5 * (policy(x) - problem.exact_control(x)).square().sum(dim=-1)
     x0 = torch.cat([evaluation_points(64, problem.dim, r, seed=7) for r in range(8)])
     dynamics = lambda x: (problem.velocity(x, policy(x)), half_square(x))
@@ -149,9 +149,21 @@ def test_any_control_variate_gives_the_performance_with_noise(problem, horizon):
     x = zoo.states(problem, 2**16, seed=5)
     initial = [float((value(x) * problem.initial_density(x)).mean())] * 4
     for seed in range(6):
-        found = simulate_performance(
-            problem, problem.exact_control, 32, 4, seed, value=value, initial=initial, horizon=horizon, tolerance=3e-3
-        ).perf
+        found = (
+            Simulation(
+                problem,
+                problem.exact_control,
+                32,
+                4,
+                seed,
+                value=value,
+                initial=initial,
+                horizon=horizon,
+                tolerance=3e-3,
+            )
+            .run()
+            .perf
+        )
         low, high = found.interval(0.95)
         missed += not low <= problem.exact_optimum <= high
         assert high - low < (0.2 if horizon == "truncated" else 0.6) * problem.exact_optimum
@@ -162,7 +174,7 @@ def test_any_control_variate_gives_the_performance_with_noise(problem, horizon):
 @zoo.on(zoo.QUIET[:2])
 def test_what_the_truncation_leaves_out_is_within_the_bias(problem):
     """From the very starts the exact controller costs what `V*` says; steps so fine that only the tail is missing."""
-    found = simulate_performance(problem, problem.exact_control, 4, 2, seed=0, tolerance=1e-9).perf
+    found = Simulation(problem, problem.exact_control, 4, 2, seed=0, tolerance=1e-9).run().perf
     x0, mass = starting_points(problem, 4, 2, seed=0)
     missing = float((mass * problem.exact_value(x0)).mean()) - found.value
     assert 1e-6 * found.value < missing <= found.bias < 1e-4 * found.value
@@ -171,7 +183,7 @@ def test_what_the_truncation_leaves_out_is_within_the_bias(problem):
 @zoo.on(("torus 2-d chain", "circle rho=4"))
 def test_a_system_at_rest_costs_what_its_states_cost_but_for_the_tail(problem):
     rest = lambda x: torch.zeros(len(x), problem.control_dim, dtype=x.dtype)
-    found = simulate_performance(problem, rest, 4, 2, seed=0, tolerance=1e-9).perf
+    found = Simulation(problem, rest, 4, 2, seed=0, tolerance=1e-9).run().perf
     x0, mass = starting_points(problem, 4, 2, seed=0)
     missing = float((mass * problem.state_cost(x0)).mean()) - found.value
     assert 1e-6 * found.value < missing <= found.bias < 1e-4 * found.value
@@ -197,11 +209,11 @@ def test_what_the_truncation_leaves_out_is_within_the_bias_with_noise(monkeypatc
     for name in ("SMALLEST_TAIL", "LARGEST_TAIL"):  # much more than the steps' own error
         monkeypatch.setattr(f"ocp_torch.certificate.simulated.performance.{name}", 0.05)
     problem = Even()
-    found = simulate_performance(problem, lambda x: torch.zeros_like(x), 8, 2, seed=0, tolerance=1e-7).perf
+    found = Simulation(problem, lambda x: torch.zeros_like(x), 8, 2, seed=0, tolerance=1e-7).run().perf
     assert 0.01 < 1.0 - found.value <= found.bias < 0.1
-    given = simulate_performance(
+    given = Simulation(
         problem, lambda x: torch.zeros_like(x), 8, 2, seed=0, value=lambda x: 1.0 + 0.0 * x[:, 0], initial=[1.0] * 2
-    )
+    ).run()
     assert given.perf.value == pytest.approx(1.0, abs=1e-12)
 
 
@@ -240,7 +252,7 @@ def test_intervals_cover_the_cost_of_a_jump_however_alike_the_replicates(slope, 
     rest = lambda x: torch.zeros(len(x), 1, dtype=x.dtype)
     missed = 0
     for seed in range(80):
-        low, high = simulate_performance(problem, rest, starts, 8, seed=seed).perf.interval(0.95)
+        low, high = Simulation(problem, rest, starts, 8, seed=seed).run().perf.interval(0.95)
         missed += not low <= problem.edge + slope <= high
     assert missed <= 9
 
@@ -324,10 +336,10 @@ def test_rounding_is_in_the_bias_of_a_look_too():
     problem, error = zoo.Manufactured(dim=1), 1e-6
     rounded = lambda x: problem.exact_control(x) * (1.0 + error)
     how = dict(tolerance=1e-3, rounded=(rounded, None))
-    run = lambda **given: simulate_performance(problem, problem.exact_control, 64, 4, 0, **how, **given).perf
+    run = lambda **given: Simulation(problem, problem.exact_control, 64, 4, 0, **how, **given).run().perf
     look, exact = (
         run(audited=False),
-        simulate_performance(problem, problem.exact_control, 64, 4, 0, tolerance=1e-3).perf,
+        Simulation(problem, problem.exact_control, 64, 4, 0, tolerance=1e-3).run().perf,
     )
     assert look.bias > abs(look.value - exact.value) > 0.0
     assert look.bias <= run().bias + 1e-5
@@ -335,7 +347,7 @@ def test_rounding_is_in_the_bias_of_a_look_too():
 
 def rounded_perf(problem, rounded, policy):
     """Of ``policy``, with ``rounded`` in its place; and of ``policy`` alone."""
-    run = lambda other: simulate_performance(problem, policy, 64, 4, 0, tolerance=1e-3, rounded=other).perf
+    run = lambda other: Simulation(problem, policy, 64, 4, 0, tolerance=1e-3, rounded=other).run().perf
     return run(None if rounded is None else (rounded, None)), run(None)
 
 
@@ -387,7 +399,7 @@ def test_trajectories_are_the_same_on_one_core_and_on_several(monkeypatch):
             threads.add(threading.current_thread())
             return problem.exact_control(x)
 
-        found.append(simulate_performance(problem, problem.exact_control, 600, 4, 0, rounded=(rounded, None)))
+        found.append(Simulation(problem, problem.exact_control, 600, 4, 0, rounded=(rounded, None)).run())
         assert (len(threads) > 1) == (count > 1)
     assert found[0].perf == found[1].perf
     assert torch.equal(found[0].end_states, found[1].end_states)
@@ -418,7 +430,7 @@ def test_a_value_whose_slack_is_as_large_as_the_cost_is_no_control_variate(probl
     rough = zoo.rough_network(problem.dim, seed=2, size=size)
     value = lambda x: problem.exact_value(x) + rough(x)
     plain, varied = (
-        simulate_performance(problem, problem.exact_control, 16, 2, 0, V, initial, tolerance=1e-2).perf
+        Simulation(problem, problem.exact_control, 16, 2, 0, V, initial, tolerance=1e-2).run().perf
         for V, initial in ((None, None), (value, [problem.exact_optimum] * 2))
     )
     assert (varied != plain) == used
@@ -450,7 +462,7 @@ def test_a_few_fast_trajectories_take_finer_steps_and_the_others_none(monkeypatc
     for mostly in (0.9, 1.0):
         monkeypatch.setattr("ocp_torch.certificate.simulated.steps.MOSTLY", mostly)
         problem.asked.clear()
-        found.append(simulate_performance(problem, zero_policy(problem), 64, 8, 0, tolerance=1e-3).perf)
+        found.append(Simulation(problem, zero_policy(problem), 64, 8, 0, tolerance=1e-3).run().perf)
         work.append(sum(problem.asked))
     x, mass = starting_points(problem, 64, 8, 0)
     rho, w = problem.discount, TURN * (1.0 + 40.0 * (x[:, 0] > 0.95))
@@ -469,7 +481,7 @@ def test_paths_that_are_very_long_are_fewer_and_agree_with_the_time_average(monk
     count = lambda *how, **rest: taken.append(how[1:3]) or starting_points(*how, **rest)
     monkeypatch.setattr("ocp_torch.certificate.simulated.performance.starting_points", count)
     monkeypatch.setattr("ocp_torch.certificate.simulated.performance.MOST_STEPS", 2.0e4)
-    found = simulate_performance(problem, lambda x: torch.ones_like(x), 256, 2, seed=0, tolerance=1e-3).perf
+    found = Simulation(problem, lambda x: torch.ones_like(x), 256, 2, seed=0, tolerance=1e-3).run().perf
     assert taken[0] == (256, 2)
     assert taken[-1][0] < 16
     x = torch.linspace(0.0, 1.0, 4097, dtype=torch.float64)[:-1].unsqueeze(1)

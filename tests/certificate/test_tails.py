@@ -11,8 +11,8 @@ import torch
 from ocp_torch.certificate import Run, Trained, certify_fields
 from ocp_torch.certificate.checks.tails import beyond_largest, rarity, sharpened, widened
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
-from ocp_torch.certificate.simulated import performance
-from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.simulated import unseen
+from ocp_torch.certificate.simulated.performance import Simulation
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.policies import NETWORK, zero_policy
 from ocp_torch.fields import Fields, PeriodicMLP
@@ -68,7 +68,7 @@ def test_bounds_of_a_closed_loop_know_a_spike_of_the_cost(name):
 )
 def test_a_simulated_cost_knows_a_spike_where_trajectories_start(name, speed):
     problem = spike(name, speed=speed)
-    low, high = simulate_performance(problem, zero_policy(problem), 64, 8, 0).perf.interval(0.999)
+    low, high = Simulation(problem, zero_policy(problem), 64, 8, 0).run().perf.interval(0.999)
     assert low <= problem.idle <= high
 
 
@@ -160,7 +160,7 @@ class Far(Problem):
 def test_a_place_that_no_random_path_met_and_that_costs_much_is_in_the_interval(options, horizon):
     """Nothing of it is seen in the paths; at the random times it costs 5 more in truth, by its closed form."""
     problem = Far(discount=1.0, **options)
-    found = simulate_performance(problem, zero_policy(problem), 64, 4, 0, horizon=horizon, tolerance=1e-2).perf
+    found = Simulation(problem, zero_policy(problem), 64, 4, 0, horizon=horizon, tolerance=1e-2).run().perf
     assert found.value < 1.5
     assert found.above > 6.3
 
@@ -168,7 +168,7 @@ def test_a_place_that_no_random_path_met_and_that_costs_much_is_in_the_interval(
 def test_where_all_that_costs_much_was_met_nothing_is_added():
     problem = Far(discount=1.0, noise=0.02)
     problem.state_cost = lambda x: 1e5 * (1.0 + (TURN * (x[:, 0] - 0.4)).cos())  # most where all start
-    found = simulate_performance(problem, zero_policy(problem), 64, 4, 0, tolerance=1e-2).perf
+    found = Simulation(problem, zero_policy(problem), 64, 4, 0, tolerance=1e-2).run().perf
     assert found.bias < 0.05 * found.value
 
 
@@ -221,22 +221,22 @@ class Singular(Problem):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_cost_without_a_variance_is_noticed_among_starts_of_different_weights(seed):
-    found = simulate_performance(Singular(), zero_policy(Singular()), 256, 8, seed, tolerance=1e-2).perf
+    found = Simulation(Singular(), zero_policy(Singular()), 256, 8, seed, tolerance=1e-2).run().perf
     assert found.bias > 0.01 * found.value
 
 
 def test_what_falls_off_slowly_counts_no_further_than_the_largest_rate(monkeypatch):
     """No path costs more than 2, so that 3 / 2,048 of them are all that is left."""
-    monkeypatch.setattr(performance, "beyond_largest", lambda results, weights, size: 1.0)
+    monkeypatch.setattr(unseen, "beyond_largest", lambda results, weights, size: 1.0)
     problem = Singular()
     problem.state_cost = lambda x: 1.0 + (TURN * x[:, 0]).cos()
-    found = simulate_performance(problem, zero_policy(problem), 256, 8, 0, tolerance=1e-3).perf
+    found = Simulation(problem, zero_policy(problem), 256, 8, 0, tolerance=1e-3).run().perf
     assert 0.5 * 3.0 / 2048 < found.bias < 5.0 * 3.0 / 2048
 
 
 def test_of_rates_without_a_largest_one_all_counts(monkeypatch):
-    monkeypatch.setattr(performance, "beyond_largest", lambda results, weights, size: 100.0)
-    found = simulate_performance(Singular(), zero_policy(Singular()), 256, 8, 0, tolerance=1e-2).perf
+    monkeypatch.setattr(unseen, "beyond_largest", lambda results, weights, size: 100.0)
+    found = Simulation(Singular(), zero_policy(Singular()), 256, 8, 0, tolerance=1e-2).run().perf
     assert found.bias >= 100.0
 
 

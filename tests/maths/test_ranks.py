@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.distributed as dist
 
-from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.simulated.performance import Simulation
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.errors import InputError, ProblemError
 from ocp_torch.maths.cores import cores, in_pieces, spread
@@ -183,7 +183,7 @@ def test_a_simulation_and_slopes_are_the_same_to_the_bit_however_many_processes_
     policy = ValuePolicy(problem, value)
 
     def numbers():
-        seen = simulate_performance(problem, policy, 512, 8, 3, tolerance=0.1, rounded=(policy, None))
+        seen = Simulation(problem, policy, 512, 8, 3, tolerance=0.1, rounded=(policy, None)).run()
         (squares,) = in_pieces(lambda rows: (rows**2,), x, True, long=True)
         slopes = chunked_jet(value, x).gradient
         return seen.perf, [float(part.sum()) for part in (seen.end_states, squares, slopes)]

@@ -9,7 +9,7 @@ import torch
 from ocp_torch.certificate.checks.wellposed import check_problem
 from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lower.sampled import SampledValue
-from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, simulate_performance, starting_points
+from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, Simulation, starting_points
 from ocp_torch.control.policies import zero_policy
 from ocp_torch.gym.environment import ControlEnvironment
 from ocp_torch.maths.mixture_fit import fitted_mixture
@@ -47,13 +47,13 @@ def assert_near(estimate: Estimate, truth: float, most: float):
 
 @pytest.mark.nightly
 def test_doing_nothing_from_a_narrow_start_costs_what_it_costs(narrow):
-    perf = simulate_performance(narrow, zero_policy(narrow), 64, 8, seed=0).perf
+    perf = Simulation(narrow, zero_policy(narrow), 64, 8, seed=0).run().perf
     assert_near(perf, narrow.idle, 0.4)
 
 
 def test_the_random_horizon_starts_there_too():
     problem = NarrowStart(*NARROW["2-d"])
-    perf = simulate_performance(problem, zero_policy(problem), 128, 8, seed=0, horizon="random").perf
+    perf = Simulation(problem, zero_policy(problem), 128, 8, seed=0, horizon="random").run().perf
     assert_near(perf, problem.idle, 0.3)
 
 

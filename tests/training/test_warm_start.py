@@ -10,7 +10,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from ocp_torch.certificate.report import table
 from ocp_torch.certificate.simulated import candidates
-from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.simulated.performance import Simulation
 from ocp_torch.certificate.trained import TrainedContext
 from ocp_torch.control.controller import Controller, load_controller
 from ocp_torch.control.greedy import HeldPolicy
@@ -194,9 +194,9 @@ def test_looks_remember_the_controller_of_the_warm_start_until_its_weights_or_th
 
     def simulated(problem, policy, *rest):
         made.append(isinstance(policy, HeldPolicy))
-        return simulate_performance(problem, policy, *rest)
+        return Simulation(problem, policy, *rest)
 
-    monkeypatch.setattr(candidates, "simulate_performance", simulated)
+    monkeypatch.setattr(candidates, "Simulation", simulated)
 
     def looked(seed: int = 0):
         made.clear()

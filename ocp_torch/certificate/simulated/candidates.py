@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
 from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.certificate.simulated.performance import Simulated, simulate_performance
+from ocp_torch.certificate.simulated.performance import Simulated, Simulation
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.policies import Policy, zero_policy
 from ocp_torch.maths.jets import Field
@@ -56,7 +56,7 @@ def simulate_candidates(
         if roughly:
             effort, tolerance, doublings = max(2, effort // BASELINE_PART), ROUGH * tolerance, HALVED
         sets, how = (settings.replicates, seed, value, initial), (settings.horizon, tolerance, rounded, doublings)
-        return simulate_performance(problem, policy, effort, *sets, *how, settings.audited)
+        return Simulation(problem, policy, effort, *sets, *how, settings.audited).run()
 
     held = [name for name, candidate in candidates.items() if isinstance(candidate.policy, HeldPolicy)]
     many = problem.noisy or held or settings.trajectories * settings.replicates > CHEAP

@@ -9,7 +9,7 @@ from torch import Tensor
 from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.simulated.candidates import BASELINE_PART
-from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.simulated.performance import Simulation
 from ocp_torch.control.policies import Policy
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.physical.system import System
@@ -47,7 +47,7 @@ def time_outside(problem: Problem, policy: Policy, settings: CertificateSettings
     if not isinstance(problem, System) or not problem.chart.boxed or few < FEWEST:
         return None
     effort = few, settings.replicates, seed
-    found = simulate_performance(
+    found = Simulation(
         _clock(problem),
         policy,
         *effort,
@@ -55,7 +55,7 @@ def time_outside(problem: Problem, policy: Policy, settings: CertificateSettings
         [LEVEL],
         settings.horizon,
         max(TOLERANCE, settings.tolerance),
-    )
+    ).run()
     return replace(found.perf, value=max(0.0, found.perf.value - 1.0))
 
 

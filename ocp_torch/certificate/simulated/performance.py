@@ -6,14 +6,16 @@ and `E[rate(x_T)]` is the discounted integral, without a tail.
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.checks.tails import beyond_largest, unmet, widened
+from ocp_torch.certificate.checks.tails import widened
 from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
-from ocp_torch.certificate.simulated.loops import HeldLoop, loop_of
+from ocp_torch.certificate.simulated.loops import HeldLoop, Loop, loop_of
 from ocp_torch.certificate.simulated.paths import Paths
 from ocp_torch.certificate.simulated.steps import Steps
 from ocp_torch.certificate.simulated.unseen import (
@@ -22,6 +24,7 @@ from ocp_torch.certificate.simulated.unseen import (
     largest_rate_of,
     stratum_error,
     unmet_cost,
+    unmet_tail,
     unseen_cost,
 )
 from ocp_torch.control.policies import Policy
@@ -44,8 +47,6 @@ NO_VARIATE = 0.5
 # Where the first steps of all paths are more than that, as with a small discount, fewer paths are taken, but so many in each
 # set, and the cost itself along them: each is so long that it sees most of what others do. A quadrotor's are 1.6e6.
 MOST_STEPS, LEAST_PATHS = 2.0e6, 4
-# Ascents to the largest rate there is: one that has none, as `r^-1.6`, is then larger than all that could matter.
-ASCENTS = 32
 # Head-room on the rate's supremum, met at starts and ends, for the states after the end.
 RATE_ROOM = 2.0
 
@@ -62,6 +63,25 @@ class Simulated:
     unmet: float = 0.0  # what states far dearer than any that was met add, if one path comes to them
 
 
+class Start(NamedTuple):
+    """All paths at their starts ``x`` ``(N, d)``, one replicate after the other: the ``mass`` of `mu0` that each stands for
+    ``(N,)``, the ``times`` at which they end where these are random, the control variate there (``base``), the ``state`` of
+    the loop, its ``velocity`` and its ``rates``, ``(N,)`` or more columns of them."""
+
+    x: Tensor
+    mass: Tensor
+    times: Tensor | None
+    base: Tensor
+    state: Tensor
+    velocity: Tensor
+    rates: Tensor
+
+    @property
+    def rate(self) -> Tensor:
+        """The first column of the rates, ``(N,)``."""
+        return self.rates.reshape(len(self.x), -1)[:, 0]
+
+
 def starting_points(
     problem: Problem, trajectories: int, replicates: int, seed: int, extra: int = 0
 ) -> tuple[Tensor, Tensor]:
@@ -71,21 +91,8 @@ def starting_points(
     return torch.cat([x for x, _ in sets]), torch.cat([mass for _, mass in sets])
 
 
-@torch.no_grad()
-def simulate_performance(
-    problem: Problem,
-    policy: Policy,
-    trajectories: int,
-    replicates: int,
-    seed: int,
-    value: Field | None = None,
-    initial: list[float] | None = None,
-    horizon: str = TRUNCATED,
-    tolerance: float = CertificateSettings.tolerance,
-    rounded: tuple[Policy, Field | None] | None = None,
-    doublings: int = MAX_DOUBLINGS,
-    audited: bool = True,
-) -> Simulated:
+@dataclass(frozen=True, eq=False)
+class Simulation:
     """Perf of ``policy`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts, near `mu0`.
 
     With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is added;
@@ -93,96 +100,149 @@ def simulate_performance(
     along fewer of them (`MOST_STEPS`). Steps are halved, without noise ``doublings`` times at most, until a trajectory
     changes by less than ``tolerance``, relative to the answer, or all of them by little beside the standard error.
     ``rounded``, the controller and `V` in single precision, takes their place where it agrees well enough with them at the
-    starts; a few trajectories are exact, and what they differ by goes into the ``bias``, unless, without noise, they are
-    not ``audited``. The ``bias`` is the error of integration (`refined`, with noise `expectation`), plus, where the
-    ``horizon`` is truncated, the discount left there times the rate's supremum as met along the trajectories, with
-    head-room, what states that no random path met may add, and what is left of a mean that has no variance
-    (`_unmet_tail`); and all that any state may cost, where an audit shows a wall that the steps jump over
-    (`jumped_over`). A `HeldPolicy` is simulated as one: its control changes only when it is renewed, always up to a
-    truncated horizon.
+    starts; a few trajectories are exact, and what they differ by goes into the bias, unless, without noise, they are
+    not ``audited``. A `HeldPolicy` is simulated as one: its control changes only when it is renewed, always up to a
+    truncated ``horizon``.
     """
-    dim, rho = problem.dim, problem.discount
-    loop = loop_of(problem, policy, value)
-    held = isinstance(loop, HeldLoop)
-    random = horizon == RANDOM and not held
-    points, mass = starting_points(problem, trajectories, replicates, seed, extra=int(random))
-    x0, times = points[:, :dim], -torch.log1p(-points[:, dim]) / rho if random else None
-    plain = None if rounded is None else (rounded[0], None)
-    plainly = lambda count: simulate_performance(
-        problem, policy, count, replicates, seed, None, None, horizon, tolerance, plain, doublings, audited
-    )
-    along, beside = (None, value) if held else (value, None)  # of rates; of whole pieces
-    base = along(x0) if along is not None else torch.zeros_like(mass)
-    state = loop.start(x0)
-    velocity, rates = loop(state)
-    velocity, rate = velocity[:, :dim], rates.reshape(len(x0), -1)[:, 0]
-    if along is not None:
-        paid = loop_of(problem, policy, None)(state)[1]
-        if not float((mass * rate).abs().mean()) <= NO_VARIATE * float((mass * paid).mean()):
-            return plainly(trajectories)
-    quick = loop if rounded is None else loop_of(problem, *rounded)
-    off = float((quick(quick.renewed(state))[1] - rates).abs().mean())
-    if not (torch.isfinite(velocity).all() and torch.isfinite(rate).all()):
-        return Simulated(Estimate(math.nan, math.nan), math.nan, x0)
-    # By the slack's definition `V - Q_u = f + R(u) + grad V . g / rho`: the answer's size also where `E[V mu0]` is far off.
-    size = max(float((mass * (base + rate)).mean().abs()), LEAST * float((mass * problem.state_cost(x0)).mean()), 1e-12)
-    largest_rate = RATE_ROOM * float(rate.abs().max())
-    tail = min(max(TAIL_PART * tolerance, SMALLEST_TAIL), LARGEST_TAIL)
-    to_the_tail = max(math.log(max(largest_rate / (tail * size), math.e)), 1.0) / rho
-    steps = Steps.of(loop, to_the_tail if times is None else float(times.max()), velocity)
-    fewer = max(LEAST_PATHS, 2 ** int(math.log2(max(MOST_STEPS / (steps.count * replicates), 1.0))))
-    if fewer < trajectories and not held:
-        return plainly(fewer)
-    allowed = tolerance * size
-    paths = Paths(
-        loop,
-        quick if off <= ROUNDED * allowed else loop,
-        steps,
-        state,
-        mass,
-        replicates,
-        times=times,
-        allowed=allowed,
-        seed=seed,
-        together=rounded is not None and problem.concurrent,  # networks of ours are pure functions
-        doublings=doublings,
-        audited=audited,
-        rounding=off,
-        value=beside,
-    )
-    result, end, refinement, bias, wall = paths.followed()
-    ended = end[:, :dim].remainder(1.0)
-    if times is None:
-        left = 0.0 if beside is None else beside(ended).abs()
-        largest_rate = max(largest_rate, RATE_ROOM * float((paths.rates(end).abs() + left).max()))
-        bias += math.exp(-rho * steps.horizon) * largest_rate * float(mass.mean())
-    bias += UNSEEN_ROOM * unseen_cost(problem, x0, mass, seed)
-    bias += largest_rate_of(loop_of(problem, policy, None)) if wall else 0.0
-    # Starts are spread evenly, and without noise their paths follow from them.
-    chance, met = problem.noisy or random, (mass * torch.maximum(rate.abs(), result.abs())).max()
-    rare = unmet_cost(paths.quick, float(met), len(mass), size) if chance or audited else 0.0
-    bias += rare if chance else 0.0
-    parts = (paths.means(result) + refinement).tolist()
-    totals = [part + (initial[r % len(initial)] if initial else 0.0) for r, part in enumerate(parts)]
-    bias += _unmet_tail(paths, result, size)
-    perf = Estimate.of(totals, bias=bias)
-    perf = widened(replace(perf, se=max(perf.se, stratum_error(mass * result, replicates))), [mass * result])
-    # One path with noise is off its mean, `V^u`; the largest of `N` by some `sqrt(2 log N)` standard deviations.
-    above = float(result.std()) * math.sqrt(2.0 * math.log(len(result))) if problem.noisy else 0.0
-    largest = None if random or held else float((base + result).max()) - above
-    return Simulated(perf, largest, ended, wall, 0.0 if chance else rare)
 
+    problem: Problem
+    policy: Policy
+    trajectories: int
+    replicates: int
+    seed: int
+    value: Field | None = None
+    initial: list[float] | None = None
+    horizon: str = TRUNCATED
+    tolerance: float = CertificateSettings.tolerance
+    rounded: tuple[Policy, Field | None] | None = None
+    doublings: int = MAX_DOUBLINGS
+    audited: bool = True
 
-def _unmet_tail(paths: Paths, results: Tensor, size: float) -> float:
-    """What results larger than any of ``results`` ``(N,)`` of ``paths`` add to their mean, whose size is ``size``: by how the
-    largest fall off, but no more than results as large as the largest rate that is found do, `3 / N` of all paths. Kinks of
-    `V` leave errors that fall off slowly up to the largest slack: of a torus that was .1 % where the former alone was up to
-    .6 %."""
-    beyond = beyond_largest(results, paths.mass, size)
-    if not beyond > 0.0:
-        return 0.0
-    largest = max(largest_rate_of(paths.quick, ASCENTS), float(results.abs().max()))
-    largest += abs(float(paths.means(results).mean()))
-    if paths.value is not None:
-        largest += float(paths.value(paths.state[:, : paths.loop.problem.dim]).abs().max())
-    return min(beyond, unmet(float(paths.mass.max()) * largest, len(results)))
+    @torch.no_grad()
+    def run(self) -> Simulated:
+        """The performance, by the cost itself along fewer paths where that is better."""
+        if not self._is_variate:
+            return self._without_value(self.trajectories).run()
+        if not bool(torch.isfinite(self._start.velocity).all() and torch.isfinite(self._start.rate).all()):
+            return Simulated(Estimate(math.nan, math.nan), math.nan, self._start.x)
+        steps = self._steps
+        fewer = max(LEAST_PATHS, 2 ** int(math.log2(max(MOST_STEPS / (steps.count * self.replicates), 1.0))))
+        if fewer < self.trajectories and not self._held:
+            return self._without_value(fewer).run()
+        return self._judged(self._paths(steps))
+
+    def _without_value(self, trajectories: int) -> "Simulation":
+        """The same by the cost itself, along so many ``trajectories`` of each set."""
+        rounded = None if self.rounded is None else (self.rounded[0], None)
+        return replace(self, trajectories=trajectories, value=None, initial=None, rounded=rounded)
+
+    @cached_property
+    def _loop(self) -> Loop:
+        return loop_of(self.problem, self.policy, self.value)
+
+    @property
+    def _held(self) -> bool:
+        return isinstance(self._loop, HeldLoop)
+
+    @property
+    def _along(self) -> Field | None:
+        """The control variate of rates; that of a control that is held is of whole pieces."""
+        return None if self._held else self.value
+
+    @property
+    def _ends_at_random(self) -> bool:
+        return self.horizon == RANDOM and not self._held
+
+    @cached_property
+    def _start(self) -> "Start":
+        """Where all paths start."""
+        dim, at_random = self.problem.dim, self._ends_at_random
+        points, mass = starting_points(
+            self.problem, self.trajectories, self.replicates, self.seed, extra=int(at_random)
+        )
+        x, loop = points[:, :dim], self._loop
+        times = -torch.log1p(-points[:, dim]) / self.problem.discount if at_random else None
+        base = torch.zeros_like(mass) if self._along is None else self._along(x)
+        state = loop.start(x)
+        velocity, rates = loop(state)
+        return Start(x, mass, times, base, state, velocity[:, :dim], rates)
+
+    @property
+    def _is_variate(self) -> bool:
+        """Whether the slack of the control variate is small enough at the starts, if there is one."""
+        if self._along is None:
+            return True
+        start = self._start
+        paid = loop_of(self.problem, self.policy, None)(start.state)[1]
+        slack, cost = float((start.mass * start.rate).abs().mean()), float((start.mass * paid).mean())
+        return slack <= NO_VARIATE * cost
+
+    @cached_property
+    def _size(self) -> float:
+        """That of the answer: by the slack's definition `V - Q_u = f + R(u) + grad V . g / rho`, also where `E[V mu0]` is far
+        off."""
+        start = self._start
+        least = LEAST * float((start.mass * self.problem.state_cost(start.x)).mean())
+        return max(float((start.mass * (start.base + start.rate)).mean().abs()), least, 1e-12)
+
+    @property
+    def _steps(self) -> Steps:
+        start, rate = self._start, RATE_ROOM * float(self._start.rate.abs().max())
+        if start.times is not None:
+            return Steps.of(self._loop, float(start.times.max()), start.velocity)
+        tail = min(max(TAIL_PART * self.tolerance, SMALLEST_TAIL), LARGEST_TAIL)
+        to_the_tail = max(math.log(max(rate / (tail * self._size), math.e)), 1.0) / self.problem.discount
+        return Steps.of(self._loop, to_the_tail, start.velocity)
+
+    def _paths(self, steps: Steps) -> Paths:
+        """In single precision, where that differs little from the exact rates at the starts."""
+        start, loop, allowed = self._start, self._loop, self.tolerance * self._size
+        quick = loop if self.rounded is None else loop_of(self.problem, *self.rounded)
+        off = float((quick(quick.renewed(start.state))[1] - start.rates).abs().mean())
+        return Paths(
+            loop,
+            quick if off <= ROUNDED * allowed else loop,
+            steps,
+            start.state,
+            start.mass,
+            self.replicates,
+            times=start.times,
+            allowed=allowed,
+            seed=self.seed,
+            together=self.rounded is not None and self.problem.concurrent,  # networks of ours are pure functions
+            doublings=self.doublings,
+            audited=self.audited,
+            rounding=off,
+            value=self.value if self._held else None,
+        )
+
+    def _judged(self, paths: Paths) -> Simulated:
+        """What ``paths`` show. The bias is the error of integration (`refined`, with noise `expectation`), plus, where the
+        horizon is truncated, the discount left there times the rate's supremum as met along the trajectories, with
+        head-room; what states that no random path met may add; what is left of a mean that has no variance (`unmet_tail`);
+        and all that any state may cost, where an audit shows a wall that the steps jump over (`jumped_over`)."""
+        problem, start, replicates = self.problem, self._start, self.replicates
+        result, end, refinement, bias, wall = paths.followed()
+        ended = end[:, : problem.dim].remainder(1.0)
+        if start.times is None:
+            left = 0.0 if paths.value is None else paths.value(ended).abs()
+            rates = float(start.rate.abs().max()), float((paths.rates(end).abs() + left).max())
+            largest = RATE_ROOM * max(rates)
+            bias += math.exp(-problem.discount * paths.steps.horizon) * largest * float(start.mass.mean())
+        bias += UNSEEN_ROOM * unseen_cost(problem, start.x, start.mass, self.seed)
+        bias += largest_rate_of(loop_of(problem, self.policy, None)) if wall else 0.0
+        # Starts are spread evenly, and without noise their paths follow from them.
+        chance = problem.noisy or self._ends_at_random
+        met = float((start.mass * torch.maximum(start.rate.abs(), result.abs())).max())
+        rare = unmet_cost(paths.quick, met, len(start.mass), self._size) if chance or self.audited else 0.0
+        bias += rare if chance else 0.0
+        parts, initial = (paths.means(result) + refinement).tolist(), self.initial
+        totals = [part + (initial[r % len(initial)] if initial else 0.0) for r, part in enumerate(parts)]
+        bias += unmet_tail(paths, result, self._size)
+        perf = Estimate.of(totals, bias=bias)
+        weighted = start.mass * result
+        perf = widened(replace(perf, se=max(perf.se, stratum_error(weighted, replicates))), [weighted])
+        # One path with noise is off its mean, `V^u`; the largest of `N` by some `sqrt(2 log N)` standard deviations.
+        above = float(result.std()) * math.sqrt(2.0 * math.log(len(result))) if problem.noisy else 0.0
+        highest = None if self._ends_at_random or self._held else float((start.base + result).max()) - above
+        return Simulated(perf, highest, ended, wall, 0.0 if chance else rare)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from ocp_torch.certificate import BOUNDS, LOWER, UPPER, CertificateSettings, Run, StageSettings, Trained, bounds
 from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lower.penalised import PenalisedDual
-from ocp_torch.certificate.simulated.performance import simulate_performance
+from ocp_torch.certificate.simulated.performance import Simulation
 from ocp_torch.certificate.trained import TrainedContext
 from ocp_torch.certificate.upper.penalised import DensityBounds
 from ocp_torch.control.policies import Policy
@@ -153,9 +153,8 @@ class Judge:
         if self.problem.dim == 1:
             policy, value, initial = tabulated(policy, TABLE), None, None
         starts = ALONE if value is None else TRAJECTORIES
-        return simulate_performance(
-            self.problem, policy, starts, REPLICATES, 0, value, initial, tolerance=TOLERANCE
-        ).perf.value
+        simulation = Simulation(self.problem, policy, starts, REPLICATES, 0, value, initial, tolerance=TOLERANCE)
+        return simulation.run().perf.value
 
 
 def tabulated(policy: Policy, count: int) -> Policy:
