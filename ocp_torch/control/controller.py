@@ -85,6 +85,12 @@ class Controller:
         return u.cpu().numpy() if isinstance(x, np.ndarray) else u
 
     @property
+    def policy(self) -> Policy:
+        """`u` at states of the unit cell, in float64 on the CPU, where certificates and metrics are computed."""
+        fields = copy.deepcopy(self._exact).to("cpu")
+        return trained_policies(self.occupation, self.problem, fields, self.constants, every=True)[self.kind]
+
+    @property
     def held_for(self) -> float | None:
         """For how many units of time each control is meant to be held, and was in the simulations of the certificate; `None`
         for a controller that acts at every instant."""

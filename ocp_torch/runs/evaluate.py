@@ -12,7 +12,6 @@ from ocp_torch.errors import InputError, require_integer, require_section
 from ocp_torch.files.limits import require_modest_run
 from ocp_torch.files.reading import kind
 from ocp_torch.runs.build import build_certificate_settings, build_network, build_problem, use_threads
-from ocp_torch.runs.loading import policy_of
 from ocp_torch.runs.metrics.trial import write_metrics
 from ocp_torch.runs.pictures.picture import animate, require_gif
 from ocp_torch.training.health import sanity_warnings
@@ -35,7 +34,7 @@ def recertification(config: dict) -> Callable[[], Certificate]:
     def recertify() -> Certificate:
         certificate = certify_saved(controller, settings, seed)
         if animation is not None:
-            animate(controller.problem, policy_of(controller), animation, seed or 0)
+            animate(controller.problem, controller.policy, animation, seed or 0)
             log.info("animated in %s", animation)
         return certificate
 
@@ -81,5 +80,5 @@ def certify_saved(controller: Controller, settings: CertificateSettings, seed: i
     certificate = replace(certificate, warnings=[*certificate.warnings, *fresh])
     log.info("\n%s", table(certificate.to_dict(), certificate.searches))
     if settings.trajectories:
-        write_metrics(controller.problem, policy_of(controller), run.seed, None)
+        write_metrics(controller.problem, controller.policy, run.seed, None)
     return certificate

@@ -66,7 +66,7 @@ def certify(
     settings = settings or build_certificate_settings(defaults)
     constants = resolve_constants(problem)
     network = build_network(defaults["model"])
-    policy = policy_of(controller, problem)
+    policy = checked_policy(controller, problem)
     steps = defaults["trainer"]["steps"] if train_steps is None else require_integer("train_steps", train_steps, 0)
     steps = 0 if value is not None else steps
     kept = None if value is None else kept_of(value, problem)
@@ -102,7 +102,7 @@ def train_value(
     return average.module
 
 
-def policy_of(controller: Callable | Controller, problem: Problem) -> Policy:
+def checked_policy(controller: Callable | Controller, problem: Problem) -> Policy:
     """A policy in float64: the networks of a `Controller` of ours, or a `BlackBox` around anything else."""
     if not isinstance(controller, Controller):
         return BlackBox(controller, problem)
@@ -111,7 +111,7 @@ def policy_of(controller: Callable | Controller, problem: Problem) -> Policy:
             f"the controller is for d = {controller.problem.dim} and m = {controller.problem.control_dim}, "
             f"but the problem has d = {problem.dim} and m = {problem.control_dim}."
         )
-    policy = loading.policy_of(controller)
+    policy = controller.policy
     if controller.problem.control_limit != problem.control_limit:  # its own limit it obeys by itself
         x = scrambled_sobol(LIMIT_PROBES, problem.dim, 0, torch.float64)
         with torch.no_grad():
@@ -158,7 +158,7 @@ def arguments(config: dict) -> dict:
         require_integer("steps", config["steps"], 1)
     require_possible(problem, settings, trains_value=False)  # a given controller's bounds are not proved
     controller = loading.load_policy(config["controller"], problem)
-    policy_of(controller, problem)
+    checked_policy(controller, problem)
     return {
         "problem": problem,
         "controller": controller,

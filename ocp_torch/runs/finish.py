@@ -18,7 +18,6 @@ from ocp_torch.maths.seeds import generators_kept
 from ocp_torch.problems.blame import blamed
 from ocp_torch.runs import canvas
 from ocp_torch.runs.figures import Shown, interval_figure
-from ocp_torch.runs.loading import policy_of
 from ocp_torch.runs.metrics.measures import has_metrics
 from ocp_torch.runs.metrics.trial import METRICS
 from ocp_torch.runs.pictures.picture import motion
@@ -112,7 +111,7 @@ def hand_out(
             how = trainer.constants, trainer.objective.occupation
             followed = certificate.followed or kind, certificate.occupation
             figures |= Shown(trainer.problem, controller.fields, *how, *followed).figures()
-            moved = motion(trainer.problem, policy_of(controller), trainer.seed)
+            moved = motion(trainer.problem, controller.policy, trainer.seed)
             figures |= {} if moved is None else {"motion": moved}
         drawn = canvas.drawn(figures)
         canvas.save(drawn, folder / "figures")

@@ -1,4 +1,4 @@
-"""Controllers by what the command line names: a function in a file, a run of ours, ONNX, TorchScript; and their policies."""
+"""Controllers by what the command line names: a function in a file, a run of ours, ONNX, TorchScript."""
 
 import logging
 from collections.abc import Callable
@@ -7,10 +7,8 @@ from pathlib import Path
 
 import torch
 
-from ocp_torch.certificate.fields import in_float64
 from ocp_torch.control.controller import Controller, controller_file, load_controller
 from ocp_torch.control.described import problem_name
-from ocp_torch.control.policies import Policy, trained_policies
 from ocp_torch.errors import InputError, first_line
 from ocp_torch.files.reading import FOLDER, kind, require_file
 from ocp_torch.problems import PROBLEMS, Problem
@@ -18,13 +16,6 @@ from ocp_torch.problems.simulator.target import resolved
 from ocp_torch.runs.onnx_controller import onnx_controller
 
 log = logging.getLogger(__name__)
-
-
-def policy_of(controller: Controller) -> Policy:
-    """The policy that ``controller`` follows, in float64."""
-    fields = in_float64(controller.fields)
-    how = controller.occupation, controller.problem, fields, controller.constants
-    return trained_policies(*how, every=True)[controller.kind]
 
 
 def load_policy(source: str, problem: Problem) -> Callable | Controller:

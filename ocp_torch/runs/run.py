@@ -31,7 +31,6 @@ from ocp_torch.runs.finish import (
     unless_it_failed,
     with_warnings,
 )
-from ocp_torch.runs.loading import policy_of
 from ocp_torch.runs.metrics.trial import write_metrics
 from ocp_torch.runs.report.report import REPORT, write_report
 from ocp_torch.runs.resume import filled_from, require_same_run, result_of
@@ -191,7 +190,7 @@ def ending(
     found = None
     if settings.trajectories:
         with unless_it_failed(failure, trainer):
-            found = write_metrics(trainer.problem, policy_of(controller), trainer.seed, folder)
+            found = write_metrics(trainer.problem, controller.policy, trainer.seed, folder)
     if trainer.settings.figures:
         write_report(folder, trainer.problem, trainer.config)
     complete(folder)

@@ -8,7 +8,6 @@ import torch
 from ocp_torch.control.controller import load_controller
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.runs.build import build_problem
-from ocp_torch.runs.loading import policy_of
 from ocp_torch.runs.metrics.trial import METRICS, metrics
 from support.small import configured, session, small
 
@@ -33,7 +32,7 @@ def test_a_run_leaves_numbers_and_a_picture(tmp_path):
     found = json.loads((tmp_path / METRICS).read_text())
     assert {"controller", "zero", "classical"} <= found.keys()
     controller = load_controller(tmp_path / "controller.safetensors")
-    assert metrics(controller.problem, policy_of(controller), derive_seed(0, Branch.METRICS)) == found
+    assert metrics(controller.problem, controller.policy, derive_seed(0, Branch.METRICS)) == found
 
 
 @pytest.mark.nightly
