@@ -2,7 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-from ocp_torch.control.controller import Controller, load_controller
+from ocp_torch.control.controller import Controller
+from ocp_torch.control.saved import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.problems import PROBLEMS, Circle, Dataset, Manufactured, Problem, Simulator, Torus
 from ocp_torch.problems.control_cost import PowerCost

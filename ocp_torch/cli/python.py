@@ -14,7 +14,7 @@ import torch
 from ocp_torch.cli.asked import Asked, data_of, flat
 from ocp_torch.cli.job import isolated
 from ocp_torch.cli.single import require_writable, told
-from ocp_torch.control.controller import load_controller
+from ocp_torch.control.saved import load_controller
 from ocp_torch.errors import InputError, require_integer, shown
 from ocp_torch.files.reading import kind, read_json, require_unlinked
 from ocp_torch.maths.ranks import joined

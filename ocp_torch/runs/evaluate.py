@@ -7,7 +7,8 @@ from pathlib import Path
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields, table
 from ocp_torch.certificate.settings import require_possible
-from ocp_torch.control.controller import Controller, load_controller
+from ocp_torch.control.controller import Controller
+from ocp_torch.control.saved import load_controller
 from ocp_torch.errors import InputError, require_integer, require_section
 from ocp_torch.files.limits import require_modest_run
 from ocp_torch.files.reading import kind

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from ocp_torch.certificate import Certificate, CertificateSettings
-from ocp_torch.control.controller import FILE_NAME, Controller
+from ocp_torch.control.controller import Controller
 from ocp_torch.control.policies import BOUNDING
+from ocp_torch.control.saved import FILE_NAME
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.fields import SUBSOLUTION, Fields
 from ocp_torch.files.storage import write_atomically

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import torch
 
-from ocp_torch.control.controller import Controller, controller_file, load_controller
+from ocp_torch.control.controller import Controller
 from ocp_torch.control.described import problem_name
+from ocp_torch.control.saved import controller_file, load_controller
 from ocp_torch.errors import InputError, first_line
 from ocp_torch.files.reading import FOLDER, kind, require_file
 from ocp_torch.problems import PROBLEMS, Problem

@@ -13,7 +13,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ocp_torch.control.controller import load_controller
+from ocp_torch.control.saved import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.files.plain import NotPlain, json_object, looked_up, require_plain, yaml_mapping
 from ocp_torch.files.reading import read_json

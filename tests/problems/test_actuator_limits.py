@@ -13,8 +13,8 @@ from ocp_torch.certificate.lower.penalised import penalised
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.proof.rigorous import rigorous_lower_bound
 from ocp_torch.certificate.upper.penalised import density_bounds
-from ocp_torch.control.controller import load_controller
 from ocp_torch.control.policies import CLOSED, ValuePolicy, admissible_density, occupation_density
+from ocp_torch.control.saved import load_controller
 from ocp_torch.maths import jets
 from ocp_torch.problems import Torus
 from ocp_torch.problems.constants import resolve_constants

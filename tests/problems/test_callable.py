@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ocp_torch.cli.job import Job
-from ocp_torch.control.controller import load_controller
+from ocp_torch.control.saved import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.maths.jets import jet
 from ocp_torch.objectives import primal, saddle

@@ -19,8 +19,8 @@ from ocp_torch.certificate.proof.models import Box
 from ocp_torch.certificate.proof.rigorous import obstacle, rigorous_lower_bound
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.certificate.upper.penalised import density_bounds
-from ocp_torch.control.controller import load_controller
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, admissible_density, occupation_density, trained_policies
+from ocp_torch.control.saved import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.maths import jets
 from ocp_torch.objectives import Phase

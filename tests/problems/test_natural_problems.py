@@ -9,7 +9,7 @@ import torch
 from scipy.linalg import solve_continuous_are
 
 from ocp_torch import System
-from ocp_torch.control.controller import problem_name
+from ocp_torch.control.described import problem_name
 from ocp_torch.errors import InputError
 from ocp_torch.maths.runge_kutta import discounted_integral
 from ocp_torch.maths.supremum import supremum

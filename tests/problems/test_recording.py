@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.external.dataset import groups
 from ocp_torch.certificate.upper.recorded import closed_loop_samples
-from ocp_torch.control.controller import load_controller
 from ocp_torch.control.policies import NETWORK, trained_policies
+from ocp_torch.control.saved import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.maths.sampling import scrambled_sobol

@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from ocp_torch.control.controller import load_controller
+from ocp_torch.control.saved import load_controller
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.runs.build import build_problem
 from ocp_torch.runs.metrics.trial import METRICS, metrics

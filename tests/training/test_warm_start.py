@@ -12,9 +12,10 @@ from ocp_torch.certificate.report import table
 from ocp_torch.certificate.simulated import candidates
 from ocp_torch.certificate.simulated.performance import Simulation
 from ocp_torch.certificate.trained import TrainedContext
-from ocp_torch.control.controller import Controller, load_controller
+from ocp_torch.control.controller import Controller
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.pace import Pace
+from ocp_torch.control.saved import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.fields.fields import typical_sizes

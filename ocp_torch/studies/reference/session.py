@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from ocp_torch.control.controller import Controller, controller_file
+from ocp_torch.control.controller import Controller
 from ocp_torch.control.described import problem_name
+from ocp_torch.control.saved import controller_file
 from ocp_torch.errors import InputError, require_integer, require_section
 from ocp_torch.files.reading import FOLDER, kind, require_unlinked
 from ocp_torch.files.storage import write_atomically
