@@ -6,6 +6,7 @@ import inspect
 import platform
 import re
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import nn
@@ -139,25 +140,29 @@ def build_trainer(config: dict, problem: Problem | None = None) -> Trainer:
     require_memory("trainer.batch", settings.batch, settings.torch_dtype.itemsize * kept)
     stepper = _build_stepper(config, fields, objective, settings.steps, cost_unit(problem))
     average = call(averaged, "averaging", require_section("averaging", config["averaging"]), fields=fields)
-    sampler_name, section = _chosen("sampler", config["sampler"], SAMPLERS)
-    visited = section.pop("visited", None)
-    given = {"dim": problem.dim, "seed": seed, "dtype": settings.torch_dtype}
-    if problem.has_simulator:
-        sampler = call(SAMPLERS[sampler_name], "sampler", section, **given)
-    elif sampler_name == "importance":
-        raise InputError(
-            "sampler.name is importance, but a data set has no data where it was not recorded; leave it out."
-        )
-    elif settings.target_gap is not None:
-        raise InputError("trainer.target_gap is set, but a data set has no simulation to see a gap by.")
-    else:  # a data set has its own samples
-        assert isinstance(problem, Dataset)
-        sampler = RowSampler(problem.rows, seed, problem.recording.digest)
+    sampler, visited = _sampler(config, problem, settings, seed)
     batches = Batches(problem, fields, objective, sampler, settings.batch, seed, visited)
     warm = None if warm_start is None else ValueIteration(problem, fields.trajectory_value, warm_start, seed)
     run = (problem_name(problem), name)
     state = TrainState(run, config, fields, average, stepper, batches, Health.of(problem), constants, warm=warm)
     return Trainer(problem, objective, settings, network, seed, state, ranks=ranks)
+
+
+def _sampler(config: dict, problem: Problem, settings: TrainerSettings, seed: int) -> tuple[Any, Any]:
+    """The sampler of training states, and `sampler.visited`; a data set has states of its own."""
+    name, section = _chosen("sampler", config["sampler"], SAMPLERS)
+    visited = section.pop("visited", None)
+    if problem.has_simulator:
+        given = {"dim": problem.dim, "seed": seed, "dtype": settings.torch_dtype}
+        return call(SAMPLERS[name], "sampler", section, **given), visited
+    if name == "importance":
+        raise InputError(
+            "sampler.name is importance, but a data set has no data where it was not recorded; leave it out."
+        )
+    if settings.target_gap is not None:
+        raise InputError("trainer.target_gap is set, but a data set has no simulation to see a gap by.")
+    assert isinstance(problem, Dataset)
+    return RowSampler(problem.rows, seed, problem.recording.digest), visited
 
 
 def _warm_start(config: dict, problem: Problem, objective: Objective, constants: Constants) -> WarmStartSettings | None:
