@@ -15,7 +15,7 @@ from ocp_torch.certificate import (
 )
 from ocp_torch.certificate.lower.tightened import new_states
 from ocp_torch.certificate.settings import Progress
-from ocp_torch.certificate.upper.policy_evaluation import LARGER
+from ocp_torch.certificate.upper.policy_evaluation import STEEP_FACTOR
 from ocp_torch.fields import SUBSOLUTION, Fields
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem
@@ -84,7 +84,7 @@ class Evaluator:
         state, stage = self.state, settings.stage
         states = float(stage.steps * stage.batch)
         if settings.searches(state.constants) and self.trained.fields.value is not None and self.problem.has_simulator:
-            longest = LARGER * 2 ** (stage.rounds - 1)  # as beside kinks
+            longest = STEEP_FACTOR * 2 ** (stage.rounds - 1)  # as beside kinks
             states = states * longest + TRAINED_ON * new_states(self.problem, settings.points, settings.bound_steps)
         return QUICK_CERTIFICATES * self.seconds + states * state.seconds / max(state.samples, 1)
 

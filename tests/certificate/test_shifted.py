@@ -16,7 +16,7 @@ from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lower.mollified import DIRECTIONS, EVALUATIONS, Mollified, mollified_shift
 from ocp_torch.certificate.lower.sampled import SampledValue, attainable
 from ocp_torch.certificate.lower.shifted import Shift, climbed, highest, scaled_by
-from ocp_torch.certificate.lower.slack import TOP, Peaks, SlackParts, slack_function
+from ocp_torch.certificate.lower.slack import MAX_THETA, Peaks, SlackParts, slack_function
 from ocp_torch.certificate.lower.tightened import tightened
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.fields import Fields, PeriodicMLP, Subsolution
@@ -59,7 +59,9 @@ def test_a_peak_of_the_slack_in_a_hollow_counts():
     around = torch.tensor(PLACE) + 0.01 * (zoo.states(problem, 20_000) - 0.5)
     everywhere = torch.cat([around, *(samples.x for samples in sets)])
     true = SlackParts.of(L := Generator.of(problem, Samples.of(problem, everywhere)), L.jet(value))
-    best = max(t * shift.found.initial - float(true.slack(t).max()) for t in torch.linspace(0.0, TOP, 1501).tolist())
+    best = max(
+        t * shift.found.initial - float(true.slack(t).max()) for t in torch.linspace(0.0, MAX_THETA, 1501).tolist()
+    )
     assert shift.bound == pytest.approx(best, abs=2e-3)
     assert shift.looked.bound > best + 0.04
     searches = (shift.largest.ascents - 32) / (32 * 64)
@@ -103,7 +105,7 @@ def test_averages_take_off_narrow_spikes_and_are_not_asked_for_without_any():
 def test_the_multiple_is_the_best_on_a_line_of_multiples(problem):
     parts, initial = parts_of(problem, near(problem, 4, 0.2)), problem.exact_optimum
     bound = lambda theta: theta * initial - float(parts.slack(theta).max())
-    best = max(bound(theta) for theta in torch.linspace(0.0, TOP, 1501).tolist())
+    best = max(bound(theta) for theta in torch.linspace(0.0, MAX_THETA, 1501).tolist())
     assert bound(scaled_by(parts, initial)) >= best - 1e-9
 
 

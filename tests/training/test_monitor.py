@@ -9,7 +9,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ocp_torch.certificate import CertificateSettings, StageSettings
-from ocp_torch.certificate.upper.policy_evaluation import LARGER
+from ocp_torch.certificate.upper.policy_evaluation import STEEP_FACTOR
 from ocp_torch.control.policies import occupation_density
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
@@ -154,5 +154,5 @@ def test_the_time_that_is_told_counts_what_the_certificate_trains(monkeypatch):
     evaluator.seconds, trainer.state.seconds, trainer.state.samples = 2.0, 3.0, 1000
     assert evaluator.expected(plain) == pytest.approx(6.0 * 2.0 + 5000 * 0.003)
     searched = evaluator.expected(replace(plain, mollify=None))
-    assert searched == pytest.approx(6.0 * 2.0 + (LARGER * 5000 + TRAINED_ON * 40 * 2048) * 0.003)
+    assert searched == pytest.approx(6.0 * 2.0 + (STEEP_FACTOR * 5000 + TRAINED_ON * 40 * 2048) * 0.003)
     assert evaluator.expected(replace(plain, mollify=None, points=1024)) < searched

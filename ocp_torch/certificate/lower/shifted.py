@@ -15,9 +15,9 @@ from ocp_torch.certificate.bound import LOWER, Bound, sentence_on
 from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
 from ocp_torch.certificate.estimate import Estimate, integrals
 from ocp_torch.certificate.lower.slack import (
+    MAX_THETA,
     NEGLIGIBLE,
-    STARTS,
-    TOP,
+    STEEP_ASCENTS,
     Peaks,
     Scaled,
     SlackParts,
@@ -58,9 +58,9 @@ class Scaling(NamedTuple):
 class Shift:
     """The shifted bound of the best multiple of a ``value`` `W` on ``sets`` of samples of ``problem``.
 
-    The supremum of the slack is climbed from the ``ascents`` worst states, and sought ``beside`` too, and where `STARTS`
-    times as many ascents end from where it is steep. `W` is what ``name`` says, averaged over neighbours at ``radius`` where
-    that is not 0. All is computed when it is first asked for.
+    The supremum of the slack is climbed from the ``ascents`` worst of all states, those ``beside`` included, and sought in
+    steep places by `STEEP_ASCENTS` times as many ascents in each search. ``name`` is `W` in words; it is averaged over
+    neighbours at ``radius``, unless that is 0. Properties are computed when they are first asked for.
     """
 
     problem: Problem
@@ -101,7 +101,7 @@ class Shift:
     def peaks(self) -> Peaks:
         """Where ascents from steep places end, as far as more than what is known is in reach there."""
         slack, rough = (slack_function(self.problem, value) for value in (self.value, rounded(self.value)))
-        starts = STARTS * self.ascents
+        starts = STEEP_ASCENTS * self.ascents
         if self.radius:  # its peaks are as wide as that, and every value is of many states
             starts = max(1, starts // AVERAGED)
         return steep_peaks(slack, rough, self.problem.dim, starts, self._plain.value, self.looked.initial)
@@ -180,8 +180,8 @@ def climbed(problem: Problem, value: Field, parts: SlackParts, theta: float, asc
 
 
 def scaled_by(parts: SlackParts, initial: float) -> float:
-    """The `theta` in `[0, TOP]` that maximises the sampled bound, concave in `theta`."""
-    return minimiser(lambda theta: float(parts.slack(theta).max()) - theta * initial, 0.0, TOP)
+    """The `theta` in `[0, MAX_THETA]` that maximises the sampled bound, concave in `theta`."""
+    return minimiser(lambda theta: float(parts.slack(theta).max()) - theta * initial, 0.0, MAX_THETA)
 
 
 class Shifted(Bound):

@@ -15,12 +15,12 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
 # The largest theta that is tried.
-TOP = 1.5
+MAX_THETA = 1.5
 # A search for peaks in steep places: its ascents for each one from the largest values, and the states that are looked at for
 # each of its own. How many searches are made at most, and after how many in a row that found nothing no more. Of hidden peaks
 # of .09 and .30 % of a bound in three and two coordinates 8 of 8 seeds found all by 3 to 5 searches in 3 s; of one of 1.07 %
 # in five .75 to 1.07 by 3 to 7 in 4 s.
-STARTS, STEEPEST = 64, 8
+STEEP_ASCENTS, STEEPEST = 64, 8
 SEARCHES, FRUITLESS = 8, 2
 # Of each search so many of the highest ends climb to their tops: a peak of .09 % of a bound was .03 % high before.
 FINISHED = 32

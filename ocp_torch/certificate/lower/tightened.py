@@ -16,7 +16,7 @@ from collections.abc import Generator
 import torch
 from torch import Tensor, nn
 
-from ocp_torch.certificate.lower.slack import STARTS, slack_function, steep_peaks
+from ocp_torch.certificate.lower.slack import STEEP_ASCENTS, slack_function, steep_peaks
 from ocp_torch.certificate.lower.worst import WorstStates
 from ocp_torch.fields.fields import VALUE, Fields, cost_unit
 from ocp_torch.fields.rounded import rounded
@@ -80,7 +80,7 @@ def tightened(
     try:
         for step in range(count):
             if step == count - count // LAST:
-                starts = STARTS * ASCENTS * states // BATCH
+                starts = STEEP_ASCENTS * ASCENTS * states // BATCH
                 draw.remember(hidden_peaks(problem, average.module.value, draw.worst.x, starts, generator))
             with torch.enable_grad():
                 advance(stepper, average, draw, phase)

@@ -12,7 +12,7 @@ class Evaluation(Bound):
     """`Perf(u) <= E[V mu0] + eps_hi`, also of a controller that jumps."""
 
     name, side, label = "evaluation", UPPER, "evaluation"
-    end = 1  # of the interval in which the performance lies
+    end = 1  # the upper end of `ClosedLoopBounds.sandwich`
 
     def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
         return (found_by_search("sup |Q_u|"),)

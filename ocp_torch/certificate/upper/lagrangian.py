@@ -9,14 +9,14 @@ that, and what is said along trajectories holds in the mean over paths (Ito's fo
    `eps_lo = sup max(Q_u, 0)` and `eps_hi = sup max(-Q_u, 0)`.
 2. `V^u` has Bellman slack 0, so by parts `E[V^u mu0] = E[(f + R(u)) mu + V^u r]` for every `mu`: with `V^u = V + (V^u - V)`,
    `Perf(u) = E[(f + R(u)) mu + V r] + E[(V^u - V) r]`, and by 1 the last term is at most
-   `eps_hi E[max(r, 0)] + eps_lo E[max(-r, 0)]`. That sum is the **Lagrangian bound**: wrong by a product of two errors.
+   `eps_hi E[max(r, 0)] + eps_lo E[max(-r, 0)]`. That sum is the **Lagrangian bound**, off by a product of two errors.
 3. By parts again `E[(f + R(u)) mu + V r] = E[V mu0 - mu Q_u]`: the same number with far less variance.
 4. `0 <= V^u <= C_V` with `C_V = sup V + eps_hi` gives `J = E[(f + R(u)) mu + C_V max(r, 0)]`, with `w = mu u`, for the
    smallest `C_V` that these facts prove for this very controller.
-5. All this holds for every function `W` of `V` too, and the best one of some is taken (`LoweredSlack`).
-6. And for every multiple `s mu`, with residual `mu0 - s (mu0 - r)`, and each bound is convex in `s`. Where
-   `Q_u` is deep on one side only, as at kinks, a little more mass (`s > 1`) makes the dear side of `r` rare. Each half
-   of the sets is evaluated with the `s` that is best on the other half: the search does not flatter the bound.
+5. All this holds for every function `W` of `V` too, and the best of a few is taken (`LoweredSlack`).
+6. It holds for every multiple `s mu`, whose residual is `mu0 - s (mu0 - r)`, and each bound is convex in `s`. Where `Q_u`
+   is large on one side only, as at kinks, a little more mass (`s > 1`) makes the costly side of `r` rare. Each half of the
+   sets is evaluated with the `s` that is best on the other half, so that the search does not flatter the bound.
 """
 
 from dataclasses import dataclass, replace
@@ -53,14 +53,14 @@ class ClosedLoopBounds:
     C_V: float
     eps_hi: Extremum
     eps_lo: Extremum
-    below: Estimate  # of Perf(u) from below: 2. with the signs turned
+    below: Estimate  # a lower bound on Perf(u): 2. with its signs reversed
     sandwich: tuple[Estimate, Estimate]  # E[V mu0] - eps_lo <= Perf(u) <= E[V mu0] + eps_hi, by 1. alone
     hidden: Hidden | None  # a divergence that the residual does not see: only the sandwich stands then
-    contributions: list[list[Tensor]]  # of `lagrangian` and `J`, parts of each
+    contributions: list[list[Tensor]]  # weighted integrands of `lagrangian` and `J` over their values
     sup_occupation: float  # the largest `mu` met
     occupation: Field  # `mu` itself
-    how: Lowering  # the function of `V` that all this is of
-    sought: Peaks  # of its slack, in steep places
+    how: Lowering  # the function `W` of `V` that the bounds use
+    sought: Peaks  # peaks of its slack in steep places
 
 
 def closed_loop_bounds(
@@ -74,8 +74,8 @@ def closed_loop_bounds(
     odd: Tensor | None = None,
     sought: Peaks | None = None,
 ) -> ClosedLoopBounds:
-    """All bounds on ``sets`` of samples of ``loop``; suprema are climbed from the worst of them and of the states ``odd``
-    ``(K, d)``, and sought in steep places, unless they have been ``sought`` there for other sets. ``initial``, if given, is
+    """All bounds of ``loop`` on ``sets`` of its samples. Suprema are climbed from the worst of these and of states ``odd``
+    ``(K, d)``, and sought in steep places, unless they were ``sought`` there for other sets. ``initial``, if given, is
     `E[V mu0]` per set from more states: it carries nearly all of the variance."""
     found = [terms_on(Generator.of(loop, samples), value, log_occupation) for samples in sets]
     plain, _, densities, fluxes = zip(*found, strict=True)
@@ -95,15 +95,15 @@ def closed_loop_bounds(
         values = torch.cat([values, batched(value, odd)])
         mu = torch.cat([mu, batched(occupation, odd)])
     highest = max(climbed_from(value, values, states, ascents).value, 0.0)
-    top = float(how(values.new_tensor(highest)))  # as W grows with V
+    top = float(how(values.new_tensor(highest)))  # sup W, since W grows with V
     hi, lo, C_V = eps_hi.value, eps_lo.value, top + eps_hi.value
     started = [integral(t.samples, t.v * t.samples.mu0) for t in terms]
-    if initial:  # of V itself
+    if initial:  # the mean of V from more states, that of W - V from these
         own_means = [integral(t.samples, t.v * t.samples.mu0) for t in plain]
         started = [e + mean - of_v for e, mean, of_v in zip(initial, started, own_means, strict=True)]
 
     def bound(integrand: Integrand, sign: float = 1.0) -> tuple[Estimate, list[Tensor]]:
-        """`E[V mu0]` and ``sign`` times the mean of ``integrand``; and the weighted integrand for `mu` itself."""
+        """`E[W mu0]` plus ``sign`` times the mean of ``integrand``; and the weighted integrand for `mu` itself, per set."""
         excess = best_multiples(terms, integrand)
         found = Estimate.of([e + sign * x for e, x in zip(started, excess, strict=True)])
         weighted = [t.samples.weight * integrand(t, 1.0) for t in terms]
@@ -143,7 +143,7 @@ class Lagrangian(Bound):
 
 
 class LagrangianBelow(Lagrangian):
-    """The same with the signs turned: it bounds the performance of a given controller from below."""
+    """The Lagrangian bound with its signs reversed: a lower bound on the performance of a given controller."""
 
     side = PERFORMANCE
 
@@ -155,7 +155,7 @@ class LagrangianBelow(Lagrangian):
 
 
 def slack_searches(found: ClosedLoopBounds | None) -> list[str]:
-    """How the two suprema of the slack behind ``found`` were found."""
+    """How the two suprema of the slack behind ``found`` were found, a sentence each."""
     if found is None:
         return []
     named = lambda what: f"{what} of {found.how}"

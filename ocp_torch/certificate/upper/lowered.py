@@ -1,10 +1,9 @@
-r"""The slack of functions made of `V` along one closed loop, and the one for which the Lagrangian bound is lowest.
+r"""The slack of functions `W` of `V` along one closed loop, and the `W` with the lowest Lagrangian bound.
 
-The bound holds for each `W = V - s h(V)`, and is convex in `s` as `Q_u` is linear in `V`. Here `h(V)` is `V` itself, so that
-`W` is a multiple of it, or what of `V` lies above some height. Where `V` is a little too large at its maxima, where kinks
-cross, `sup Q_u` is all there: on a torus in two dimensions `sup Q_u` was .004 for `W = V` and .0001 for `W = .987 V`, and the
-bound .067 and .031 % above the optimum. A multiple has its price wherever `V` is not 0: where `W` had .98 of only what of `V`
-is above half of its largest, the bound was .015 % above.
+The bound holds for each `W = V - s h(V)`, and is convex in `s` as `Q_u` is linear in `W`. Here `h(V)` is `V` itself, so that
+`W` is a multiple of `V`, or the part of `V` above a height. Where kinks cross, `V` is a little too large at its maxima, and
+`sup Q_u` is attained there alone: on a torus in two dimensions it was .004 for `W = V` and .0001 for `W = .987 V`, and the
+bound .067 and .031 % above the optimum. Lowering `V` only above half of its largest value brought the bound to .015 %.
 """
 
 from collections.abc import Callable
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.estimate import integral
-from ocp_torch.certificate.lower.slack import STARTS, TOP, Peaks, steep_peaks
+from ocp_torch.certificate.lower.slack import MAX_THETA, STEEP_ASCENTS, Peaks, steep_peaks
 from ocp_torch.certificate.upper.multiples import Terms, best_multiple
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields.rounded import rounded
@@ -25,21 +24,23 @@ from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.generator import Generator, pull_back
 from ocp_torch.problems.samples import Samples
 
-# What another function must give, relative to `|E[V mu0]|`: less is rounding.
-LEAST = 1e-7
-# Heights above which `V` is lowered, in parts of its range, and within which part of what is left the slope changes. Of eight
-# heights on four tori .3 was best three times and .8 once; .5 to .9 differ little where the spike is at the top alone.
-HEIGHTS, BEND = (0.3, 0.6, 0.9), 0.25
-# Ascents may find a spike that another function of `V` makes lower: the best one is sought, and its slack climbed, so many
-# times, or until no ascent ends higher than that part above what was met, or the bound rises by less than that part of
-# `|E[V mu0]|`: where `V` solves its equation higher spikes are always found, and hardly count. In eight coordinates the
-# ascents then take 2.2 s for 3.7.
-TIMES, HIGHER, RISE = 4, 0.01, 1e-6
+# Another function must lower the bound by more than this part of `|E[V mu0]|`: less is rounding.
+LEAST_GAIN = 1e-7
+# Heights above which `V` is lowered, as parts of its range: of eight heights on four tori .3 was best three times, .8 once.
+HEIGHTS = (0.3, 0.6, 0.9)
+# The slope of `h` grows from 0 to 1 within this part of the range above the height.
+BEND = 0.25
+# How often at most the best function is chosen and its slack climbed: another one may lower a spike that ascents find.
+MOST_CHOICES = 4
+# That ends where no supremum grows by more than this part of itself,
+GROWTH = 0.01
+# or where the bound rises by no more than this part of `|E[V mu0]|`: ascents in eight coordinates take 2.2 s instead of 3.7.
+BOUND_RISE = 1e-6
 
 
 @dataclass(frozen=True)
 class Above:
-    """`h(v)`: 0 below ``height``, of slope 1 from ``width`` above it on, a parabola between; `v` where there is no height."""
+    """`h(v)`: 0 below ``height``, of slope 1 above ``height + width``, a parabola between; `h(v) = v` without a height."""
 
     height: float | None = None
     width: float = 0.0
@@ -55,7 +56,7 @@ class Above:
 
 
 class Lowering(NamedTuple):
-    """``by`` times what of `V` is ``above``."""
+    """`W = V - by h(V)` for the `h` that ``above`` is."""
 
     above: Above = Above()
     by: float = 0.0
@@ -65,7 +66,7 @@ class Lowering(NamedTuple):
         return v - self.by * self.above(v)[0]
 
     def jet(self, V: Jet, sigma: Tensor | None = None) -> Jet:
-        """That of `W`, with its curvature along ``sigma`` ``(N, d, k)``, for that of `V`."""
+        """The jet of `W`, with its curvature along ``sigma`` ``(N, d, k)``, from the jet of `V`."""
         h, slope, bend = self.above(V.value)
         steep = 1.0 - self.by * slope
         curvature = None if sigma is None else steep * V.curvature - self.by * bend * spread(sigma, V)
@@ -85,7 +86,7 @@ def spread(sigma: Tensor, V: Jet) -> Tensor:
 
 
 class Met(NamedTuple):
-    """States, and `V`, its slack, `L^u V / rho` and its `spread` over `rho` there."""
+    """States ``(N, d)``, and there `V`, its slack, `L^u V / rho` and its `spread` over `rho`, each ``(N,)``."""
 
     x: Tensor
     v: Tensor
@@ -101,18 +102,18 @@ class Met(NamedTuple):
         return cls(samples.x, V.value, loop.hjb_slack(V), zero if moved is None else moved, varied)
 
     def part(self, above: Above) -> Tensor:
-        """What the slack of `W` is less than that of `V`, for each unit of ``by``."""
+        """The slack of `V` less that of `W`, per unit of ``by``, ``(N,)``."""
         h, slope, bend = above(self.v)
         return h - slope * self.transport - bend * self.spread
 
     def of(self, how: Lowering) -> Tensor:
-        """`Q_u` of `W`."""
+        """`Q_u` of `W`, ``(N,)``."""
         return self.slack - how.by * self.part(how.above)
 
 
 class LoweredSlack:
-    """`Q_u` of any `W` on ``samples`` of ``loop``; its suprema are sought there, at the states ``odd`` ``(K, d)`` too, where
-    ascents have ended (`climb`), and at the peaks that were ``sought`` before, on other samples."""
+    """`Q_u` of any `W` on ``samples`` of ``loop``. Its suprema are the largest values there, at states ``odd`` ``(K, d)``,
+    at the peaks that were ``sought`` before, on other samples, and where ascents have ended (`climb`, `seek`)."""
 
     @torch.no_grad()
     def __init__(
@@ -126,11 +127,11 @@ class LoweredSlack:
         heights = [low + part * (high - low) for part in HEIGHTS] if high > low else []
         self.choices = [Above(), *(Above(height, BEND * (high - height)) for height in heights)]
         for x in (self.sought.x, odd):
-            if x is not None and len(x):  # a controller of somebody else's may refuse to be asked for no state
+            if x is not None and len(x):  # a given controller may refuse an empty batch
                 self._meet(x)
 
     def _meet(self, x: Tensor) -> None:
-        """From now on the states ``x`` count too."""
+        """Include the states ``x`` ``(K, d)`` in the suprema from now on."""
         there = Generator.of(self.loop, Samples.of(self.loop, x, divergences=False))
         self.met = Met(*map(torch.cat, zip(self.met, Met.at(there, self.value), strict=True)))
 
@@ -140,11 +141,11 @@ class LoweredSlack:
         return max(abs(self.initial), 1e-30)
 
     def suprema(self, how: Lowering = UNCHANGED) -> tuple[float, float]:
-        """`eps_hi` and `eps_lo` of `W`, as met."""
+        """`eps_hi` and `eps_lo` of `W` over all states met so far."""
         return _sides(self.met.of(how))
 
     def _slack_of(self, how: Lowering, value: Field) -> Field:
-        """`x -> Q_u(x)` of `W`, made of ``value``, which is `V` or nearly so."""
+        """`x -> Q_u(x)` of `W`, made of ``value``: `V`, or `V` in single precision."""
         policy = self.loop.policy
         own = policy if isinstance(policy, ValuePolicy) and policy.value is self.value else None
 
@@ -153,23 +154,23 @@ class LoweredSlack:
             generator = Generator.of(problem, Samples.live(problem, x))
             V, data = generator.jet(value), generator.data
             W = how.jet(V, data.noise)
-            # Of the controller of `V` one jet gives the control and the slack.
+            # One jet of `V` gives both the control and the slack of the controller from `V`.
             return generator.hjb_slack(W) if own is None else generator.bellman_slack(W, own.control(data.B, V))
 
         return slack
 
     @torch.no_grad()
     def climb(self, how: Lowering, ascents: int, steps: int = 60) -> None:
-        """Meet the ends of so many ``steps`` of ``ascents`` from where the slack of `W` is smallest and largest."""
+        """Include the ends of ``ascents`` from where the slack of `W` is largest, and of descents; each takes ``steps``."""
         self._meet(extremes(self._slack_of(how, self.value), self.met.x, self.met.of(how), ascents, steps))
 
     @torch.no_grad()
     def seek(self, how: Lowering, ascents: int) -> bool:
-        """Meet the peaks of the slack of `W` in steep places, and of what it is below 0, by `STARTS` times as many ascents or
-        more, and say whether any is higher than what was met before."""
+        """Include peaks of the slack of `W`, and of its negative, in steep places, sought by `STEEP_ASCENTS` times as many
+        ascents in each search; return whether any is higher than all that was met before."""
         slack, rough = (self._slack_of(how, value) for value in (self.value, rounded(self.value)))
         below, roughly_below = (lambda x: -slack(x)), (lambda x: -rough(x))
-        met, dim, starts = self.met.of(how), self.samples.x.shape[1], STARTS * ascents
+        met, dim, starts = self.met.of(how), self.samples.x.shape[1], STEEP_ASCENTS * ascents
         for exact, near, known in ((slack, rough, met.max()), (below, roughly_below, -met.min())):
             peaks = steep_peaks(exact, near, dim, starts, float(known), self.unit)
             if len(peaks.x):
@@ -178,7 +179,7 @@ class LoweredSlack:
         return any(now > seen for now, seen in zip(self.suprema(how), _sides(met), strict=True))
 
     def extrema(self, how: Lowering, ascents: int) -> tuple[Extremum, Extremum]:
-        """`suprema`, and where they were met: by so many ``ascents`` among others."""
+        """`suprema`, where they were met, and the number of ascents: ``ascents`` and those in steep places."""
 
         def largest(side: Tensor) -> Extremum:
             top, seen = int(side.argmax()), len(self.sampled.x)
@@ -189,39 +190,39 @@ class LoweredSlack:
         return largest(-slack), largest(slack)
 
     def climbed_lowest(self, terms: Terms, ascents: int) -> Lowering:
-        """The best `W`, for the ``terms`` of any density, of those whose slack was climbed, by all that was met."""
+        """The `W` with the lowest bound for the ``terms`` of a density, among those whose slack was climbed."""
         tried: list[Lowering] = []
         bound = lambda how: self._along(terms, how.above)(how.by)[0]
-        for _ in range(TIMES):
+        for _ in range(MOST_CHOICES):
             lowest, how = self.lowest(terms)
             tried.append(how)
             before = self.suprema(how)
             self.climb(how, ascents)
-            higher = any(now > (1.0 + HIGHER) * seen for now, seen in zip(self.suprema(how), before, strict=True))
-            if not higher or bound(how) <= lowest + RISE * self.unit:
+            higher = any(now > (1.0 + GROWTH) * seen for now, seen in zip(self.suprema(how), before, strict=True))
+            if not higher or bound(how) <= lowest + BOUND_RISE * self.unit:
                 break
         return min(tried, key=bound)
 
     @torch.no_grad()
     def lowest(self, terms: Terms) -> tuple[float, Lowering]:
-        """The lowest Lagrangian bound for the ``terms`` of any density, with the suprema met, among all multiples of it and
-        all `W`; and which that is, `V` itself where no other does better.
+        """The lowest Lagrangian bound for the ``terms`` of a density, by the suprema met, among multiples of the density and
+        all `W`; and its `W`: `V` itself where no other is lower by `LEAST_GAIN`.
 
-        By parts `E[W mu0 - mu Q_u]` of `W` is that of `V` less `s E[h(V) r]`, which scatters little: none is chosen by
+        By parts `E[W mu0 - mu Q_u]` for `W` is that for `V` less `s E[h(V) r]`, which scatters little: no `W` is chosen by
         chance.
         """
         lowest, scale = self._along(terms, Above())(0.0)
         how = UNCHANGED
         for above in self.choices:
             bound = self._along(terms, above)
-            by = minimiser(lambda by: bound(by, scale)[0], 1.0 - TOP, 1.0)  # noqa: B023
+            by = minimiser(lambda by: bound(by, scale)[0], 1.0 - MAX_THETA, 1.0)  # noqa: B023
             found, _ = bound(by)
-            if found < lowest - LEAST * self.unit:
+            if found < lowest - LEAST_GAIN * self.unit:
                 lowest, how = found, Lowering(above, by)
         return lowest, how
 
     def _along(self, terms: Terms, above: Above) -> Callable[..., tuple[float, float]]:
-        """By `s`, the bound of `W` and the multiple of the density: the best one, where none is given."""
+        """A function of `s` and a multiple of the density, by default the best: the bound with `W`, and that multiple."""
         part, h = self.met.part(above), above(terms.v)[0]
 
         def bound(by: float, scale: float | None = None) -> tuple[float, float]:
@@ -233,11 +234,11 @@ class LoweredSlack:
         return bound
 
     def excess(self, terms: Terms) -> float:
-        """What the residual adds to that bound, relative to `|E[V mu0]|`: what it is above `E[V mu0 - mu Q_u]`."""
+        """The `lowest` bound less `E[V mu0 - mu Q_u]`, relative to `|E[V mu0]|`: what the residual adds to it."""
         return (self.lowest(terms)[0] - self.initial + integral(self.samples, terms.spent)) / self.unit
 
 
 def _sides(slack: Tensor) -> tuple[float, float]:
-    """`eps_hi` and `eps_lo` of a ``slack``."""
+    """`eps_hi` and `eps_lo` of a ``slack`` ``(N,)``."""
     low, high = slack.aminmax()
     return max(-float(low), 0.0), max(float(high), 0.0)

@@ -21,13 +21,13 @@ class MinimisedPrimal(Bound):
         return context.densities.G if context.densities else None
 
     def valid(self, context: Context) -> bool:
-        """It takes the divergence of `B w`: `w` is smooth, so that jumps of the problem alone make it wrong."""
+        """`G` takes the divergence of `B w`: `w` is smooth, so that only jumps of the problem make it wrong."""
         jump = context.observed.jump
         jumps = jump is not None and jump.in_problem
         return context.hidden is None and not jumps and context.posed.smooth_seam
 
     def about(self, context: Context) -> str | None:
-        """`G` bounds the performance of `w` over the `mu` of Lemma 2, where no value of that exceeds `C_V`."""
+        """`w` over the `mu` of Lemma 2, whose performance `G` bounds where none of its simulated values exceeds `C_V`."""
         name = DENSITY if context.occupation == CLOSED else MINIMISED
         return name if name in context.candidates and context.value_holds_of(name) else None
 

@@ -1,4 +1,4 @@
-"""What bounds of a closed loop are made of, and the best multiple of `mu`: they hold for each, and are convex in it."""
+"""The terms of the bounds of a closed loop, and the best multiple of `mu`: bounds hold for each, and are convex in it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,8 +19,8 @@ MULTIPLES = (0.0, 2.0)
 
 @dataclass(frozen=True)
 class Terms:
-    """What the bounds on one set of states are made of: `V`, `mu Q_u` and `r`, each ``(N,)``. By the numbers of `lagrangian`,
-    its methods are the integrands, ``(N,)``, of the bounds of ``scale`` times `mu`, without `E[V mu0]`."""
+    """`V` (``v``), `mu Q_u` (``spent``) and `r` on one set of samples, each ``(N,)``. The methods give integrands ``(N,)`` of
+    bounds with ``scale`` times `mu`, without `E[V mu0]`; their numbers are those of `lagrangian`."""
 
     samples: Samples
     v: Tensor
@@ -32,26 +32,26 @@ class Terms:
         return self.samples.mu0 - scale * (self.samples.mu0 - self.r)
 
     def lagrangian(self, scale: float, hi: float, lo: float) -> Tensor:
-        """Of 2.: `hi max(r, 0) + lo max(-r, 0) - mu Q_u`."""
+        """Bound 2: `hi max(r, 0) + lo max(-r, 0) - mu Q_u`."""
         r = self.residual(scale)
         return hi * r.clamp_min(0.0) + lo * (-r).clamp_min(0.0) - scale * self.spent
 
     def J(self, scale: float, C_V: float) -> Tensor:
-        """Of 4.: `C_V max(r, 0) - V r - mu Q_u`."""
+        """Bound 4: `C_V max(r, 0) - V r - mu Q_u`."""
         r = self.residual(scale)
         return C_V * r.clamp_min(0.0) - self.v * r - scale * self.spent
 
     @staticmethod
     def join(terms: "Sequence[Terms]") -> "Terms":
-        """All states of ``terms`` in one."""
+        """The terms of all sets as those of one."""
         columns = (torch.cat([getattr(t, name) for t in terms]) for name in ("v", "spent", "r"))
         return Terms(Samples.concatenate([t.samples for t in terms]), *columns)
 
 
 @torch.no_grad()
 def terms_on(loop: Generator, value: Field, log_occupation: Field) -> tuple[Terms, Tensor, Tensor, Flux]:
-    """The terms of any ``value`` and ``log_occupation`` on the samples of a closed loop; `Q_u` and `mu` ``(N,)`` there, and
-    the flux `mu g_u - div(D mu)`."""
+    """The terms of any ``value`` and ``log_occupation`` on the samples of ``loop``; `Q_u` and `mu` ``(N,)`` there; and the
+    flux `mu g_u - div(D mu)` over `rho`."""
     samples, V = loop.data, loop.chunked_jet(value)
     slack = loop.hjb_slack(V)
     parts = [replace(loop, data=part).occupation_flux(log_occupation) for part in samples.split(CHUNK)]

@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 
 class DensityBounds(NamedTuple):
-    """`J`, `G` where there is no drift, and a divergence that neither sees, if one was found: they stand without."""
+    """`J`; `G` where there is neither drift nor noise; a divergence that both miss, if one was found: neither holds then."""
 
     J: Estimate
     G: Estimate | None
     hidden: Hidden | None
-    contributions: list[list[Tensor]]  # of `J` and `G`, as parts of each
+    contributions: list[list[Tensor]]  # weighted integrands of `J` and `G`, over their values
 
 
 def density_bounds(
@@ -53,7 +53,7 @@ def density_bounds(
 
 @torch.no_grad()
 def _upper_integrands(problem, control_density, occupation, samples: Samples, C_V: float):
-    """The integrands of `J` and, where nothing moves by itself, `G`; the flux's divergence, and the flux."""
+    """The integrands of `J` and, without drift and noise, of `G`; the flux's divergence, and the flux."""
     cost, rho = problem.control_cost, problem.discount
     generator = Generator.of(problem, samples)
     w, inflow = generator.control_inflow(control_density)
@@ -61,7 +61,7 @@ def _upper_integrands(problem, control_density, occupation, samples: Samples, C_
     if problem.still:
         mu = occupation(samples.x)
         finite, G = torch.isfinite(mu), cost.primal_minimum(w, samples.f, C_V, inflow)
-        # An infinite mu stands still at no cost where f = 0: the closed minimum has that limit, J needs the number.
+        # An infinite mu stands still at no cost where f = 0: J has the limit there that the closed form G gives.
         J = generator.primal_integrand(w, torch.where(finite, mu, 1.0), inflow - mu, C_V)
         return torch.where(finite, J, G), G, spread, pushed
     mu, drifted, carried = generator.drift_flux(occupation)
@@ -70,7 +70,7 @@ def _upper_integrands(problem, control_density, occupation, samples: Samples, C_
 
 
 class PenalisedPrimal(Bound):
-    """The lower `J` of two: that of the trained `w` and `mu`, and that of the density fitted to the closed loop."""
+    """The lower of two `J`: that of the trained `w` and `mu`, and that of the density fitted to the closed loop."""
 
     name, side, label = "J", UPPER, "J"
 
@@ -89,7 +89,7 @@ class PenalisedPrimal(Bound):
         return context.hidden is None
 
     def about(self, context: "Context") -> str | None:
-        """`J` bounds the performance of the controller whose closed loop was fitted, or of `w / mu` if that was looked at."""
+        """The controller whose closed loop was fitted if that `J` is shown, or `w / mu` if that is the one followed."""
         return context.followed if context.takes_fitted_J or context.followed == DENSITY else None
 
     def notes(self, context: "Context", shown: Estimate | None) -> list[str]:

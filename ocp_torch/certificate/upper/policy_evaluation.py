@@ -25,28 +25,36 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import advance, short_fit
 from ocp_torch.steppers.fitting import LARGEST_RATE
 
-# The closed loop's data are computed once on so many states at most: their divergences cost more than a step.
+# Samples of a closed loop at most, which are then drawn again: their divergences cost more than a step.
 POOL = 2**15
-# Where the slack is more than that part of `|E[V mu0]|`, as beside kinks (1.1 on the circle), only the last and longest round
-# is made, on batches so many times as large, and ends as soon as the excess will do: of a torus in two dimensions the
-# Lagrangian bound was .04 % above the optimum after 800 steps of 512 states, .06 % after rounds of 400 and 800 of 256, which
-# took longer; in three .08 and .12 %.
-STEEP, LARGER = 0.1, 2
-# Beyond that ratio of the two suprema of the slack the residual is not weighed any more lopsidedly.
-MOST_LOPSIDED = 16.0
-# Where `mu` is nearly 0 so is every gradient of the fit, and large first steps may lead there (dubins with noise: two seeds
-# of three, one for good). A fit is begun anew at so many times its rate, no slower than the last number, if after so many
-# steps `mu` has less mass than this.
-LOOKED_AT, LEAST_MASS, SLOWER, SLOWEST = 40, 0.01, 0.3, 1e-3
-# Ascents of either sign, and their steps: of 64 coordinates the largest slack at 4,096 states was .1 where they found 7.
-PEAKS, CLIMBED = 32, 40
-# States at which the excess is computed after a round, and that are made at once: what decides need not be exact. In the
-# first one that is made it is also looked at after so many steps, and then again after each so many, and the round ends once
-# the excess is that part of what is good enough: where the slack is steep the last number (at 1 the circle's certified gap
-# was .002 % wider than with a round of 300 steps), elsewhere the other, as any `mu` will do where `V` solves its equation.
-# After 25 steps that is so already (an excess of 5e-6 in 16 coordinates), but where the certificate then finds spikes of the
-# slack the bound was 5e-5 above the optimum, after 100 steps 5e-6.
-EXCESS_STATES, EXCESS_FIRST, EXCESS_EVERY, EXCELLENT, GOOD = 4096, 100, 25, 0.05, 0.5
+# A largest slack above this part of `|E[V mu0]|` is steep, as beside kinks: only the last, longest round is then made.
+STEEP = 0.1
+# Factor on the batch where the slack is steep: on a torus in two dimensions the Lagrangian bound was .04 % above the optimum
+# after 800 steps of 512 states, and .06 % after rounds of 400 and 800 steps of 256.
+STEEP_FACTOR = 2
+# The ratio of the two suprema of the slack, by which the residual is weighed, is cut off here and at the inverse.
+LARGEST_RATIO = 16.0
+# The step at which a first round is checked for a collapse to `mu = 0`, where every gradient of the fit vanishes.
+COLLAPSE_STEP = 40
+# A mass of `mu` below this is a collapse, and the fit is begun anew (dubins with noise: two seeds of three).
+LEAST_MASS = 0.01
+# Factor on the learning rate of a fit that is begun anew.
+RESTART_FACTOR = 0.3
+# Fits at this learning rate or less are not checked for a collapse.
+LEAST_CHECKED_RATE = 1e-3
+# Ascents of either sign to the slack's suprema: in 64 coordinates they found 7, where 4,096 states showed .1.
+ASCENTS = 32
+ASCENT_STEPS = 40
+# States at which the excess of the bound is computed to decide whether a fit is good enough, and that are made at once.
+EXCESS_STATES = 4096
+# Steps after which the first round may end: in 16 coordinates the bound was 5e-6 above the optimum after 100, 5e-5 after 25.
+EXCESS_FIRST = 100
+# Steps between two looks at the excess from then on.
+EXCESS_EVERY = 25
+# Part of `good_excess` at which the first round ends early: any `mu` will do where `V` solves its equation.
+EARLY_PART = 0.05
+# The same where the slack is steep: at 1 the circle's certified gap was .002 % wider than after a round of 300 steps.
+STEEP_EARLY_PART = 0.5
 
 
 @dataclass(frozen=True)
@@ -54,9 +62,9 @@ class StageSettings:
     """Budget of policy evaluation, `certificate.stage` of a configuration. Raises `InputError` on a wrong value."""
 
     steps: int = 300  # least-squares steps in the first round; 0 for none at all
-    rounds: int = 3  # at most, each twice as long as the one before; beside kinks the last one alone
+    rounds: int = 3  # at most, each twice as long as the one before; where the slack is steep the last one alone
     good_excess: float = 1e-4  # part of the Lagrangian bound that comes from the residual, below which rounds end
-    batch: int = 256  # states per step; beside kinks `LARGER` times as many
+    batch: int = 256  # states per step; `STEEP_FACTOR` times as many where the slack is steep
     lr: float = 1.0e-2  # learning rate, with cosine decay in each round
 
     def __post_init__(self) -> None:
@@ -77,17 +85,17 @@ def fit_closed_loop(
     seed: int,
     pool: "Pool | Drawn | None" = None,
 ) -> Fields:
-    """Fields with `log mu^u`, and with `V^u` where ``fields`` hold no `V`, of the closed loop of ``policy``.
+    """Fit `log mu^u`, and `V^u` where ``fields`` hold no `V`, to the closed loop of ``policy``; return the fitted fields.
 
-    ``fields`` are the trained ones, ``policy`` one of theirs in their precision; their `log mu`, if any, is the start. With
-    no ``fields`` the policy is somebody's own, in float64, and both `mu` and `V` are fitted in float32. ``pool``
-    is where samples of the closed loop come from, by default from evaluations at Sobol points.
+    ``policy`` is made of the trained ``fields``, in their precision; the fit starts from their `log mu`, if any. Without
+    ``fields`` the policy is a given one in float64, and both `mu` and `V` are fitted in float32. ``pool`` gives samples of
+    the closed loop, by default from evaluations at Sobol points.
     """
     trained = None if fields is None else fields.value
     like = torch.zeros(()) if fields is None else next(fields.parameters())
     loop = ClosedLoop(problem, policy)
     names = (LOG_OCCUPATION, VALUE) if trained is None else (LOG_OCCUPATION,)
-    known = getattr(trained, "embedding", None)  # has the waves that were found in the slack of V too
+    known = getattr(trained, "embedding", None)  # its waves include those found in the slack of V
     waves = known.mixed if isinstance(known, FourierEmbedding) else None
     fitted = Fields.build(problem, names, network, derive_seed(seed, Branch.POLICY_EVALUATION, 0), waves).to(like)
     if fields is not None and fields.log_occupation is not None:
@@ -97,17 +105,17 @@ def fit_closed_loop(
     judged = pool.samples.take(slice(EXCESS_STATES))
     fixed = None if trained is None else LoweredSlack(loop, trained, judged)
     if fixed is not None and problem.has_simulator:
-        fixed.climb(UNCHANGED, PEAKS, CLIMBED)
+        fixed.climb(UNCHANGED, ASCENTS, ASCENT_STEPS)
     hi, lo = (0.0, 0.0) if fixed is None else fixed.suprema()
     steep = fixed is not None and max(hi, lo) > STEEP * fixed.unit
-    first, batch = (settings.rounds - 1, LARGER * settings.batch) if steep else (0, settings.batch)
-    enough = settings.good_excess * (GOOD if steep else EXCELLENT)
+    first, batch = (settings.rounds - 1, STEEP_FACTOR * settings.batch) if steep else (0, settings.batch)
+    enough = settings.good_excess * (STEEP_EARLY_PART if steep else EARLY_PART)
     draw = lambda phase: pool.draw(batch)
     objective, phase = PolicyEvaluation(loop, trained is None, positive_weight(hi, lo)), Phase(constants)
     stepper, average = short_fit(fitted, objective, settings.lr, settings.steps * 2**first)
 
     def excess() -> float:
-        """Below 0 it is where another multiple of `mu` serves a `V` that is far off."""
+        """The size of `LoweredSlack.excess`, which is negative where another multiple of `mu` suits a `V` that is far off."""
         value, log_mu = fixed.value if fixed else average.module.value, average.module.log_occupation
         terms, *_ = terms_on(Generator.of(loop, judged), value, log_mu)
         return abs((fixed or LoweredSlack(loop, value, judged)).excess(terms))
@@ -120,9 +128,9 @@ def fit_closed_loop(
             due = k == first and step + 1 >= EXCESS_FIRST and (step + 1) % EXCESS_EVERY == 0
             if due and excess() <= enough:
                 return average.module
-            looked_at = k == first and step == LOOKED_AT and settings.lr > SLOWEST
+            looked_at = k == first and step == COLLAPSE_STEP and settings.lr > LEAST_CHECKED_RATE
             if looked_at and vanished(fitted.log_occupation, judged):
-                slower = replace(settings, lr=SLOWER * settings.lr)
+                slower = replace(settings, lr=RESTART_FACTOR * settings.lr)
                 return fit_closed_loop(problem, policy, fields, network, constants, slower, seed, pool)
         if excess() <= settings.good_excess:
             break
@@ -131,12 +139,12 @@ def fit_closed_loop(
 
 @torch.no_grad()
 def vanished(log_occupation: Field, samples: Samples) -> bool:
-    """Whether hardly any mass of `mu` is left at the states of ``samples``."""
+    """Whether the mass of `mu`, by the states of ``samples``, is below `LEAST_MASS`."""
     return float(samples.mean(log_occupation(samples.x).exp())) < LEAST_MASS
 
 
 class Pool:
-    """``count`` samples of a closed loop that are made as they are drawn, and then drawn again and again.
+    """``count`` samples of a closed loop, made when first drawn, and then drawn again in the same order.
 
     The loop is evaluated in float64 if ``double``; samples are kept in the precision and on the device of ``like``."""
 
@@ -150,11 +158,11 @@ class Pool:
         return Samples.concatenate([Samples.of(self.loop, x).to(self.like) for x in states])
 
     def grow(self, count: int) -> None:
-        """``count`` in all from now on, if they were fewer."""
+        """Raise the number of samples to ``count``, if it was lower."""
         self.count = max(count, self.count)
 
     def draw(self, count: int) -> Samples:
-        """The next ``count`` of them, round and round: consecutive Sobol points are spread evenly."""
+        """The next ``count`` samples, after the last the first again: consecutive Sobol points are spread evenly."""
         while len(self.samples) < min(self.drawn + count, self.count):
             missing = min(EXCESS_STATES, self.count - len(self.samples))
             self.samples = Samples.concatenate([self.samples, self._fresh(missing)])
@@ -171,15 +179,15 @@ class Drawn:
         self.picker = torch.Generator().manual_seed(seed)
 
     def grow(self, count: int) -> None:
-        """There are no more."""
+        """Do nothing: the set is fixed."""
 
     def draw(self, count: int) -> Samples:
-        """``count`` of them."""
+        """``count`` samples, drawn with replacement."""
         index = torch.randint(len(self.samples), (count,), generator=self.picker)
         return self.samples.take(index.to(self.samples.x.device))
 
 
 def positive_weight(hi: float, lo: float) -> float:
-    """What a positive residual should weigh where a negative one weighs 1: the root of `eps_hi / eps_lo`, within limits."""
+    """Weight of a positive residual where a negative one has weight 1: `sqrt(eps_hi / eps_lo)`, the ratio within limits."""
     ratio = max(hi, 1e-30) / max(lo, 1e-30)
-    return math.sqrt(min(max(ratio, 1.0 / MOST_LOPSIDED), MOST_LOPSIDED))
+    return math.sqrt(min(max(ratio, 1.0 / LARGEST_RATIO), LARGEST_RATIO))

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from ocp_torch.certificate.context import Context
     from ocp_torch.certificate.external.dataset import RecordedContext
 
-# The samples with most mass, at which the contraction of the flow is looked at.
-TOP = 10
+# Samples of largest fitted density at which the contraction of the flow is checked.
+DENSEST_SAMPLES = 10
 
 
 class RecordedPrimal(PenalisedPrimal):
@@ -84,8 +84,8 @@ class RecordedFit(NamedTuple):
 def fit_recorded(context: "RecordedContext", kind: str) -> RecordedFit:
     """`J(mu u, mu)` of the controller ``kind``, on held-out samples, with `log mu` fitted on the training samples.
 
-    By parts `E[(f + R(u)) mu] = E[V mu0 - mu Q_u - V r]`, the same number with less scatter. `C_V` is the largest of the
-    bound at hand and of `V - min(Q_u, 0)`, which bounds `V^u` where it is largest, at all samples, with head-room. Raises
+    By parts `E[(f + R(u)) mu] = E[V mu0 - mu Q_u - V r]`, the same number with less scatter. `C_V` is the larger of the
+    constant's and of `sup V + sup max(-Q_u, 0)`, which bounds `V^u`, over all samples and with head-room. Raises
     `ArithmeticError` where the fit fails.
     """
     problem, trained, constants, seed = context.problem, context.trained, context.constants, context.seed
@@ -119,14 +119,14 @@ def fit_recorded(context: "RecordedContext", kind: str) -> RecordedFit:
 
 
 def highest_occupation(mu: Tensor, loop: Samples, rho: float) -> float:
-    """The largest of the fitted densities ``mu`` ``(N,)`` at samples of the closed ``loop``; infinite where it need not end
-    there.
+    """The largest of the fitted densities ``mu`` ``(N,)`` at samples of the closed ``loop``; infinite where the density may
+    be unbounded.
 
-    Where a density is largest its gradient is 0, and Liouville's equation says `-div g_u = rho (1 - mu0 / mu) < rho`. Where a
-    flow contracts faster, at the states with most mass, the density has no bound, and a fit shows its lower part; unless
+    Where a density is largest its gradient is 0, and Liouville's equation says `-div g_u = rho (1 - mu0 / mu) < rho`. Where
+    a flow contracts faster at the densest samples, the density has no bound and the fit shows only its lower part, unless
     noise in all directions spreads it.
     """
-    top = loop.take(mu.topk(min(TOP, len(mu))).indices)
+    top = loop.take(mu.topk(min(DENSEST_SAMPLES, len(mu))).indices)
     if top.noise is not None and float(torch.linalg.matrix_rank(top.noise).min()) == top.x.shape[1]:
         return float(mu.max())
     return float(mu.max()) if float((-top.require_divergences("the closed loop")[0]).max()) < rho else math.inf
