@@ -274,7 +274,7 @@ def test_a_value_trained_on_for_the_bound_comes_closer_to_the_optimum_from_below
         monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{plan}", (100.0, 150, 2e-2))
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.BATCH", 512)
     monkeypatch.setattr("ocp_torch.certificate.lower.mollified.RADII", (1.0 / 64.0,))
-    for least in ("WORTH", "NOISY_WORTH"):
+    for least in ("LEAST_PROMISE", "NOISY_LEAST_PROMISE"):
         monkeypatch.setattr(f"ocp_torch.certificate.lower.sampled.{least}", 0.0)
     problem = zoo.build(name)
     value = perturbed(problem)
@@ -365,7 +365,7 @@ def test_v_is_trained_on_where_there_is_enough_to_gain(problem, heights, trained
 def test_a_second_core_gives_the_same_certificate(name, monkeypatch):
     for plan in ("PLAN", "NOISY_PLAN"):
         monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{plan}", (1000.0, 30, 1e-3))
-    for least in ("WORTH", "NOISY_WORTH"):
+    for least in ("LEAST_PROMISE", "NOISY_LEAST_PROMISE"):
         monkeypatch.setattr(f"ocp_torch.certificate.lower.sampled.{least}", 0.0)
     problem, threads = zoo.build(name), []
     torch.manual_seed(0)

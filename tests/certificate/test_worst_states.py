@@ -38,7 +38,7 @@ def test_a_batch_stands_for_all_states_of_the_last_ones(name, M, monkeypatch):
     value = zoo.rough_network(2, seed=3)
     given = batches(problem, 9)
     remembered = round(40 * M / NEW)
-    monkeypatch.setattr("ocp_torch.certificate.lower.worst.KEPT", 60 / NEW)  # above the level are 40
+    monkeypatch.setattr("ocp_torch.certificate.lower.worst.RETURNING", 60 / NEW)  # above the level are 40
     draw = WorstStates(problem, value, iter(given).__next__, fixed_generator())
     objective, phase = LevelledDual(problem), phase_of(M)
     for k, new in enumerate(given):
@@ -71,7 +71,7 @@ def test_no_state_stays_longer_than_the_others_it_is_compared_with(monkeypatch):
 def test_the_worst_are_those_of_the_value_as_it_is_now(monkeypatch):
     """A spike that `V` has lost is not trained on, though its states are still remembered."""
     monkeypatch.setattr("ocp_torch.certificate.lower.worst.CLIMBERS", 0)
-    monkeypatch.setattr("ocp_torch.certificate.lower.worst.KEPT", 30 / NEW)
+    monkeypatch.setattr("ocp_torch.certificate.lower.worst.RETURNING", 30 / NEW)
     problem, height = zoo.build("box-limited 2-d"), torch.ones((), dtype=torch.float64)
     bump = lambda x: height * torch.exp(2.0 * torch.cos(2.0 * torch.pi * x).sum(dim=-1))
     draw = WorstStates(problem, bump, iter(batches(problem, 2)).__next__, fixed_generator())

@@ -39,7 +39,7 @@ def run(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(f"{TIGHTENED}.PLAN", (100.0, 60, 1e-2))
         patch.setattr(f"{TIGHTENED}.BATCH", 64)
-        patch.setattr("ocp_torch.certificate.lower.sampled.WORTH", 0.0)
+        patch.setattr("ocp_torch.certificate.lower.sampled.LEAST_PROMISE", 0.0)
         certificate = session(small("certificate.mollify=true", *QUICK), folder)
     assert any("tightened" in line for line in certificate.searches)
     return folder
@@ -140,7 +140,7 @@ def test_its_controller_is_handed_out_where_it_is_the_best(tmp_path, monkeypatch
             return Subsolution(taught(value), torch.zeros(0, 1, dtype=torch.float64))
 
     monkeypatch.setattr("ocp_torch.certificate.lower.sampled.tightened", training)
-    monkeypatch.setattr("ocp_torch.certificate.lower.sampled.WORTH", 0.0)
+    monkeypatch.setattr("ocp_torch.certificate.lower.sampled.LEAST_PROMISE", 0.0)
     how = [setting for setting in QUICK if "trajectories" not in setting]
     how += ["method=dual", "certificate.mollify=true", "certificate.trajectories=16", "trainer.steps=2"]
     certificate = session(small(*how), tmp_path)

@@ -20,20 +20,26 @@ from ocp_torch.maths.jets import Field, Jet, jet
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.samples import Samples
 
-# Radii that are looked at, from the smallest on until two in a row promise less than another (one did beside a gain of .2 %):
-# on few of the states and on the worst for V itself, beside which its averages are worst too.
-RADII, FEW, WORST, FEW_ASCENTS = tuple(2.0 ** (0.5 * k) for k in range(-15, -8)), 2048, 2048, 8
-# All states are asked where these promise that part of the bound, and again, for another radius, where they promise as much
-# beyond what the first came to. At half effort that took 30 of 250 s of a unicycle and gave .14 %, 60 of 230 of six
-# oscillators and .45 %.
-WORTH = 3e-4
-# Directions at most along which neighbours lie, and evaluations of V at most.
-DIRECTIONS, EVALUATIONS = 8, 2**20
+# Radii that are tried, from the smallest until two in a row promise less than another (one did beside a gain of .2 %).
+RADII = tuple(2.0 ** (0.5 * k) for k in range(-15, -8))
+# States of all sets together on which a radius is tried.
+TRIAL_STATES = 2048
+# States where the slack of V is largest, at which its averages are evaluated too, as theirs is large there.
+WORST_STATES = 2048
+# Ascents of such a trial at most.
+TRIAL_ASCENTS = 8
+# A trial must promise this part of the bound for all states to be evaluated: for six oscillators that gave .45 % in 60 of
+# 230 s. For another radius it must promise as much beyond the bound that the first came to.
+LEAST_PROMISE = 3e-4
+# Directions at most along which neighbours lie.
+DIRECTIONS = 8
+# Evaluations of V at most for the values at all sampled states.
+EVALUATIONS = 2**20
 
 
 class Mollified:
-    """`x -> (V(x) + sum_k V(x + h e_k) + V(x - h e_k)) / (2 k + 1)` along the axes, or ``DIRECTIONS`` random directions
-    where there are more. ``V`` is periodic; it is asked for states in the unit cell."""
+    """`x -> (V(x) + sum_k (V(x + h e_k) + V(x - h e_k))) / (2 K + 1)` along the `K` axes, or `DIRECTIONS` random directions
+    where there are more. `V` is periodic, and is evaluated in the unit cell."""
 
     def __init__(self, value: Field, dim: int, radius: float) -> None:
         self.dim = dim
@@ -46,7 +52,7 @@ class Mollified:
 
     @property
     def rounded(self) -> "Mollified":
-        """The same in single precision."""
+        """This average with `V` in single precision."""
         return Mollified(rounded(self.value), self.dim, self.radius)
 
     def neighbours(self, x: Tensor) -> Tensor:
@@ -57,12 +63,12 @@ class Mollified:
         return self.value(self.neighbours(x)).unflatten(0, (len(x), -1)).mean(dim=1)
 
     def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
-        """The average of the neighbours' jets; noise is that at ``x``."""
+        """The average of the neighbours' jets, all with the noise ``sigma`` ``(N, d, k)`` at ``x``."""
         sigma = None if sigma is None else sigma.repeat_interleave(len(self.offsets), dim=0)
         return jet(self.value, self.neighbours(x), sigma).map(lambda part: part.unflatten(0, (len(x), -1)).mean(dim=1))
 
     def fitting(self, sets: list[Samples]) -> list[Samples]:
-        """As many of the first states of each of ``sets``, a power of two times fewer, as the budget allows."""
+        """The first states of each of ``sets``, their number halved until `EVALUATIONS` suffice for all."""
         count = len(sets[0])
         while count > 1 and count * len(sets) * len(self.offsets) > EVALUATIONS:
             count //= 2
@@ -70,28 +76,28 @@ class Mollified:
 
 
 def mollified_shift(own: Shift) -> Shift:
-    """The best shifted bound that was found of the value of ``own`` averaged; ``own`` itself where none is better, or where
-    few states promise little.
+    """The best shifted bound found of averages of the value of ``own``; ``own`` itself where none is better, or where trials
+    on few states promise little.
 
-    Few states promise too much, and about as much too much for one radius as for the next.
+    Trials promise too much, and about as much too much for one radius as for the next.
     """
     slack = SlackParts.join(own.parts).slack(own.theta)
-    worst = Samples.concatenate(own.sets).take(slack.topk(min(WORST, len(slack))).indices)
-    # A peak that stands where the slack is low is an average's too: of six oscillators a search among averages missed one of
-    # .4 % of the bound that the search before had found.
+    worst = Samples.concatenate(own.sets).take(slack.topk(min(WORST_STATES, len(slack))).indices)
+    # Peaks in hollows of the slack are peaks of averages too: for six oscillators a search of an average's own missed one of
+    # .4 % of the bound.
     steep = [own.problem.samples(own.peaks.x, divergences=False)] if len(own.peaks.x) else []
     beside = [Samples.concatenate([worst, *own.beside, *steep])]
-    few = [samples.take(slice(0, max(1, FEW // len(own.sets)))) for samples in own.sets]
+    few = [samples.take(slice(0, max(1, TRIAL_STATES // len(own.sets)))) for samples in own.sets]
 
     def averaged(radius: float, sets: list[Samples], ascents: int) -> Shift:
         W = Mollified(own.value, own.problem.dim, radius)
         return replace(own, value=W, sets=W.fitting(sets), ascents=ascents, beside=beside, radius=radius)
 
-    ascents = min(own.ascents, FEW_ASCENTS)
+    ascents = min(own.ascents, TRIAL_ASCENTS)
     initial, by_V = sum(own.initial) / len(own.initial), replace(own, sets=few).parts
 
     def promise(radius: float) -> float:
-        """How much higher the bound looks on few states: what `E[V mu0]` is off by there is the average's too."""
+        """By how much the bound rises on few states: the error of `E[V mu0]` there cancels against that of `E[W mu0]`."""
         tried = averaged(radius, few, ascents)
         changes = [integral(s, p.initial - v.initial) for s, p, v in zip(few, tried.parts, by_V, strict=True)]
         theta, _, largest = tried.looked
@@ -104,7 +110,7 @@ def mollified_shift(own: Shift) -> Shift:
             break
     best, too_much = own, 0.0
     for radius in sorted(promised, key=promised.__getitem__, reverse=True):
-        if not promised[radius] - too_much > best.bound - own.bound + WORTH * abs(own.bound):
+        if not promised[radius] - too_much > best.bound - own.bound + LEAST_PROMISE * abs(own.bound):
             break
         tried = averaged(radius, own.sets, own.ascents)
         too_much = max(too_much, promised[radius] - (tried.looked.bound - own.bound))

@@ -23,8 +23,10 @@ from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.needs import Need
 from ocp_torch.problems.samples import Samples
 
-# States above a constant that is worth looking for, in each half; and trained samples that are looked at beside the others.
-FEWEST, MOST_TRAINED = 16, 2**15
+# States of a half that must lie above the constant taken off `V`: with fewer none is sought.
+FEWEST_ABOVE = 16
+# Training samples at most that are compared with the held-out ones.
+MOST_TRAINED = 2**15
 
 
 class PenalisedDual(Bound):
@@ -47,7 +49,7 @@ class PenalisedDual(Bound):
 
 
 class RecordedDual(PenalisedDual):
-    """`F_M` where only recorded samples are known: a weighted mean of those that were held out."""
+    """`F_M` where only recorded samples are known: a weighted mean over the held-out samples."""
 
     def applies(self, context: Context) -> bool:
         return context.recorded
@@ -63,7 +65,7 @@ class RecordedDual(PenalisedDual):
         initial = [starting_mean(g.data, V.value, level) for g, V in seen]
         slacks = [g.hjb_slack(V) for g, V in seen]
         found = _penalised(initial, sets, slacks, [0.0] * len(sets), M)
-        # What only samples which were trained on show, a violation or a start, others met by chance in no row.
+        # A violation, or a start, that is larger in training samples than in any held-out one was missed there by chance.
         violated = lambda data, V, slack: float((data.weight * slack.clamp_min(0.0)).max())
         started = lambda data, V, slack: float((data.weight * data.mu0 * (V.value - level).abs()).max())
         missed = 0.0
@@ -75,16 +77,16 @@ class RecordedDual(PenalisedDual):
 
 
 def penalised(V: SampledValue, M: float) -> Estimate:
-    """`F_M`."""
+    """`F_M` of `V` itself, no constant taken off."""
     slacks = [part.slack(1.0) for part in V.own.parts]
     return _penalised(V.initial, V.sets, slacks, [0.0] * len(slacks), M)
 
 
 def levelled(shift: Shift, M: float) -> Estimate:
     """`F_M(theta W - c)` for the value `W` of ``shift``, its best multiple and the best constant; the shifted bound where
-    hardly any state would lie above the constant. Each half of the sets takes both from the other half, so that the search
-    does not flatter the bound."""
-    if FEWEST * M > sum(map(len, shift.sets[1::2])):
+    hardly any state would lie above the constant. Each half of the sets takes multiple and constant from the other half, so
+    that the search does not flatter the bound."""
+    if FEWEST_ABOVE * M > sum(map(len, shift.sets[1::2])):
         return shift.estimate
     weights = [samples.weight for samples in shift.sets]
     mean = sum(shift.initial) / len(shift.initial)
@@ -98,8 +100,8 @@ def levelled(shift: Shift, M: float) -> Estimate:
 def _penalised(
     initial: list[float], sets: list[Samples], slacks: list[Tensor], levels: list[float], M: float
 ) -> Estimate:
-    """`E[V mu0] - c - M E[max(Q - c, 0)]` for the level `c` of each set, the interval widened where a few states carry the
-    last mean."""
+    """`E[V mu0] - c - M E[max(Q - c, 0)]`, with a level `c` for each set; the interval is widened where a few states carry
+    the last mean."""
     parts = zip(sets, slacks, levels, strict=True)
     violations = [samples.weight * (slack - c).clamp_min(0.0) for samples, slack, c in parts]
     terms = zip(initial, levels, violations, strict=True)

@@ -12,13 +12,14 @@ if TYPE_CHECKING:
     from ocp_torch.certificate.lower.shifted import Shift
     from ocp_torch.certificate.proof.rigorous import RigorousBound
 
-# How far rounding may take a number in float64 from what holds in real arithmetic, relative to 1 + its size; and the level at
-# which a sampled mean must be elsewhere than what was proved of it.
-ROUNDING, SURE = 1e-9, 0.9999
+# How far rounding may take a number in float64 from its value in real arithmetic, relative to 1 + its size.
+ROUNDING = 1e-9
+# Level of the interval of a sampled mean that, outside the proved one, refutes a proof.
+REFUTING_LEVEL = 0.9999
 
 
 class Rigorous(Bound):
-    """Only where the settings ask for it, of trained fields in one and two dimensions."""
+    """The proved bound, only where the settings ask for it, of trained fields in one and two dimensions."""
 
     name, side, label = "rigorous", LOWER, "rigorous"
 
@@ -39,7 +40,7 @@ class Rigorous(Bound):
 
 
 def proved(context: Context) -> tuple[Estimate | None, list[str], list[str]]:
-    """The proved counterpart of `SampledValue.own`, with a note where there is none, and what was proved in words."""
+    """The proved counterpart of `SampledValue.own` or `None`, a note that says why, and what was proved in words."""
     if "proved" not in context.results:
         context.results["proved"] = _proved(context)
     return context.results["proved"]
@@ -65,11 +66,12 @@ def _proved(context: Context) -> tuple[Estimate | None, list[str], list[str]]:
 
 
 def refuted(own: "Shift", bound: "RigorousBound") -> str | None:
-    """Where ``own``, the same bound by sampling, shows that what was enclosed for ``bound`` is not the problem: in words."""
+    """How ``own``, the same bound by sampling, contradicts what ``bound`` proves of the problem, in words; `None` if it does
+    not."""
     met, mean = own.largest.value, Estimate.of([own.theta * mean for mean in own.initial])
     if met > bound.slack + ROUNDING * (1.0 + abs(met)):
         return f"sup Q <= {bound.slack:.4g} would be proved, but {met:.4g} was met"
-    (low, high), (least, most) = mean.interval(SURE), bound.integral
+    (low, high), (least, most) = mean.interval(REFUTING_LEVEL), bound.integral
     room = ROUNDING * (1.0 + abs(mean.value))
     if low > most + room or high < least - room:
         sampled = f"{mean.value:.6g} +- {0.5 * (high - low):.2g}"

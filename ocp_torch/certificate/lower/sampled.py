@@ -1,4 +1,4 @@
-"""`V` at sampled states: what the lower bounds of one `V` share."""
+"""`V` at sampled states, which the lower bounds of one `V` share."""
 
 import contextlib
 from collections.abc import Generator, Iterator
@@ -20,16 +20,16 @@ from ocp_torch.maths.jets import Field
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# Training for the bound is worth it where that part of it is to gain: without noise, where gaps are narrow, and with it. Of
-# two arms .39 and .85 % were to gain, and it gave .51 and 1.0 %; two dubins and a unicycle with noise had 1.1 to 7.3 %, of
-# which it gave 1.2 to 7.5 %, and .2 to .35 % after it.
-WORTH, NOISY_WORTH = 0.0006, 0.005
-# What is to gain is seen by the mean of the slack over its largest part of the torus, a hundredth, in place of its supremum.
+# Part of the bound that training for it must promise: .39 and .85 % were promised of two arms, .51 and 1.0 % came.
+LEAST_PROMISE = 0.0006
+# The same with noise: 1.1 to 7.3 % were promised of two dubins and a unicycle, and 1.2 to 7.5 % came.
+NOISY_LEAST_PROMISE = 0.005
+# Part of the torus with the largest slacks, whose mean stands for the supremum in that promise.
 LARGEST_PART = 0.01
 
 
 class Found(NamedTuple):
-    """The best ``shift``, and the ``subsolution`` that it is made of, unless that is `V`."""
+    """The best ``shift``, and the ``subsolution`` that it is made of, `None` where that is `V`."""
 
     shift: Shift
     subsolution: Subsolution | None = None
@@ -39,12 +39,11 @@ class Found(NamedTuple):
 class SampledValue:
     """``value`` `V` on ``sets`` of samples of ``problem``; each part is computed when it is first asked for.
 
-    Suprema of its slack are climbed from the ``ascents`` worst states, and sought at the states ``odd`` ``(K, d)`` too. With
-    ``search`` the shifted bound is sought among functions made of `V`, which takes many times as long: `V` trained on for
-    that bound (`tightened`, by ``steps`` on states of ``seed``; or one that was ``kept`` from before), and averages over
-    neighbours of the better of the two (`mollified`).
-    With noise kinks are rounded, and no averages are tried: on dubins they gave 0.1 to 0.3 % of OPT more, for a tenth of a
-    run's time.
+    Suprema of its slack are climbed from the ``ascents`` worst states, those ``odd`` ``(K, d)`` included. With ``search`` the
+    shifted bound is sought among functions made of `V`, which takes many times as long: `V` trained on for that bound
+    (`tightened`, by ``steps`` on states of ``seed``; or one that was ``kept`` from before), and averages over neighbours of
+    the better of the two (`mollified`). With noise, which rounds kinks, no averages are tried: on dubins they gave 0.1 to
+    0.3 % of OPT more, for a tenth of a run's time.
     """
 
     problem: Problem
@@ -71,18 +70,18 @@ class SampledValue:
 
     @property
     def best(self) -> Shift:
-        """That of `V` itself, or of a function made of it where it is higher."""
+        """The shifted bound of `V` itself, or of a function made of it where that is higher."""
         return self._best.answer().shift
 
     @property
     def subsolution(self) -> Subsolution | None:
-        """What the `best` is of, or an average of, where that is not `V`."""
+        """`V` trained on for its bound, where the `best` is of it or of an average of it; else `None`."""
         return self._best.answer().subsolution
 
     @contextlib.contextmanager
     def ahead(self) -> Iterator[None]:
-        """Within it a second core looks for the `best`, if there is one and the problem can be asked from two threads."""
-        _ = self.initial  # which is asked for at once
+        """Within it a second core looks for the `best`, if there is one and two threads may evaluate the problem."""
+        _ = self.initial  # needed at once, beside that search
         if self.search and self.problem.concurrent:
             self._best.begin()
         try:
@@ -96,11 +95,11 @@ class SampledValue:
 
     @property
     def tightened(self) -> Subsolution | None:
-        """`V` trained on for its bound, where that is worth it."""
+        """`V` trained on for its bound; `None` where that promises too little."""
         return Ahead(self._trained_on()).answer()
 
     def _trained_on(self) -> Generator[None, None, Subsolution | None]:
-        if not worth(self.own, NOISY_WORTH if self.problem.noisy else WORTH):
+        if not worth(self.own, NOISY_LEAST_PROMISE if self.problem.noisy else LEAST_PROMISE):
             return None
         batch = len(self.sets[0])  # a small certificate is a quick one
         return (yield from tightened(self.problem, self.value, self.seed, batch, self.steps))
@@ -119,15 +118,15 @@ class SampledValue:
 
 
 def worth(shift: Shift, least: float) -> bool:
-    """Whether more than the part ``least`` of the bound is to gain up to what is `attainable`."""
+    """Whether the bound may rise to what is `attainable` by more than its part ``least``."""
     most = attainable(shift)
     lacks = lambda scaling: most - scaling.bound > least * abs(scaling.bound)
     return lacks(shift.looked) or lacks(shift.found)  # what is found in steep places only adds to it
 
 
 def attainable(shift: Shift) -> float:
-    """The bound with the mean of the largest slacks for their supremum, which is like what training maximises: where the
-    bound is as high, no spike is left to take off."""
+    """The bound with the mean of the largest slacks in place of their supremum, nearly what training maximises: a bound that
+    is as high has no spike left to remove."""
     weights = torch.cat([samples.weight for samples in shift.sets])
     mean = sum(shift.initial) / len(shift.initial)
     return best_level(SlackParts.join(shift.parts), weights, mean, 1.0 / LARGEST_PART)[2]

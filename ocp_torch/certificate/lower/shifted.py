@@ -3,7 +3,7 @@ r"""A lower bound that needs no `M`: `E[W mu0] - sup Q_W <= OPT` for any smooth 
 A constant `c` added to `W` adds `c` to its slack, so `W - sup Q_W` is a subsolution of the HJB equation. For `V` scaled by
 `theta` the slack `Q_{theta V} = theta (V - L^0 V / rho) - f + R*(-theta B^T grad V / rho)` is convex in `theta` at
 every state, so the bound is concave in `theta`: its maximum is found by a search on a line. (Scaling `V - c` instead of `V`
-changes nothing.) Where `V` has large slack, at kinks for instance, a `theta` below 1 trades a little of `E[V mu0]` for it.
+changes nothing.) Where the slack of `V` is large, as at kinks, a `theta` below 1 lowers it for a little of `E[V mu0]`.
 """
 
 import math
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from ocp_torch.certificate.context import Context
 
 
-# An averaged function has so many times fewer ascents from steep places: of six oscillators they took 70 s or more without.
-AVERAGED = 4
+# Divisor of the ascents from steep places for averaged functions: for six oscillators all of them took 70 s or more.
+AVERAGED_DIVISOR = 4
 
 
 class Scaling(NamedTuple):
@@ -99,16 +99,16 @@ class Shift:
 
     @cached_property
     def peaks(self) -> Peaks:
-        """Where ascents from steep places end, as far as more than what is known is in reach there."""
+        """Peaks of the slack in steep places, from where more than the known supremum may be in reach."""
         slack, rough = (slack_function(self.problem, value) for value in (self.value, rounded(self.value)))
         starts = STEEP_ASCENTS * self.ascents
-        if self.radius:  # its peaks are as wide as that, and every value is of many states
-            starts = max(1, starts // AVERAGED)
+        if self.radius:  # peaks are as wide as the radius, and each value takes many evaluations
+            starts = max(1, starts // AVERAGED_DIVISOR)
         return steep_peaks(slack, rough, self.problem.dim, starts, self._plain.value, self.looked.initial)
 
     @cached_property
     def found(self) -> Scaling:
-        """By what is sought in steep places too."""
+        """The best multiple by `looked` and by the peaks in steep places."""
         best, peaks = self.looked, self.peaks
         if len(peaks.x):
             there = Samples.of(self.problem, peaks.x, divergences=False)
@@ -120,10 +120,10 @@ class Shift:
         return best._replace(largest=replace(best.largest, points=len(self._sampled.x), ascents=ascents))
 
     def _scaled(self, everywhere: SlackParts, plain: Extremum) -> Scaling:
-        """The multiple 1, whose supremum is ``plain``, or that which maximises the bound over ``everywhere``.
+        """The multiple 1, whose supremum is ``plain``, or the one that maximises the bound over the states ``everywhere``.
 
-        The supremum at the maximiser is searched for anew, and 1 stays where the states or that show no gain. Where `f < 0`
-        is met the problem breaks its promise, `0` is no subsolution to scale towards, and `theta` is 1.
+        The supremum at the maximiser is climbed to anew, and 1 stays where the states or that supremum show no gain. Where
+        `f < 0` is met, against the problem's promise, 0 is no subsolution to scale towards, and `theta` is 1.
         """
         mean = sum(self.initial) / len(self.initial)
         unscaled = Scaling(1.0, mean, plain)
@@ -131,7 +131,7 @@ class Shift:
             return unscaled
         theta = scaled_by(everywhere, mean)
         gain = (theta - 1.0) * mean + float(everywhere.slack(1.0).max() - everywhere.slack(theta).max())
-        if gain <= NEGLIGIBLE * abs(mean):  # as of a `V` that solves the equation: nothing to climb for
+        if gain <= NEGLIGIBLE * abs(mean):  # not worth another climb, as where `V` solves the equation
             return unscaled
         scaled = Scaling(theta, mean, climbed(self.problem, self.value, everywhere, theta, self.ascents))
         return max(unscaled, scaled, key=lambda scaling: scaling.bound)
@@ -157,13 +157,13 @@ class Shift:
 
     @property
     def sentence(self) -> str:
-        """What the slack is of."""
+        """Which function's slack the supremum is of, in words."""
         averaged = f", averaged {self.radius:.2g} around," if self.radius else ""
         return f"sup Q of {self.theta:.4g} {self.name}{averaged}"
 
 
 def highest(shifts: list[Shift]) -> Shift:
-    """The one with the highest bound. Steep places are only looked at where that decides: what is found there lowers it."""
+    """The shift with the highest bound. Steep places are searched only where that decides: peaks there lower a bound."""
     looked = lambda shift: -math.inf if math.isnan(shift.looked.bound) else shift.looked.bound
     best, *others = sorted(shifts, key=looked, reverse=True)
     for other in others:
@@ -174,13 +174,13 @@ def highest(shifts: list[Shift]) -> Shift:
 
 
 def climbed(problem: Problem, value: Field, parts: SlackParts, theta: float, ascents: int) -> Extremum:
-    """`sup Q_{theta V}`."""
+    """`sup Q_{theta V}`, climbed to from the states of ``parts`` where it is largest."""
     scaled = value if theta == 1.0 else Scaled(value, theta)
     return climbed_from(slack_function(problem, scaled), parts.slack(theta), parts.x, ascents)
 
 
 def scaled_by(parts: SlackParts, initial: float) -> float:
-    """The `theta` in `[0, MAX_THETA]` that maximises the sampled bound, concave in `theta`."""
+    """The `theta` in `[0, MAX_THETA]` that maximises the bound on sampled states, which is concave in `theta`."""
     return minimiser(lambda theta: float(parts.slack(theta).max()) - theta * initial, 0.0, MAX_THETA)
 
 

@@ -14,22 +14,26 @@ from ocp_torch.problems.generator import Generator, hjb_slack
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# The largest theta that is tried.
+# The largest `theta` for which the multiple `theta V` is tried.
 MAX_THETA = 1.5
-# A search for peaks in steep places: its ascents for each one from the largest values, and the states that are looked at for
-# each of its own. How many searches are made at most, and after how many in a row that found nothing no more. Of hidden peaks
-# of .09 and .30 % of a bound in three and two coordinates 8 of 8 seeds found all by 3 to 5 searches in 3 s; of one of 1.07 %
-# in five .75 to 1.07 by 3 to 7 in 4 s.
-STEEP_ASCENTS, STEEPEST = 64, 8
-SEARCHES, FRUITLESS = 8, 2
-# Of each search so many of the highest ends climb to their tops: a peak of .09 % of a bound was .03 % high before.
+# Ascents of a search in steep places for each ascent from the largest values: peaks of .09 and .30 % of a bound were then
+# found with 8 of 8 seeds in three and two coordinates; of one of 1.07 % in five coordinates .75 to 1.07 % was.
+STEEP_ASCENTS = 64
+# Random states among which a search chooses the steepest, for each of its ascents.
+STATES_PER_ASCENT = 8
+# Searches at most.
+MOST_SEARCHES = 8
+# Searches in a row without a higher peak after which no other is made.
+FRUITLESS = 2
+# Highest ends of a search that climb on in double precision: a peak of .09 % of a bound was .03 % high before.
 FINISHED = 32
-NEGLIGIBLE = 1e-5  # higher peaks than that, relative to `E[V mu0]`, are sought
+# Peaks are sought that are higher than the known supremum by more than this part of `E[V mu0]`.
+NEGLIGIBLE = 1e-5
 
 
 @dataclass(frozen=True)
 class SlackParts:
-    """What the slack of every `theta V` at sampled states is made of."""
+    """The terms at sampled states of which the slack of every `theta V` is made."""
 
     cost: PowerCost
     x: Tensor  # (N, d)
@@ -78,7 +82,7 @@ def slack_function(problem: Problem, value: Field):
 
 
 class Peaks(NamedTuple):
-    """States ``(K, d)`` where so many ``ascents`` ended."""
+    """States ``x`` ``(K, d)`` where the highest of so many ``ascents`` ended."""
 
     x: Tensor
     ascents: int
@@ -93,14 +97,15 @@ def steep_peaks(
     unit: float,
     generator: torch.Generator | None = None,
 ) -> Peaks:
-    """Where ascents of ``slack`` end from the ``starts`` steepest of random states, as far as more than ``known`` may be
-    within their reach, and from others, until `FRUITLESS` searches in a row have found nothing higher. What is `NEGLIGIBLE`
-    beside ``unit`` is not sought. ``rough`` is ``slack`` in single precision: that leads near the tops, in half the time.
-    Bounds draw the same states each time; who trains for them gives another ``generator``."""
+    """Peaks of ``slack`` in steep places, by searches until `FRUITLESS` in a row have found nothing higher.
+
+    A search climbs from the random states, at most ``starts``, within whose reach the slack may be largest, if that is above
+    ``known`` by more than `NEGLIGIBLE` times ``unit``. It climbs ``rough``, the slack in single precision, in half the time,
+    and then ``slack`` from the highest ends. Bounds draw the same states each time; training gives another ``generator``."""
     found: list[Tensor] = []
     generator, fruitless = generator or fixed_generator(), 0
-    while fruitless < FRUITLESS and len(found) < SEARCHES:
-        x = torch.rand(STEEPEST * starts, dim, generator=generator, dtype=torch.float64)
+    while fruitless < FRUITLESS and len(found) < MOST_SEARCHES:
+        x = torch.rand(STATES_PER_ASCENT * starts, dim, generator=generator, dtype=torch.float64)
         enough = known + NEGLIGIBLE * abs(unit)
         ends, values = peaks_in_reach(rough, x, starts, enough)
         if len(ends) == 0:

@@ -1,13 +1,12 @@
 r"""`V` trained on for the shifted bound.
 
-Training fits the slack on average, for a good controller; here its largest values count. A copy of `V` goes on from where
-training left it, by the `LevelledDual`, on batches in which the worst states come again (`WorstStates`): what comes out is
-kept beside `V` for the bound, which holds for any `W` and is measured on other states. Its slack has fewer high narrow
-peaks, so that the supremum is found more surely: on two independent sets of 131,072 states the bounds of an arm's `V`
-differed by 0.8 %, of `W` by 0.02 %. Those that are left stand in hollows, where ascents from the largest values do not lead:
-they hid up to 0.3 % of a bound. So peaks are sought in steep places too, in training and by the bound (`steep_peaks`): of
-six `W` in two and three coordinates eight more searches, of other states, then took at most 0.001 % off their bounds; of
-two in five, of six oscillators, 0.6 % off one and nothing off the other.
+Training fits the slack on average, for a good controller; here its largest values count. A copy `W` of `V` is trained on by
+the `LevelledDual`, on batches in which the worst states come again (`WorstStates`), and kept beside `V` for the bound, which
+holds for any `W` and is measured on other states. The slack of `W` has fewer high narrow peaks, so that its supremum is
+found more surely: on two independent sets of 131,072 states the bounds of an arm's `V` differed by 0.8 %, of `W` by 0.02 %.
+The peaks that are left stand in hollows, out of reach of ascents from the largest values, and hid up to 0.3 % of a bound: in
+training and by the bound they are sought in steep places too (`steep_peaks`). Eight more searches then took at most 0.001 %
+off the bounds of six `W` in two and three coordinates, but 0.6 % off one of two in five.
 """
 
 import copy
@@ -31,29 +30,30 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.steppers import advance, short_fit
 from ocp_torch.steppers.nonfinite import NonFiniteError
 
-# `M`, steps, and the first learning rate, which falls to 0: the slack's mean over the part `1 / M` of the torus stands for
-# its supremum. With noise kinks are rounded, and a step takes twice as long. Bounds of a unicycle, another and a pendulum
-# with limited torque by 600 steps of M = 1,000 and 1,400 of 3,000 were 1.2961, 1.2985, 3.0278; by these, in as long, 1.2972,
-# 1.2992, 3.0311; the first and the last by 1,400 steps 1.2947, 3.0114.
-PLAN, NOISY_PLAN = (3000.0, 2000, 5e-3), (3000.0, 700, 2e-3)
-# Memory of the optimiser's moments, below the usual (.95, .95): with that, at 1e-3, one `V` of a unicycle came to 1.2959 by
-# 2,100 steps and to 1.2986 by 4,500, with this, at 5e-3, to 1.2985 by 2,000 (mean over the part 1 / 3000), as with (.8, .95).
+# `M`, steps, and the first learning rate, which falls to 0. The slack's mean over the part `1 / M` of the torus stands for
+# its supremum: a pendulum's bound was 3.0311, in as long 3.0278 by 600 steps of M = 1,000 and 1,400 of 3,000.
+PLAN = (3000.0, 2000, 5e-3)
+# The same with noise, which rounds kinks and makes a step take twice as long.
+NOISY_PLAN = (3000.0, 700, 2e-3)
+# Decays of the optimiser's moments: a unicycle's bound came to 1.2985 by 2,000 steps at a rate of 5e-3; by the usual
+# (.95, .95) at 1e-3 to 1.2959 by 2,100 and to 1.2986 by 4,500.
 BETAS = (0.9, 0.95)
 BATCH = 2048  # new states of a step, at most
-# When that part of the steps is left peaks are sought as long as the bound will seek them, from other states: what is found
-# is mended in the steps that are left, at rates that are low already. Of three unicycles with noise one had kept a peak that
-# took 2.1 % off its bound (1.2820; 1.3100 with this, in 2 % more time); another seed had 1.3086, and 1.3084 with it.
-LAST, ASCENTS = 7, 32
+# When the steps divided by this are left, peaks are sought as the bound will seek them, and mended in these last steps: of
+# three unicycles with noise one had kept a peak that took 2.1 % off its bound.
+LAST_DIVISOR = 7
+# Ascents from the largest values that the bound is taken to make, by which that search is as long as the bound's.
+ASCENTS = 32
 
 
 def plan_of(problem: Problem, steps: int | None) -> tuple[float, int, float]:
-    """`PLAN`, or that with noise; with so many ``steps`` where they are given."""
+    """`M`, steps and learning rate for ``problem``: `PLAN` or `NOISY_PLAN`, with ``steps`` where they are given."""
     M, usual, rate = NOISY_PLAN if problem.noisy else PLAN
     return M, usual if steps is None else steps, rate
 
 
 def new_states(problem: Problem, batch: int, steps: int | None) -> int:
-    """How many states `tightened` draws with up to ``batch`` a step, the worst that come again aside."""
+    """How many new states `tightened` draws with up to ``batch`` a step; the worst that come again are not counted."""
     states = min(batch, BATCH)
     return plan_of(problem, steps)[1] * states // BATCH * states
 
@@ -61,9 +61,10 @@ def new_states(problem: Problem, batch: int, steps: int | None) -> int:
 def tightened(
     problem: Problem, value: Field, seed: int, batch: int = BATCH, steps: int | None = None
 ) -> Generator[None, None, Subsolution | None]:
-    """`W` for ``value`` `V`, in float64, by training in float32, ``steps`` on up to ``batch`` states each, which yields
-    after each step; `None` where `V` has no weights, there are no steps, or weights do not stay finite. Fewer states than
-    `BATCH` are for a quick evaluation, with as many times fewer steps."""
+    """Train `W` from ``value`` `V` in float32 by ``steps`` on up to ``batch`` new states each, with a yield after each step.
+
+    Returns `W` in float64; `None` where `V` has no weights, there are no steps, or weights do not stay finite. Fewer states
+    than `BATCH` are for a quick evaluation, and take as many times fewer steps."""
     M, whole, rate = plan_of(problem, steps)
     if not whole or not isinstance(value, nn.Module) or not any(True for _ in value.parameters()):
         return None
@@ -79,7 +80,7 @@ def tightened(
     draw = WorstStates(problem, fields.value, new, generator)
     try:
         for step in range(count):
-            if step == count - count // LAST:
+            if step == count - count // LAST_DIVISOR:
                 starts = STEEP_ASCENTS * ASCENTS * states // BATCH
                 draw.remember(hidden_peaks(problem, average.module.value, draw.worst.x, starts, generator))
             with torch.enable_grad():
@@ -94,8 +95,8 @@ def tightened(
 def hidden_peaks(
     problem: Problem, network: nn.Module, worst: Tensor, starts: int, generator: torch.Generator
 ) -> Tensor:
-    """Where the slack of ``network`` is higher than at the ``worst`` states that are known, ``(K, d)``, by so many ``starts``
-    in steep places."""
+    """Peaks ``(K, d)`` of the slack of ``network`` in steep places, by ``starts`` ascents in each search, where it may be
+    higher than at the ``worst`` states known."""
     W = copy.deepcopy(network).double()
     slack, rough = slack_function(problem, W), slack_function(problem, rounded(W))
     known = float(slack(worst.double()).max()) if len(worst) else 0.0
