@@ -294,6 +294,19 @@ REFUSED = {
     "div a": (lambda: with_(drift_divergence=lambda self, x: 0.0 * x[:, 0]), "drift_divergence .* by differences of drift"),
     "detached": (lambda: with_(control_matrix=lambda self, x: Good.control_matrix(self, x.detach())),
                  "control_divergence .* by differences of control_matrix"),
+    "f detached": (lambda: with_(state_cost=lambda self, x: plain_cost(self, x.detach())),
+                   "state_cost of .*Mine loses its derivative by the state: at .* and by 0 as autograd says"),
+    "f of NumPy": (lambda: with_(state_cost=lambda self, x: torch.from_numpy(1.0 + np.cos(TURN * x.detach().numpy()[:, 0]))),
+                   "state_cost .* loses its derivative .* problem=callable takes a simulator in NumPy"),
+    "a term of f detached": (lambda: with_(state_cost=lambda self, x: plain_cost(self, x) + plain_cost(self, x.detach())),
+                             "state_cost .* loses its derivative"),
+    "a detached beside its divergence": (
+        lambda: with_(drift=lambda self, x: Good.drift(self, x.detach()),
+                      drift_divergence=lambda self, x: 0.3 * TURN * torch.cos(TURN * x).sum(dim=-1)),
+        "drift .* loses its derivative"),
+    "noise detached beside no divergences": (
+        lambda: with_(noise=lambda self, x: column()(self, x.detach()), noise_divergences=lambda self, x: None),
+        "noise .* loses its derivative"),
     **{f"{name} without a derivative": (lambda name=name, step=step: with_(**{name: step}),
                                         f"{name} of .*Mine cannot be differentiated .*aten::heaviside is not implemented.*:"
                                         " use functions that have a derivative")
@@ -347,6 +360,7 @@ LEGAL = {
     "rough": lambda: with_(state_cost=wobbly),
     "kinks": lambda: with_(drift=lambda self, x: torch.sin(TURN * x).abs().sqrt()),
     "a step of a detached state": lambda: with_(state_cost=lambda self, x: step_of(x[:, 0].detach())),
+    "f in steps of .001": lambda: with_(state_cost=lambda self, x: (1e3 * plain_cost(self, x)).round() / 1e3),
     "mu0 without a derivative": lambda: with_(initial_density=lambda self, x: 2.0 * step_of(x[:, 0])),
     "limits and gains far apart": FarApart,
     "flat": lambda: with_(state_cost=lambda self, x: torch.zeros_like(x[:, 0])),

@@ -24,6 +24,7 @@ from ocp_torch.problems.checks.sameness import (
     require_purity,
     require_still,
 )
+from ocp_torch.problems.checks.slopes import require_slopes
 from ocp_torch.problems.checks.values import require_divergences, require_finite, require_kept_noise, require_signs
 from ocp_torch.problems.control_limit import control_cost
 from ocp_torch.problems.physical.system import System
@@ -73,6 +74,7 @@ def _check(functions: Functions) -> None:
         require_signs,
         require_kept_noise,
         require_divergences,
+        require_slopes,
         require_mass,
     ):
         require(functions)
@@ -82,7 +84,7 @@ def _check(functions: Functions) -> None:
 def require_system(functions: SystemFunctions) -> None:
     """Raise where what a user wrote of a system, in physical units, is not what `System` says."""
     first = _require_functions(functions)
-    for require in (require_finite, require_turns, require_signs):
+    for require in (require_finite, require_turns, require_signs, require_slopes):
         require(functions)
     require_still(functions, first)
 
