@@ -1,9 +1,12 @@
 """A problem is checked once, before anything is trained: each slip is one sentence, and nothing legal is refused."""
 
+import time
+
 import pytest
 import torch
 
 from ocp_torch.errors import InputError
+from ocp_torch.maths.cores import cores
 from ocp_torch.problems import Simulator
 from ocp_torch.problems.checks.check import check_once
 from ocp_torch.problems.checks.mass import sampled_mass
@@ -23,6 +26,24 @@ def test_a_slip_is_one_sentence_that_says_where(name):
 @pytest.mark.parametrize("name", LEGAL)
 def test_what_is_legal_is_let_through(name):
     check_once(LEGAL[name]())
+
+
+def kept(self, x):
+    """A cost that is kept in `self` until it is given."""
+    self.cost = hostile_problems.plain_cost(self, x)
+    if len(x) > 1000:
+        time.sleep(1e-3)
+    return self.cost
+
+
+@pytest.mark.skipif(cores() < 2, reason="nothing is asked side by side on one core")
+def test_what_two_threads_may_ask_at_once_is_held_against_one():
+    check_once(with_(state_cost=kept))
+    check_once(with_(concurrent=True))
+    with refused(
+        "state_cost of .*Mine changes when two threads call the functions at once, which concurrent = True allows"
+    ):
+        check_once(with_(state_cost=kept, concurrent=True))
 
 
 def test_the_check_leaves_random_numbers_as_they_were():

@@ -19,6 +19,7 @@ from ocp_torch.problems.checks.mass import require_mass
 from ocp_torch.problems.checks.physical import SystemFunctions, require_turns
 from ocp_torch.problems.checks.sameness import (
     Answers,
+    require_concurrency,
     require_differentiable,
     require_period,
     require_purity,
@@ -76,6 +77,7 @@ def _check(functions: Functions) -> None:
         require_divergences,
         require_slopes,
         require_mass,
+        require_concurrency,
     ):
         require(functions)
     require_still(functions, first)

@@ -1,12 +1,14 @@
-"""A function of each state alone, with period 1: not of the other rows, nor of what was asked before or of whole turns; and
-one that autograd may differentiate."""
+"""A function of each state alone, with period 1: not of the other rows, nor of what was asked before, of whole turns, or of
+what another thread asks; and one that autograd may differentiate."""
 
 import math
+import time
 
 import torch
 from torch import Tensor
 
 from ocp_torch.errors import ProblemError
+from ocp_torch.maths.cores import CHUNK, cores, side_by_side
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.blame import words
 from ocp_torch.problems.checks.functions import Functions
@@ -19,9 +21,17 @@ DIFFERENTIATED, DIFFERENTIATED_DESIGN = 5, 2
 TURNED, TURNED_DESIGN = 256, 5
 # The whole numbers that are added to states, and how many of them a sentence shows.
 LOWEST, HIGHEST, MOST_SHOWN = -2, 3, 8
+# Batches that threads ask for side by side, the seconds for which they go on to, and the number of their design: of functions
+# that keep a state in `self` until they need it again, 19 of 20 times that all batches were asked for some answer was wrong.
+BATCHES, SECONDS, BATCHES_DESIGN = 16, 0.3, 10
 OTHER_ROWS = "is no function of the state alone, but changes with the other states or what was asked before"
 TWICE = "is no function of the state alone, but changes when it is asked again"
 OVERWRITES = "overwrites an answer it gave before; it must give a new tensor each time"
+
+SIDE_BY_SIDE = (
+    "changes when two threads call the functions at once, which concurrent = True allows; leave that out, or let no function "
+    "keep anything in self or in a buffer"
+)
 
 Answers = tuple[Tensor, dict[str, Tensor]]
 
@@ -47,6 +57,25 @@ def require_still(functions: Functions, first: Answers) -> None:
     x, answers = first
     for name, values in answers.items():
         _require_same(functions, name, x, values, functions.ask(name, x), TWICE)
+
+
+def require_concurrency(functions: Functions) -> None:
+    """The same answers from threads that ask side by side, where the class says that they may."""
+    if functions.simulator or not functions.problem.concurrent or cores() < 2:
+        return
+    asked = lambda x: {name: functions.ask(name, x) for name in functions.data}
+    pieces = functions.states(BATCHES * min(CHUNK, functions.count), BATCHES_DESIGN).chunk(BATCHES)
+    alone, until = [asked(x) for x in pieces], time.monotonic() + SECONDS
+    while True:
+        try:
+            together = side_by_side(asked, pieces)
+        except ProblemError:  # none was raised by one thread
+            raise ProblemError(f"what {functions.name} gives {SIDE_BY_SIDE}.") from None
+        for x, one, other in zip(pieces, alone, together, strict=True):
+            for name in one:
+                _require_same(functions, name, x, one[name], other[name], SIDE_BY_SIDE)
+        if time.monotonic() > until:
+            return
 
 
 def require_differentiable(functions: Functions) -> None:
