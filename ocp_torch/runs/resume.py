@@ -13,11 +13,13 @@ from ocp_torch.files.plain import value_at
 from ocp_torch.files.reading import read_json
 from ocp_torch.problems import PROBLEMS
 from ocp_torch.problems.commands import PACKAGE, UNKNOWN, ForeignProblem, naming
-from ocp_torch.runs.configuration import current, saved_configuration
+from ocp_torch.runs.configuration import CONFIG, current, saved_configuration
 from ocp_torch.training.checkpoint import LAST
 
 # Classes that a file may name; those of earlier versions are read by their present names.
 OWN_TARGETS = {f"{PACKAGE}.{c.__name__}" for c in PROBLEMS.values()}
+# What runs from before there was any have no section for.
+NEWER = ("sampler", "warm_start", "resume")
 # What a checkpoint's tensors belong to; everything else may be set anew at a resume.
 FIXED = ("problem", "method", "model", "averaging", "sampler", "warm_start", "seed", "optimizer.name", "trainer.dtype")
 
@@ -54,6 +56,11 @@ def resumed_configuration(composed: dict, named: Iterable[str]) -> dict:
             result[section] = {**composed[section], **result[section]}
     for name in named:
         _transplant(result, composed, name.split("."))
+    if lost := [name for name in composed if result.get(name) is None and name not in NEWER]:
+        raise InputError(
+            f"the configuration of {path} is damaged: it lacks {', '.join(lost)}; remove its .hydra/{CONFIG}, and that of its "
+            "checkpoint is taken."
+        )
     require_modest_run(path, result, {*named})
     problem: Any = result.get("problem")
     target = problem.get("_target_") if isinstance(problem, dict) else None

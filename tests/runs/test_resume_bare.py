@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from ocp_torch.cli import compose as composition
+from ocp_torch.errors import InputError
 from ocp_torch.runs.configuration import read_configuration, saved_configuration
 from ocp_torch.training.checkpoint import load_checkpoint
 from support.forked import TINY, completed, finished_run, train
@@ -54,6 +55,20 @@ def test_a_folder_without_configuration_goes_on_with_that_of_its_checkpoint(lost
     completed(f"resume={run}", cwd=tmp_path)  # and again, from what that left
     assert own(run)["trainer"]["steps"] == 70
     assert all(agrees(config, made) for config in left_behind(run))
+
+
+def test_a_configuration_that_was_cut_short_is_told_and_the_checkpoints_taken_once_it_is_gone(run):
+    file = run / ".hydra" / "config.yaml"
+    text = file.read_text()
+    for size in range(60, text.index("seed:"), 211):
+        file.write_text(text[:size])
+        with pytest.raises(InputError, match="damaged"):
+            composition.composed("train", [f"resume={run}"])
+    file.write_text(text.replace("seed: 3\n", ""))
+    with pytest.raises(InputError, match="it lacks seed; remove its .hydra/config.yaml"):
+        composition.composed("train", [f"resume={run}"])
+    file.unlink()
+    assert composition.composed("train", [f"resume={run}"])["seed"] == 3
 
 
 def test_a_finished_run_without_configuration_is_left_with_its_own(run, tmp_path):
