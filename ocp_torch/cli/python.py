@@ -17,6 +17,7 @@ from ocp_torch.cli.single import require_writable, told
 from ocp_torch.control.saved import load_controller
 from ocp_torch.errors import InputError, require_integer, shown
 from ocp_torch.files.reading import kind, read_json, require_unlinked
+from ocp_torch.files.storage import only_writer
 from ocp_torch.maths.ranks import joined
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import blamed
@@ -148,9 +149,11 @@ def _kept(run: TrainingRun, place: Path | None) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix="ocp_torch_") as gone:
             yield Path(gone)
     else:
-        (place / next_subfolder(place)).mkdir(parents=True, exist_ok=True)
-        keep_configuration(place, run.config)
-        yield place
+        place.mkdir(parents=True, exist_ok=True)
+        with only_writer(place):
+            (place / next_subfolder(place)).mkdir(parents=True, exist_ok=True)
+            keep_configuration(place, run.config)
+            yield place
 
 
 def reference(

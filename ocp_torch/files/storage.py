@@ -1,13 +1,14 @@
 """Files that survive a crash: written whole or not at all; and safetensors files with JSON metadata and a digest."""
 
 import contextlib
+import fcntl
 import hashlib
 import json
 import math
 import os
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
@@ -72,6 +73,25 @@ def sweep_temporaries(folder: Path) -> None:
         if re.fullmatch(r"\..+\.[a-z0-9_]{8}", leftover.name.removesuffix(PART)):
             with contextlib.suppress(OSError):
                 leftover.unlink()
+
+
+@contextlib.contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Raises `InputError` while somebody else is within this for the same ``folder``; who was killed is not. On a file system
+    without locks nothing is refused."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"{folder} is being written to by another process; stop that, or wait for its end."
+            ) from None
+        except OSError:
+            pass
+        yield
+    finally:
+        os.close(handle)
 
 
 def finite(data):

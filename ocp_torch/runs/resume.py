@@ -58,7 +58,7 @@ def resumed_configuration(composed: dict, named: Iterable[str]) -> dict:
         _transplant(result, composed, name.split("."))
     if lost := [name for name in composed if result.get(name) is None and name not in NEWER]:
         raise InputError(
-            f"the configuration of {path} is damaged: it lacks {', '.join(lost)}; remove its .hydra/{CONFIG}, and that of its "
+            f"the configuration of {path} is damaged: it lacks {', '.join(lost)}; remove .hydra/{CONFIG}, and that of its "
             "checkpoint is taken."
         )
     require_modest_run(path, result, {*named})

@@ -17,7 +17,7 @@ from ocp_torch.errors import InputError, StorageError, require_integer
 from ocp_torch.fields import Fields
 from ocp_torch.files.limits import require_held
 from ocp_torch.files.reading import require_unlinked
-from ocp_torch.files.storage import sweep_temporaries
+from ocp_torch.files.storage import only_writer, sweep_temporaries
 from ocp_torch.problems import Problem
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.runs.configuration import keep_configuration, load_state, starts
@@ -101,23 +101,24 @@ def train(run: TrainingRun, folder: Path) -> None:
     if not run.trainer.ranks.first:
         return assist(run.trainer)
     require_unlinked(folder)
-    for note in run.notes:
-        log.warning("warning: %s", note)
-    # What Hydra wrote is what was asked for, not what the run is.
-    if run.state is not None or len(starts(folder)) > 1:
-        keep_configuration(folder, run.config)
-    if run.state is not None:
-        result = result_of(folder, run.state, run.trainer.config)
-        lacking = missing(folder, run.trainer, run.settings)
-        if result is not None and lacking is not None:
-            log.info("%s lacks %s; what is missing is made.", folder, lacking)
-        if result is not None and lacking == REPORT:  # made of the other files
-            write_report(folder, run.trainer.problem, run.trainer.config)
-            lacking = None
-        if result is not None and lacking is None:
-            log.info("\n%s\n%s is finished; a larger trainer.steps would go on.", result, folder)
-            return
-    run_to_end(run.trainer, run.settings, folder)
+    with only_writer(folder):
+        for note in run.notes:
+            log.warning("warning: %s", note)
+        # What Hydra wrote is what was asked for, not what the run is.
+        if run.state is not None or len(starts(folder)) > 1:
+            keep_configuration(folder, run.config)
+        if run.state is not None:
+            result = result_of(folder, run.state, run.trainer.config)
+            lacking = missing(folder, run.trainer, run.settings)
+            if result is not None and lacking is not None:
+                log.info("%s lacks %s; what is missing is made.", folder, lacking)
+            if result is not None and lacking == REPORT:  # made of the other files
+                write_report(folder, run.trainer.problem, run.trainer.config)
+                lacking = None
+            if result is not None and lacking is None:
+                log.info("\n%s\n%s is finished; a larger trainer.steps would go on.", result, folder)
+                return
+        run_to_end(run.trainer, run.settings, folder)
 
 
 def run_to_end(trainer: Trainer, settings: CertificateSettings, folder: Path) -> Certificate:

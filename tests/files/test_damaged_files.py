@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from ocp_torch import train as from_python
 from ocp_torch.cli.compose import composed
 from ocp_torch.errors import InputError, StorageError
 from ocp_torch.files import storage
@@ -163,6 +164,20 @@ def test_a_run_on_a_full_disk_stops_with_a_sentence_and_can_go_on_later(tmp_path
     assert (folder / "checkpoints" / "last.pt").read_bytes() == before
     completed(f"resume={folder}", cwd=tmp_path)
     assert newest(folder / "checkpoints")[0]["step"] == 40
+
+
+def test_two_processes_do_not_write_one_run(tmp_path):
+    folder = tmp_path / "run"
+    completed(*TINY, "trainer.steps=10", f"hydra.run.dir={folder}", cwd=tmp_path)
+    before = {p: p.read_bytes() for p in (folder / "checkpoints").iterdir()}
+    with storage.only_writer(folder):
+        ended = train(f"resume={folder}", "trainer.steps=20", cwd=tmp_path)
+        assert f"{folder} is being written to by another process" in ended.sentence
+        with pytest.raises(InputError, match="another process"):
+            from_python("circle", resume=folder, steps=20, progress=False)
+    assert {p: p.read_bytes() for p in (folder / "checkpoints").iterdir()} == before
+    completed(f"resume={folder}", "trainer.steps=20", cwd=tmp_path)
+    assert newest(folder / "checkpoints")[0]["step"] == 20
 
 
 @pytest.mark.parametrize("name", ["last.pt", "certificate.json", "controller.safetensors", "config.yaml", "unfinished"])

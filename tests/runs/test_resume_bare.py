@@ -65,7 +65,7 @@ def test_a_configuration_that_was_cut_short_is_told_and_the_checkpoints_taken_on
         with pytest.raises(InputError, match="damaged"):
             composition.composed("train", [f"resume={run}"])
     file.write_text(text.replace("seed: 3\n", ""))
-    with pytest.raises(InputError, match="it lacks seed; remove its .hydra/config.yaml"):
+    with pytest.raises(InputError, match="it lacks seed; remove .hydra/config.yaml"):
         composition.composed("train", [f"resume={run}"])
     file.unlink()
     assert composition.composed("train", [f"resume={run}"])["seed"] == 3
