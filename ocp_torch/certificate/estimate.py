@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.errors import require_integer, require_number
-from ocp_torch.fields.waves import STATES, standardised, waves_of
+from ocp_torch.fields.waves import WAVE_STATES, standardised, waves_of
 from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.maths.sums import summed
 from ocp_torch.problems.problem import Problem
@@ -136,7 +136,7 @@ def integrals(states: list[Tensor], values: list[Tensor], weights: list[Tensor] 
     plain = [float(v.mean()) for v in values]
     if len(states) < 2:
         return plain
-    some = slice(0, max(1, STATES // len(states)))
+    some = slice(0, max(1, WAVE_STATES // len(states)))
     functions = standardised(torch.cat([v[some] for v in values]))
     waves = waves_of(torch.cat([x[some] for x in states]), functions, WAVES).to(states[0])
     if not len(waves):

@@ -18,7 +18,7 @@ class Tanh(nn.Module):
 # Smooth activations only: the gradient of a field is part of every loss.
 ACTIVATIONS = {"gelu": nn.GELU, "silu": nn.SiLU, "tanh": Tanh, "softplus": nn.Softplus}
 
-# A smooth function with its first three derivatives, each of the shape of its argument, the last two if they are asked for.
+# Maps an argument to a smooth function's value and first three derivatives, all of its shape; the last two once called.
 Later = Callable[[], Tensor]
 Derivatives = Callable[[Tensor], tuple[Tensor, Tensor, Later, Later]]
 

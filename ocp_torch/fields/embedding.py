@@ -34,8 +34,8 @@ class FourierEmbedding(nn.Module):
         return [] if self.mixed is None else (self.mixed == 0.0).all(dim=-1).nonzero().flatten().tolist()
 
     def mix(self, waves: Tensor) -> tuple[list[int], list[int]]:
-        """Take the wave vectors ``waves`` ``(W, d)``, as many as there are free places. Gives the columns of the new
-        features: those of cosines, which were 1 until now, and those of sines, which were 0."""
+        """Take the wave vectors ``waves`` ``(W, d)``, as many as there are free places. Returns the columns of the new
+        features: the cosines, which were 1 until now, and the sines, which were 0."""
         places = self.free[: len(waves)]
         if self.mixed is not None:
             self.mixed[places] = waves[: len(places)].to(self.mixed)

@@ -15,14 +15,15 @@ from ocp_torch.fields.embedding import FourierEmbedding
 from ocp_torch.fields.logarithmic import Logarithmic
 from ocp_torch.fields.rounded import Rounded
 from ocp_torch.fields.subsolution import Subsolution
-from ocp_torch.fields.waves import STATES, prominent_waves
+from ocp_torch.fields.waves import WAVE_STATES, prominent_waves
 from ocp_torch.problems.equilibrium import equilibrium
 from ocp_torch.problems.problem import Problem
 
 VALUE, CONTROL_DENSITY, LOG_OCCUPATION = "value", "control_density", "log_occupation"
-# A second `V`, from values of trajectories or of a grid: what controls best and what bounds best differ. No player moves it.
+# A second `V`, fitted to values of trajectories or of a grid by the warm start alone: the best controller and the best bound
+# come from different functions.
 TRAJECTORY_VALUE = "trajectory_value"
-# A third, `V` trained on for the lower bound alone.
+# A third `V`: the first one, trained on for the lower bound alone.
 SUBSOLUTION = "subsolution"
 # Builds a network from (dim, outputs, shift, scale); outputs None means a scalar field.
 NetworkFactory = Callable[..., nn.Module]
@@ -41,8 +42,8 @@ class Fields(nn.Module):
     ) -> "Fields":
         """Fresh networks for ``names`` in the units of ``problem``, initialised from ``seed`` alone.
 
-        An embedding with room for them gets ``waves`` ``(W, d)``, those that are not 0, or else the problem's
-        `prominent_waves`; one for a state of rest its `equilibrium`.
+        An embedding with room for further waves gets ``waves`` ``(W, d)``, but for zeros, or else the problem's
+        `prominent_waves`; features about a state of rest get its `equilibrium`.
         """
         cost, control = typical_sizes(problem)
         forms: dict[str, dict[str, Any]] = {
@@ -65,7 +66,7 @@ class Fields(nn.Module):
 
     @property
     def value(self) -> Any:
-        """`V`: ``(N, d) -> (N,)``; like the others `None` where there is none, which whoever asks knows of its method."""
+        """`V`: ``(N, d) -> (N,)``; each field is `None` where the method has none."""
         return self._get(VALUE)
 
     @property
@@ -85,12 +86,12 @@ class Fields(nn.Module):
 
     @property
     def subsolution(self) -> Any:
-        """What the lower bound is of, where that is not `V`: a `Subsolution`."""
+        """The `Subsolution` that the lower bound is made of, where that is not `V`."""
         return self._get(SUBSOLUTION)
 
     @property
     def rounded(self) -> "Fields":
-        """The fields at float64 states, computed in float32."""
+        """The same fields for float64 states, computed in float32."""
         return Fields({name: Rounded(network) for name, network in self.networks.items()})
 
     def _get(self, name: str) -> nn.Module | None:
@@ -107,20 +108,19 @@ def made(name: str, network: NetworkFactory, **form: Any) -> nn.Module:
     return special[name](network, **form) if name in special else network(**form)
 
 
-# A state cost whose mean is within this factor of 1 is of an ordinary size.
-ORDINARY = 1e4
-# States that a problem's units are estimated from; a spread below so much of the mean is rounding.
-SIZED, CONSTANT = 1024, 1e-12
-# What was found for a problem: the search takes seconds in eight dimensions, and policy evaluation builds networks again.
+ORDINARY = 1e4  # a state cost whose mean is within this factor of 1 is of an ordinary size
+UNIT_STATES = 1024  # from which a problem's units are estimated
+ROUNDING = 1e-12  # a standard deviation below this part of the mean is rounding
+# The waves found for a problem, by their number: a search takes seconds in eight dimensions, and networks are built again.
 _found: WeakKeyDictionary[Problem, dict[int, Tensor]] = WeakKeyDictionary()
 
 
 def _waves(problem: Problem, count: int) -> Tensor:
-    """`prominent_waves` of the problem's data, from the same states always; and `coupled_waves` of the state cost, where
-    there are more coordinates than those look at together, and states cost little."""
+    """`prominent_waves` of the problem's data, always from the same states; and `coupled_waves` of the state cost, where
+    these may exist and evaluations cost little."""
     known = _found.setdefault(problem, {})
     if count not in known:
-        samples, dim = problem.independent_samples(STATES), problem.dim
+        samples, dim = problem.independent_samples(WAVE_STATES), problem.dim
         known[count] = prominent_waves(samples, count)
         if len(known[count]) < count and may_be_coupled(problem):
             listed = torch.cat([torch.eye(dim), 2.0 * torch.eye(dim), known[count]])
@@ -131,8 +131,8 @@ def _waves(problem: Problem, count: int) -> Tensor:
 
 def cost_unit(problem: Problem) -> float:
     """What losses are divided by before they are differentiated: 1 for costs of an ordinary size, else the power of two next
-    to their mean, so that no optimiser takes a gradient of 1e-12 for none."""
-    (f,) = problem.probe(SIZED, 0, "f")
+    to their mean, so that no optimiser mistakes a gradient of 1e-12 for 0."""
+    (f,) = problem.probe(UNIT_STATES, 0, "f")
     size = float(f.abs().mean())
     ordinary = not math.isfinite(size) or size == 0.0 or 1.0 / ORDINARY <= size <= ORDINARY
     return 1.0 if ordinary else 2.0 ** round(math.log2(size))
@@ -143,7 +143,7 @@ def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:
 
     Raises `InputError` when the state cost is not finite at some sampled state.
     """
-    x, f = problem.probe(SIZED, 0, "x", "f")
+    x, f = problem.probe(UNIT_STATES, 0, "x", "f")
     if f.shape != (len(x),):
         raise InputError(f"state_cost gave shape {tuple(f.shape)} for states {tuple(x.shape)}; it must give (N,).")
     if not torch.isfinite(f).all():
@@ -151,6 +151,6 @@ def typical_sizes(problem: Problem) -> tuple[tuple[float, float], float]:
         raise InputError(f"state_cost is not finite at x = {at}; it must be finite on the whole torus.")
     spread = float(f.std())
     mean = float(f.mean())
-    spread = spread if spread > CONSTANT * max(abs(mean), 1e-300) else max(abs(mean), 1.0)
+    spread = spread if spread > ROUNDING * max(abs(mean), 1e-300) else max(abs(mean), 1.0)
     control = math.pow(problem.exponent * spread, 1.0 / problem.exponent)
     return (mean, spread), min(control, problem.control_cost.reach)

@@ -2,8 +2,9 @@ r"""Value, gradient and `D : hess` of a perceptron in one sweep forward: exact, 
 
 Each layer is handed its input `h` ``(N, F)``, the derivatives `h_i` of it along `p` directions ``(p, N, F)`` and the
 curvature `D : h_ij` ``(N, F)``. A linear layer maps them alike. An activation `s` maps them to `s(h)`, `s' h_i` and
-`s' (D : h_ij) + s'' sum_ij D_ij h_i h_j`. The directions are the coordinates, or the columns of the noise: where those are
-fewer, and one reverse pass gives the gradient, or where they are as many and the same at all states.
+`s' (D : h_ij) + s'' sum_ij D_ij h_i h_j`. The directions are the columns of the noise where there are fewer of them than
+coordinates (one reverse pass then gives the gradient), or as many and these are diagonal or the same at all states; else the
+coordinates.
 """
 
 import math
@@ -18,7 +19,7 @@ from ocp_torch.fields.activations import DERIVATIVES, Derivatives
 from ocp_torch.fields.embedding import FourierEmbedding
 from ocp_torch.maths.decisions import decided
 
-# Rounding grows by at most this factor where a gradient is had from derivatives along columns of the noise.
+# Largest condition number of noise by whose columns gradients are found: rounding grows by at most this factor.
 LARGEST_CONDITION = 100.0
 
 
@@ -27,8 +28,8 @@ class Along:
     """The directions derivatives are taken along: the columns of the noise, or else the coordinates."""
 
     columns: Tensor | None = None  # (N, d, p): directions that are not coordinates, and too few for the gradient
-    scales: Tensor | None = None  # (N, d): by which coordinates are multiplied, so that they are columns of the noise
-    frame: Tensor | None = None  # (d, d): columns of the noise that are the same at all states
+    scales: Tensor | None = None  # (N, d): the diagonal of noise that has no other entries
+    frame: Tensor | None = None  # (d, d): lower triangular noise that is the same at all states
     inverse: Tensor | None = None  # (d, d): of ``frame``
     sigma: Tensor | None = None  # (N, d, k): the noise, where directions are not its columns
 
@@ -53,7 +54,7 @@ class Along:
 
     @property
     def enough(self) -> bool:
-        """Whether directions are columns of the noise, and gradients follow from derivatives along them."""
+        """Whether the directions are columns of the noise along which derivatives determine gradients."""
         return self.scales is not None or self.frame is not None
 
     def derivatives(self, waves: Tensor, count: int) -> Tensor:
@@ -119,8 +120,8 @@ class Sweep:
 
 
 class Activated(torch.autograd.Function):
-    """`Sweep.activated` along columns of the noise, with a reverse of its own: autograd's takes twice as many passes over
-    ``(p, N, F)`` numbers, and a step a quarter longer."""
+    """`Sweep.activated` along columns of the noise, with a backward pass of its own: autograd's reads ``(p, N, F)`` numbers
+    twice as often, and a step takes a quarter longer."""
 
     @staticmethod
     def forward(ctx: Any, z: Tensor, slopes: Tensor, curvature: Tensor, derivatives: Derivatives) -> Any:

@@ -14,10 +14,8 @@ from ocp_torch.fields.forward_sweep import Along, Sweep
 from ocp_torch.fields.reverse_sweep import Dense, Layer, Product, swept_jet
 from ocp_torch.maths.jets import Jet, is_data, reverse_jet
 
-# Sizes up to so many coordinates. Kinks want Fourier modes, affordable in one and two dimensions; in many dimensions products
-# of tanh learn terms that couple coordinates several times faster. In one dimension two layers on 16 modes take .85 of the
-# time of three on 6, and leave circles the same gap, certified .018 to .023 % for .015 to .024 % (six seeds, 1,050 steps);
-# with 6 or 24 modes it is .034 or .044 %. In two dimensions two layers leave a torus .055 to .077 % for .031 to .064 %.
+# Network sizes by the largest number of coordinates they are for. Kinks need Fourier modes, affordable in few dimensions (a
+# circle's gap is .023 % or less with 16, .034 % with 6); in many, gated layers learn coupled coordinates far faster.
 SIZES = {
     1: dict(modes=16, waves=0, width=64, depth=2, gated=False),
     2: dict(modes=6, waves=16, width=96, depth=3, gated=False),
@@ -25,28 +23,27 @@ SIZES = {
     8: dict(modes=1, waves=64, width=128, depth=3, gated=True),
     inf: dict(modes=1, waves=128, width=128, depth=3, gated=True),
 }
-# In three and four coordinates where the worst state counts, or with noise: where there are no Gauss-Newton steps. These
-# converge in 20 to 30 on the network above, on this one or with half of those waves not at all; a torus has the same gap.
-PLAIN = dict(modes=3, waves=32, width=128, depth=3, gated=False)
-# Where the worst state counts a network shall bend little, for an error that is small everywhere and not on average: no
-# products, and silu. `F_M` with M = 40 of six oscillators was .641 with products and tanh, .645 without and with gelu. Their
-# simulated gap was 1.59 % with gelu, 1.20 % with silu; an arm's, on two seeds, .51 and .82, or .64 and .67 %; that of dubins
-# 1.06 and 1.36, or 1.31 and 1.05 %. A step with silu takes four fifths of the time. With softplus the arm has .84 and .89 %.
-SMOOTH = dict(gated=False, activation="silu")
-# How many waves then. In two coordinates the harmonics of kinks help: an arm has .67 % with 64 waves, 1.11 % with 16. In more
-# of them such harmonics make spikes: six oscillators have 1.2 % with 64 waves and .9 % with 16, dubins 1.05 and .84, a
-# unicycle .77 and .66, eight oscillators 5.4 and 4.2 with 28. Each pair of coordinates has one, as far as `SIZES` has many.
-WAVES_IN_TWO, LEAST_WAVES, WAVES_PER_COORDINATE = 64, 16, 4
-# A network that is fitted to values along trajectories has gelu and so many waves at least: after 200 rounds an acrobot cost
-# 2.54 with silu and 16 waves, 2.50 with 32 (after 150), 2.35 with gelu and 32; another seed 2.62, or with gelu 2.41 and 2.36
-# (after 160). With silu it swung and never stood.
-FITTED, FITTED_WAVES = "gelu", 32
-# In one dimension with noise, which turns a kink of the cost into one of the second derivative: on the circle with nu = 0.05
-# F_M was 0.055 % below OPT with 6 modes, and 0.017 % with 24 and the 2,000 steps that these take.
+# Sizes in three and four coordinates where no Gauss-Newton steps are made, with noise or where the worst state counts: such
+# steps do not converge on this network, but in 20 to 30 on the gated one above.
+UNGATED_SIZES = dict(modes=3, waves=32, width=128, depth=3, gated=False)
+# Where the worst state counts a network should have little curvature, for an error that is small everywhere and not only on
+# average: no gates, and silu (six oscillators had a simulated gap of 1.20 %, with gelu 1.59 %).
+WORST_STATE_OPTIONS = dict(gated=False, activation="silu")
+# Waves where the worst state counts: in two coordinates the harmonics of kinks help (an arm's gap is .67 % with 64, 1.11 %
+# with 16); in more they make spikes (a unicycle's is .77 and .66 %), and one for each pair of coordinates is enough.
+WAVES_IN_TWO = 64
+LEAST_WAVES = 16  # in more than two coordinates
+WAVES_PER_COORDINATE = 4  # at least, in more than two coordinates
+# A network fitted to values along trajectories: an acrobot's cost was 2.35 with gelu and 32 waves, 2.54 with silu and 16.
+FITTED_ACTIVATION = "gelu"
+FITTED_WAVES = 32  # at least
+# In one dimension with noise, which turns a kink of the cost into one of the second derivative: on a circle F_M was .055 %
+# below OPT with 6 modes, .017 % with 24 and the 2,000 steps that these take.
 NOISY_MODES = 24
-# States times directions of a sweep forward without a graph: more do not fit the cache (1,024 states in 64 coordinates 1.8 s
-# at once, 1.0 so, in 16 .28 and .20).
-SWEPT, FEWEST_ROWS = 2048, 32
+# States times directions of a forward sweep without a graph: more do not fit the cache (1,024 states in 64 coordinates take
+# 1.0 s so, 1.8 s at once).
+SWEEP_SIZE = 2048
+LEAST_SWEEP_STATES = 32  # for any number of directions
 
 
 class Gated(nn.Module):
@@ -69,8 +66,8 @@ class PeriodicMLP(nn.Module):
 
     ``shift`` and ``scale`` are constants in the units of what is represented, so that one learning rate suits costs of
     any size. With ``gated`` each hidden layer multiplies two halves (`Gated`). The last layer starts small: the field
-    starts near the constant ``shift``. A ``centred`` one is fitted to given values: its embedding has features about a state
-    of rest (`Centred`), the activation is gelu, and unless there are no ``waves`` there are at least 32.
+    starts near the constant ``shift``. A ``centred`` network is made to be fitted to given values: its embedding has
+    features about a state of rest (`Centred`), its activation is gelu, and ``waves`` other than 0 are at least 32.
     """
 
     shift: Tensor
@@ -95,7 +92,7 @@ class PeriodicMLP(nn.Module):
         depth = require_integer("model.depth", depth, 1, maximum=64)
         activate = ACTIVATIONS[require_choice("model.activation", activation, ACTIVATIONS)]
         if centred:
-            activate, waves = ACTIVATIONS[FITTED], max(waves, FITTED_WAVES) if waves else 0
+            activate, waves = ACTIVATIONS[FITTED_ACTIVATION], max(waves, FITTED_WAVES) if waves else 0
         self.embedding = FourierEmbedding(dim, modes, waves)
         self.centred = Centred(dim) if centred else None
         sizes = [self.embedding.width + (self.centred.width if self.centred else 0)] + [width] * depth
@@ -117,21 +114,21 @@ class PeriodicMLP(nn.Module):
 
     @classmethod
     def defaults(cls, dim: int, worst_state: bool = False, noisy: bool = False) -> dict:
-        """What won in measurements in dimension ``dim``, by the name of the argument; with ``worst_state`` where the bound
-        is decided by the worst state and not by an average."""
+        """The best measured arguments in dimension ``dim``, by name; ``worst_state`` says that the bound is decided by the
+        worst state and not by an average."""
         sizes = next(sizes for largest, sizes in SIZES.items() if dim <= largest)
-        sizes = PLAIN if 2 < dim <= 4 and (worst_state or noisy) else sizes
+        sizes = UNGATED_SIZES if 2 < dim <= 4 and (worst_state or noisy) else sizes
         if noisy and dim == 1:
             sizes = {**sizes, "modes": NOISY_MODES}
         if not worst_state:
             return {**sizes, "activation": "tanh"}
         enough = max(LEAST_WAVES, WAVES_PER_COORDINATE * dim, comb(dim, 2))
-        return {**sizes, **SMOOTH, "waves": WAVES_IN_TWO if dim <= 2 else min(sizes["waves"], enough)}
+        return {**sizes, **WORST_STATE_OPTIONS, "waves": WAVES_IN_TWO if dim <= 2 else min(sizes["waves"], enough)}
 
     @torch.no_grad()
     def add_waves(self, waves: Tensor) -> None:
         """Take the wave vectors ``waves`` ``(W, d)``, as many as the embedding has room for, and stay the same function: the
-        weights of the new features start at 0, and what they made of a constant is the bias's."""
+        weights of the new features start at 0, and the biases take over what the old constant features gave."""
         cosines, sines = self.embedding.mix(waves)
         first: nn.Module = self.body[0]
         for layer in first.modules():
@@ -148,13 +145,13 @@ class PeriodicMLP(nn.Module):
 
     @property
     def can_be_swept(self) -> bool:
-        """Whether the sweeps, which go layer by layer, give what `forward` gives."""
+        """Whether the hand-written sweeps, which go layer by layer, give what `forward` gives."""
         return self.centred is None and type(self).forward is PeriodicMLP.forward
 
     def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
-        """The jet of a scalar network at states ``(N, d)``: by a sweep back (`reverse_sweep`), and with noise ``sigma``
-        ``(N, d, k)`` there by one forward, of `min(d, k) + 2` times the work of `forward`; where states are differentiated,
-        and where neither `can_be_swept`, by autograd's reverse passes."""
+        """The jet of a scalar network at states ``(N, d)``: by `reverse_sweep`, or with noise ``sigma`` ``(N, d, k)`` by
+        `forward_sweep`, at `min(d, k) + 2` times the work of `forward`; by autograd's reverse passes where the network cannot
+        be swept, or states are differentiated without noise."""
         if not self.can_be_swept or (sigma is None and not is_data(x)):
             return reverse_jet(self, x, sigma)
         if sigma is None:
@@ -177,7 +174,7 @@ class PeriodicMLP(nn.Module):
         """`sigma sigma^T / 2 : hess` ``(N,)`` of a scalar network at states ``(N, d)``, for data ``sigma`` ``(N, d, k)``."""
         if not self.can_be_swept or not is_data(x):
             return reverse_jet(self, x, sigma).curvature
-        rows = max(FEWEST_ROWS, SWEPT // sigma.shape[2])
+        rows = max(LEAST_SWEEP_STATES, SWEEP_SIZE // sigma.shape[2])
         pieces = zip(x.split(rows), sigma.split(rows), strict=True)
         return torch.cat([self._swept(at, Along(columns=s)).curvature for at, s in pieces])
 

@@ -1,9 +1,9 @@
-r"""Value and gradient of a perceptron by one sweep forward and one back, and the slopes of both in its weights, written out.
+r"""Value and gradient of a perceptron by one sweep forward and one back, and their derivatives in its weights, written out.
 
-Autograd differentiates the sweep back once more, through a graph of a few hundred operations: a step of small networks is
-mostly that. But for slopes `v` ``(N,)`` of a loss in the values and `g` ``(N, d)`` in the gradients, what is to be
-differentiated is `sum v V + sum g . grad V`, with the derivative of `V` along `g` at each state: a sweep forward along `g`,
-and one back for both at once.
+Autograd differentiates the sweep back once more, through a graph of a few hundred operations, which is most of a step of
+small networks. But a loss with the derivatives ("slopes") `v` ``(N,)`` in the values and `g` ``(N, d)`` in the gradients has
+in the weights the slopes of `S = sum v V + sum g . grad V`. Since `g . grad V` is the derivative of `V` along `g` at each
+state, these take one sweep forward along `g`, and one back for both terms at once.
 """
 
 from abc import ABC, abstractmethod
@@ -16,53 +16,53 @@ from torch.autograd.function import once_differentiable
 from ocp_torch.fields.activations import DERIVATIVES
 from ocp_torch.maths.jets import Jet
 
-# States whose products with others are computed at once.
-ROWS = 128
+# States of a strip of the Gram matrix: what fits the cache.
+STRIP_STATES = 128
 
 
 class Layer(ABC):
-    """One hidden layer during the sweeps of one batch, called in this order; rows are states."""
+    """One hidden layer during the sweeps over a batch; its methods are called in the order below. Rows are states."""
 
     @abstractmethod
     def forward(self, h: Tensor) -> Tensor:
-        """What comes out."""
+        """The layer's output at its input ``h``."""
 
     @abstractmethod
     def back(self, slope: Tensor) -> Tensor:
-        """The slopes of the field in what comes in, from those in what comes out."""
+        """The slopes of the field `V` in the layer's input, from its slopes ``slope`` in the output."""
 
     @abstractmethod
     def along(self, moved: Tensor) -> Tensor:
-        """The derivative along `g` of what comes out, from that of what comes in."""
+        """The derivative of the output along `g`, from ``moved``, that of the input."""
 
     @abstractmethod
     def turned(self, adjoint: Tensor) -> None:
-        """Take the slopes of `sum v V + sum g . grad V` in what comes out."""
+        """Take ``adjoint``, the slopes of `S` in the output."""
 
     @abstractmethod
     def inward(self) -> Tensor:
-        """The same in what comes in."""
+        """The slopes of `S` in the input."""
 
     @property
     @abstractmethod
     def factors(self) -> list[tuple[Tensor, Tensor]]:
-        """For each affine map its `(z, p)`: with ``came``, `h`, and ``moved_in``, `y`, the slopes in its matrix are
-        `sum z h^T + p y^T`, those in its bias `sum z`."""
+        """`(z, p)` for each affine map: the slopes of `S` in its matrix are `sum z h^T + p y^T`, where `h` is the input
+        ``came`` and `y` is ``moved_in``, the input's derivative along `g`; those in its bias are `sum z`."""
 
     came: Tensor
     moved_in: Tensor
 
     @property
     def slopes(self) -> list[Tensor]:
-        """The slopes in the layer's parameters."""
+        """The slopes of `S` in the layer's parameters."""
         found = []
         for z, p in self.factors:
             found += [torch.addmm(z.T @ self.came, p.T, self.moved_in), z.sum(dim=0)]
         return found
 
     def add_products(self, gram: Tensor, rows: slice, others: slice) -> None:
-        """Add to ``gram`` the inner products of the slopes in the layer's parameters that the states ``rows`` have and those
-        that ``others`` have, without those slopes."""
+        """Add to ``gram`` the inner products of the states ``rows`` with the states ``others``: of the slopes in the layer's
+        parameters that each state alone has, which are not formed."""
         came = self.came, self.moved_in
         products = [[one[rows] @ other[others].T for other in came] for one in came]
         products[0][0] += 1.0  # for the bias
@@ -142,7 +142,7 @@ class Product(Layer):
 
 
 class ReverseSweep:
-    """The sweeps of the perceptron ``network`` over the states ``x`` ``(N, d)``; first `jet`, then `turn`, then the rest."""
+    """The sweeps of the perceptron ``network`` over the states ``x`` ``(N, d)``: call `jet`, then `turn`, then the rest."""
 
     def __init__(self, network: Any, x: Tensor) -> None:
         self.head, self.scale, self.shift = network.head, network.scale, network.shift
@@ -165,7 +165,7 @@ class ReverseSweep:
         return value, self.embedding.pulled_back(cosines * of_sines - sines * of_cosines, self.dim)
 
     def turn(self, of_value: Tensor, of_gradient: Tensor) -> None:
-        """Take what has the slopes ``of_value`` `v` ``(N,)`` and ``of_gradient`` `g` ``(N, d)`` in the jet."""
+        """Take the slopes of a loss in the jet: ``of_value``, `v` ``(N,)``, and ``of_gradient``, `g` ``(N, d)``."""
         turned = self.embedding.angles(of_gradient)
         cosines, sines = self.embedded.chunk(2, dim=-1)
         moved = torch.cat([-sines * turned, cosines * turned], dim=-1)
@@ -180,15 +180,16 @@ class ReverseSweep:
                 adjoint = layer.inward()
 
     def slopes(self) -> list[Tensor]:
-        """Its slopes in all parameters, in the network's order."""
+        """The slopes of the loss in all parameters, in the network's order."""
         head = [self.of_head.sum(dim=0, keepdim=True), self.of_bias.sum(dim=0, keepdim=True)]
         return [slope for layer in self.layers for slope in layer.slopes] + head
 
     def products(self) -> Tensor:
-        """The inner products ``(N, N)`` of each two states' own slopes in all parameters, below the diagonal and on it."""
+        """The Gram matrix ``(N, N)`` of the slopes that each state alone has in all parameters; valid below the diagonal and
+        on it."""
         gram = self.of_head @ self.of_head.T + torch.outer(self.of_bias, self.of_bias)
-        for first in range(0, len(gram), ROWS):  # in strips that fit the cache
-            rows, others = slice(first, first + ROWS), slice(0, first + ROWS)
+        for first in range(0, len(gram), STRIP_STATES):  # in strips that fit the cache
+            rows, others = slice(first, first + STRIP_STATES), slice(0, first + STRIP_STATES)
             for layer in self.layers:
                 layer.add_products(gram[rows, others], rows, others)
         return gram
@@ -200,7 +201,7 @@ class _Swept(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, network: Any, x: Tensor, *weights: Tensor) -> Any:
         ctx.sweep = ReverseSweep(network, x)
-        ctx.save_for_backward(*weights)  # which tells where one was changed meanwhile
+        ctx.save_for_backward(*weights)  # so that autograd notices where one was changed meanwhile
         return ctx.sweep.jet()
 
     @staticmethod

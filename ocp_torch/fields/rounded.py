@@ -24,12 +24,12 @@ class Rounded(nn.Module):
         return jets.jet(self.network, here, None if sigma is None else sigma.float()).map(Tensor.double)
 
     def curvature(self, x: Tensor, sigma: Tensor) -> Tensor:
-        """As `jets.curvature` has it."""
+        """`sigma sigma^T / 2 : hess` ``(N,)`` of a scalar network, as `jets.curvature` gives it."""
         return jets.curvature(self.network, (x - x.floor()).float(), sigma.float()).double()
 
 
 def rounded(field: Field) -> Field:
-    """``field`` in single precision where it is a network of this package, known by its method ``jet``, or made of one, and
-    then has a property of this name; else as it is."""
+    """``field`` in single precision where it has a property ``rounded``, or is a network of this package (known by its method
+    ``jet``); else as it is."""
     own = getattr(field, "rounded", None)
     return own or (Rounded(field) if isinstance(field, nn.Module) and hasattr(field, "jet") else field)

@@ -17,14 +17,14 @@ from ocp_torch.maths.jets import Jet
 KERNELS = ("product", "isotropic")
 # Pairs of frequencies at most: beyond, one batch of features would fill the memory.
 MOST_FREQUENCIES = 2**14
-# What `modes = None` chooses fits into so many.
+# Pairs of frequencies at most where ``modes`` is `None`.
 COMFORTABLE_FREQUENCIES = 256
 
 
 def frequencies_within(dim: int, kernel: str, modes: int, most: int) -> np.ndarray | None:
     """One of each pair `w, -w` of non-zero frequencies whose weight is at least that of `modes`; `None` beyond ``most``.
 
-    These are the largest weights of the spectrum: a hyperbolic cross, `prod_i max(1, |w_i|) <= modes`, for the product
+    The frequencies of the largest weights are a hyperbolic cross, `prod_i max(1, |w_i|) <= modes`, for the product
     kernel and a ball, `|w| <= modes`, for the isotropic one.
     """
     found = np.zeros((1, 0), dtype=np.int64)
@@ -131,8 +131,8 @@ class SobolevField(nn.Module):
     """`x -> shift + scale * theta . features(x)`, ``(N, d) -> (N,)`` or, with ``outputs``, ``(N, outputs)``; starts at 0.
 
     A plain gradient step on `theta` is a gradient step in the space. ``scaled`` takes the problem's units for shift and
-    scale; without it they are 0 and 1, as in the paper, whose step sizes mean something only then. A space has
-    its features, ``centred`` or not.
+    scale; without it they are 0 and 1, as in the paper, whose step sizes mean something only then. ``centred`` changes
+    nothing.
     """
 
     shift: Tensor
@@ -156,7 +156,7 @@ class SobolevField(nn.Module):
 
     @classmethod
     def defaults(cls, dim: int, worst_state: bool = False, noisy: bool = False) -> dict:
-        """None: where ``modes`` is `None` the features choose."""
+        """No defaults: where ``modes`` is `None` the features choose."""
         return {}
 
     @classmethod

@@ -9,8 +9,8 @@ from ocp_torch.maths.jets import Jet
 
 
 class Subsolution(nn.Module):
-    """``network`` `W`, ``(N, d) -> (N,)``, and ``worst`` ``(K, d)``, where its slack was found to be largest: a search for
-    the supremum begins there too, since others may miss a peak that this one has met."""
+    """``network`` `W`, ``(N, d) -> (N,)``, and ``worst`` ``(K, d)``, the states at which its slack was found to be largest:
+    a later search for the supremum begins there too, since it may miss a peak that an earlier one has met."""
 
     worst: Tensor
 
@@ -21,7 +21,7 @@ class Subsolution(nn.Module):
 
     @classmethod
     def of(cls, network: Any, dim: int, states: int = 0, **form: Any) -> "Subsolution":
-        """One with room for so many ``states``, to load weights and states into; ``network`` makes its network."""
+        """A subsolution with room for so many ``states``, to load weights and states into; ``network`` makes its network."""
         made = network(dim=dim, **form)
         return cls(made, next(made.parameters()).new_zeros(states, dim))
 
@@ -29,9 +29,9 @@ class Subsolution(nn.Module):
         return self.network(x)
 
     def jet(self, x: Tensor, sigma: Tensor | None = None) -> Jet:
-        """As `jets.jet` has it."""
+        """The jet of `W` at states ``(N, d)``, as `jets.jet` gives it."""
         return jets.jet(self.network, x, sigma)
 
     def curvature(self, x: Tensor, sigma: Tensor) -> Tensor:
-        """As `jets.curvature` has it."""
+        """`sigma sigma^T / 2 : hess` of `W` ``(N,)``, as `jets.curvature` gives it."""
         return jets.curvature(self.network, x, sigma)

@@ -14,14 +14,14 @@ from torch import Tensor
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.samples import Samples
 
-# States the coefficients are estimated from, and random mixtures that stand for all entries of `a` and of `B`.
-STATES, MIXTURES = 8192, 4
-# Wave vectors looked at are sums `l + r` of two lists; so many sums at most, and no entry beyond the highest harmonic.
-MOST_SUMS, HIGHEST = 1_000_000, 6
-# Under noise alone, the chance that any coefficient of any function passes the bar is e^-MARGIN, 5 %.
+WAVE_STATES = 8192  # from which Fourier coefficients are estimated
+MIXTURES = 4  # random mixtures that stand for all entries of `a`, and as many for those of `B`
+MOST_SUMS = 1_000_000  # candidates at most, which are sums `l + r` of wave vectors of two lists
+HIGHEST_HARMONIC = 6  # largest entry of a candidate
+# Under sampling noise alone, the chance that any coefficient of any function passes the bar is e^-MARGIN, 5 %.
 MARGIN = 3.0
-# A standard deviation below so much of the mean size is rounding, in single precision: the function is constant.
-CONSTANT = 1e-5
+# A standard deviation below this part of the mean size is rounding in single precision: the function is constant.
+ROUNDING = 1e-5
 
 
 def prominent_waves(samples: Samples, count: int) -> Tensor:
@@ -34,8 +34,8 @@ def prominent_waves(samples: Samples, count: int) -> Tensor:
 
 
 def waves_of(x: Tensor, functions: list[Tensor], count: int, entries: int = 1) -> Tensor:
-    """The same for ``functions`` ``(N,)`` of mean 0 and variance 1 at random states ``x``: waves of at least ``entries``
-    non-zero entries."""
+    """At most ``count`` wave vectors ``(W, d)``, chosen as in `prominent_waves`, of ``functions`` ``(N,)`` with mean 0 and
+    variance 1 at random states ``x`` ``(N, d)``: of at least ``entries`` non-zero entries each."""
     dim = x.shape[1]
     if count == 0 or dim < entries or not functions:
         return torch.zeros(0, dim, dtype=torch.float32)
@@ -77,7 +77,7 @@ def candidate_parts(dim: int) -> tuple[Tensor, Tensor]:
     A full grid over both halves of the coordinates where that is affordable, else waves of few coordinates.
     """
     half = dim // 2
-    for K in range(HIGHEST, 1, -1):
+    for K in range(HIGHEST_HARMONIC, 1, -1):
         if (2 * K + 1) ** dim <= MOST_SUMS:
             axis = torch.arange(-K, K + 1.0)
             grid = lambda n, axis=axis: torch.cartesian_prod(*[axis] * n).reshape(-1, n) if n else torch.zeros(1, 0)
@@ -115,4 +115,4 @@ def standardised(y: Tensor) -> list[Tensor]:
     """``y`` with mean 0 and variance 1, as a list; empty where it is constant."""
     centred = y - y.mean()
     spread = float(centred.std())
-    return [centred / spread] if spread > CONSTANT * float(y.abs().mean()) else []
+    return [centred / spread] if spread > ROUNDING * float(y.abs().mean()) else []

@@ -16,7 +16,7 @@ from ocp_torch.control.described import problem_name
 from ocp_torch.errors import InputError, call, nearest, require_choice, require_integer, require_number, require_section
 from ocp_torch.fields import MODELS, TRAJECTORY_VALUE, VALUE, Fields
 from ocp_torch.fields.fields import cost_unit
-from ocp_torch.fields.waves import STATES
+from ocp_torch.fields.waves import WAVE_STATES
 from ocp_torch.files.limits import require_memory
 from ocp_torch.maths.ranks import joined
 from ocp_torch.maths.sampling import SAMPLERS, RowSampler
@@ -88,7 +88,7 @@ def build_problem(section: object) -> Problem:
 def _require_room(dim: int, control_dim: object) -> None:
     """Raise `InputError` where `B` at the states at which the embedding looks for waves would not fit into the memory."""
     given = control_dim if isinstance(control_dim, int) and 1 <= control_dim <= MOST_COORDINATES else dim
-    require_memory("the number of entries of B, problem.dim times control_dim,", dim * given, 8.0 * STATES)
+    require_memory("the number of entries of B, problem.dim times control_dim,", dim * given, 8.0 * WAVE_STATES)
 
 
 def use_threads(threads: int) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.fields.coupled_waves import coupled_waves, may_be_coupled
 from ocp_torch.fields.embedding import FourierEmbedding
-from ocp_torch.fields.waves import STATES, standardised, waves_of
+from ocp_torch.fields.waves import WAVE_STATES, standardised, waves_of
 from ocp_torch.problems import Problem
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
@@ -38,7 +38,7 @@ def missed_waves(problem: Problem, fields: Fields, coupled: bool = False) -> Ten
     if not isinstance(embedding, FourierEmbedding) or not embedding.free:
         return torch.zeros(0, problem.dim)
     room = len(embedding.free)
-    samples = problem.independent_samples(STATES).to(next(fields.parameters()))
+    samples = problem.independent_samples(WAVE_STATES).to(next(fields.parameters()))
     generator = Generator.of(problem, samples)
     slack = generator.hjb_slack(generator.chunked_jet(fields.value)) * samples.weight
     if slack.square().mean().sqrt() < ROUNDING * samples.f.std():

@@ -59,7 +59,7 @@ def test_curvature_alone_is_the_same_also_from_many_pieces(dim, columns, gated, 
     network, (x, sigma) = made(dim, dim, gated=gated).requires_grad_(False), drawn(dim, columns, count=70)
     expected = reverse_jet(network, x, sigma).curvature
     torch.testing.assert_close(curvature(network, x, sigma), expected, **EXACT)
-    monkeypatch.setattr(mlp, "SWEPT", 1)
+    monkeypatch.setattr(mlp, "SWEEP_SIZE", 1)
     torch.testing.assert_close(curvature(network, x, sigma), expected, **EXACT)
     torch.testing.assert_close(curvature(lambda at: network(at), x, sigma), expected, **EXACT)
 

@@ -101,7 +101,7 @@ def test_frozen_networks_and_no_graphs():
 @pytest.mark.parametrize("gated", [False, True])
 def test_products_of_slopes_are_had_without_the_slopes(gated, monkeypatch):
     """In strips of rows, below the diagonal."""
-    monkeypatch.setattr(reverse_sweep, "ROWS", 4)
+    monkeypatch.setattr(reverse_sweep, "STRIP_STATES", 4)
     field, x = network(2, gated=gated), torch.rand(11, 2, dtype=torch.float64)
     of_value, of_gradient = torch.randn(11, dtype=torch.float64), torch.randn(11, 2, dtype=torch.float64)
     of = reverse_jet(field, x)
