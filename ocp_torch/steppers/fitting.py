@@ -18,12 +18,10 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers.simultaneous import Simultaneous
 from ocp_torch.steppers.stepper import Stepper, StepReport
 
-# A larger learning rate moves weights, which are about 1, so far at once that nothing is learnt; it is a slip.
-LARGEST_RATE = 1e6
+LARGEST_RATE = 1e6  # a larger learning rate is a slip: it moves weights, which are about 1, too far to learn anything
 # A memory of about 1 / (1 - decay) = 50 steps: a longer one lags behind the last steps of the cosine schedule.
 DECAY = 0.98
-# At 1 the average would never leave the first iterate.
-MOST_DECAY = 0.999999
+MOST_DECAY = 0.999999  # at 1 the average would never leave the first iterate
 
 
 def _sgd(parameters: list[Tensor], lr: float, momentum: float = 0.0) -> Optimizer:
@@ -94,15 +92,15 @@ def schedule_maker(
 
 
 class Average(AveragedModel):
-    """The average of the iterates that were counted is in ``module``."""
+    """A running average, ``module``, of the iterates that `count` was given."""
 
     module: Fields
     rule: Callable[..., None]
 
     @torch.no_grad()
     def count(self, iterate: Sequence[Tensor]) -> None:
-        """Take ``iterate``, all parameters in the order of those of the fields, into the average: what `update_parameters` of
-        a module would do, which takes four times as long on a GPU."""
+        """Take ``iterate``, all parameters in the order of those of the fields, into the average, as `update_parameters` does
+        for a module in four times the time on a GPU."""
         own: list[Any] = list(self.module.parameters())
         if self.n_averaged == 0:
             torch._foreach_copy_(own, list(iterate))
@@ -113,8 +111,8 @@ class Average(AveragedModel):
 
 def exponential(decay: float) -> Callable[..., None]:
     """The rule of an average that keeps the part ``decay`` of itself at each step, but at the `n`-th at most
-    `(1 + n) / (10 + n)`: the first iterates, which are far off, are soon forgotten. After 40 steps on the circle, a third of
-    a second, the controller is then .2 % off the optimum, and 19 % without."""
+    `(1 + n) / (10 + n)`, so that the first iterates, which are far off, are soon forgotten: after 40 steps on the circle the
+    controller is .2 % off the optimum, and 19 % without."""
 
     def rule(own: list[Tensor], iterate: list[Tensor], count: Tensor) -> None:
         n = int(count)
@@ -152,7 +150,7 @@ def advance(stepper: Stepper, average: Average, draw: Callable[[Phase], Samples]
 def short_fit(
     fields: Fields, objective: Objective, lr: float, steps: int, unit: float = 1.0, **options
 ) -> tuple[Simultaneous, Average]:
-    """Stepper and average of a fit that nobody configures: SOAP, a learning rate that falls from ``lr`` to 0 in ``steps``.
+    """Stepper and average of a fit without configuration: SOAP with a learning rate that falls from ``lr`` to 0 in ``steps``.
 
     ``unit`` is what losses are divided by (see `cost_unit`); ``options`` are those of SOAP.
     """

@@ -19,7 +19,7 @@ class NonFiniteError(ArithmeticError):
 
 
 def first_nonfinite(objective: Objective, fields: Fields, samples: Samples, phase: Phase) -> str:
-    """The first thing that is not finite, in words; one state at a time, as slow as that is: the run is over anyway."""
+    """The first thing that is not finite, in words; sought one state at a time, slowly, as the run is over anyway."""
     owners = {field: player for player, names in objective.players.items() for field in names}
     for name, parameter in fields.named_parameters():
         if not parameter.isfinite().all():

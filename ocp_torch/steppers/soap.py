@@ -13,8 +13,8 @@ from ocp_torch.maths.replays import Called
 
 
 class ReplayedSOAP(SOAP):
-    """`SOAP`, whose moves may go through ``replay``. The learning rate, with its correction for a short memory, is an input
-    of a move then, and new eigenbases are found after it, every so many steps. The arithmetic is that of `SOAP`."""
+    """`SOAP`, whose moves may go through ``replay``: the learning rate, with its correction for a short memory, is then an
+    input of a move, and new eigenbases are found after moves, every so many steps. The arithmetic is that of `SOAP`."""
 
     replay = Called()
     _keeps_bases = False  # during a move
@@ -40,7 +40,7 @@ class ReplayedSOAP(SOAP):
         return None
 
     def _move(self, rate: Tensor, *gradients: Tensor) -> list[Tensor | None]:
-        """A step of the library's at the rate 1, which is then multiplied by ``rate``."""
+        """Make the library's step at the learning rate 1, and multiply it by ``rate``."""
         (group,) = self.param_groups
         moved = [p for p in group["params"] if p.grad is not None]
         own = [p.grad for p in moved]
@@ -63,7 +63,7 @@ class ReplayedSOAP(SOAP):
         return []
 
     def project(self, grad: Tensor, state: Any, *options: Any, **named: Any) -> Tensor:
-        """As `SOAP` has it; of matrices by products that copy nothing, in two thirds of the time."""
+        """The projection of `SOAP`; of matrices by products that copy nothing, in two thirds of the time."""
         if grad.dim() != 2 or not all(map(len, state["Q"])):
             return super().project(grad, state, *options, **named)
         left, right = state["Q"]
@@ -71,7 +71,7 @@ class ReplayedSOAP(SOAP):
         return left @ grad @ right.T if back else left.T @ grad @ right
 
     def update_pre_conditioner(self, grad: Tensor, state: Any, step: int, *sizes: Any, **named: Any) -> None:
-        """As `SOAP` has it; of matrices by one product for each side, in half the time."""
+        """The update of `SOAP`; of matrices by one product for each side, in half the time."""
         if grad.dim() != 2 or not all(map(len, state["GG"])) or named.get("merge_dims"):
             return super().update_pre_conditioner(grad, state, step, *sizes, **named)
         kept = state["shampoo_beta"]
@@ -83,12 +83,12 @@ class ReplayedSOAP(SOAP):
             state["Q"] = self.get_orthogonal_matrix_qr(state)
 
     def get_orthogonal_matrix_qr(self, state: dict, *options: Any) -> list:
-        """As `SOAP` has it; during a move, the eigenbases there are."""
+        """The eigenbases of `SOAP`; during a move, the present ones."""
         return state["Q"] if self._keeps_bases else super().get_orthogonal_matrix_qr(state, *options)
 
     def _refresh(self, state: dict, group: dict) -> None:
-        """New eigenbases where the old ones were in memory, found on the CPU: there a matrix of 96 or 128 rows takes .24 or
-        .45 ms, copies included, on an H200 .57 or .80."""
+        """Write new eigenbases over the old ones. They are found on the CPU: a matrix of 128 rows takes .45 ms there, copies
+        included, and .80 on an H200."""
         host = {name: _on_cpu(state[name]) for name in ("GG", "Q", "exp_avg_sq")}
         bases = self.get_orthogonal_matrix_qr(host, group["max_precondition_dim"], group["merge_dims"])
         state["exp_avg_sq"].copy_(host["exp_avg_sq"])

@@ -68,7 +68,7 @@ class Stepper(ABC):
         self.schedules = {player: schedule(o, self.delays[player]) for player, o in self.optimizers.items()}
         self._start = copy.deepcopy(self.state_dict())
         self._moving: dict[tuple, list[str]] = {}  # who has a loss, by the form of the phase
-        self.ranks = Alone()  # those with which batches are shared
+        self.ranks = Alone()  # the processes that share batches
         self.replay = Called()
 
     @property
@@ -101,8 +101,8 @@ class Stepper(ABC):
         }
 
     def load_state_dict(self, state: dict, moves: dict[str, int] | None = None) -> None:
-        """Go on from ``state`` exactly; or, with ``moves``, with its moments but with this stepper's own hyper-parameters and
-        schedules, those after so many moves of each player."""
+        """Go on from ``state`` exactly; or, with ``moves`` of each player, with its moments but with this stepper's own
+        hyper-parameters and schedules as they are after so many moves."""
         start = copy.deepcopy(self._start)
         for player, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][player])
@@ -124,7 +124,7 @@ class Stepper(ABC):
         return torch._foreach_mul([p.detach() for p in self.fields.parameters()], 1.0)  # type: ignore[return-value]
 
     def _differentiate(self, samples: Samples, phase: Phase) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Set each parameter's gradient to that of its own player's loss, the mean of those of all `ranks`; losses and
+        """Set each parameter's gradient to that of its own player's loss, averaged over all `ranks`. Returns losses and
         gradient norms per player."""
         form = (*phase.form, self.objective.needs_divergences(phase))
 
@@ -154,7 +154,7 @@ class Stepper(ABC):
         return losses, norms
 
     def _gradients(self, losses: dict[str, Tensor]) -> list[Tensor]:
-        """Of each player's own loss, with respect to each of its parameters."""
+        """The gradients of each player's own loss in each of its parameters, player after player."""
         *_, last = losses
         found: list[Tensor] = []
         for player, loss in losses.items():

@@ -108,14 +108,14 @@ def test_steps_end_where_the_residual_is_small_enough_and_where_it_stays_as_it_i
     assert refined(start, slack_of(problem), draw, steps=40, enough=1e-3) is not None
     assert sizes[-1] < 1e-3 <= min(sizes[:-1])
     monkeypatch.setattr(GaussNewton, "step", lambda self, samples: sizes.append(1.0) or 1.0)
-    monkeypatch.setattr(gauss_newton, "GROWTH", torch.inf)
+    monkeypatch.setattr(gauss_newton, "LARGEST_GROWTH", torch.inf)
     sizes.clear()
     assert refined(start, lambda samples, V: torch.ones_like(V.value), draw, steps=40) is None
-    assert len(sizes) == gauss_newton.LOOKED_AT + 1
-    monkeypatch.setattr(gauss_newton, "FALLEN", torch.inf)
+    assert len(sizes) == gauss_newton.CHECKED_STEP + 1
+    monkeypatch.setattr(gauss_newton, "FALLEN_TO", torch.inf)
     sizes.clear()
     assert refined(start, lambda samples, V: torch.ones_like(V.value), draw, steps=40) is None
-    assert len(sizes) == gauss_newton.LOOKED_AT + 2
+    assert len(sizes) == gauss_newton.CHECKED_STEP + 2
 
 
 def test_states_that_are_all_alike_and_numbers_that_are_none_end_the_steps(monkeypatch):
