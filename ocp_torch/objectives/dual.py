@@ -37,7 +37,7 @@ class Dual(Objective):
 
 
 def value_loss(phase: Phase, fields: Fields, samples: Samples, value: Tensor, slack: Tensor, residual: float) -> Tensor:
-    """What a value player on its own minimises: `E[M max(Q, 0) + (residual / s) Q^2 - V mu0]`, both weighed by ``phase``."""
+    """The loss of a value player alone: `E[M max(Q, 0) + (residual / s) Q^2 - V mu0]`, the first two weighed by ``phase``."""
     violation = phase.growth * phase.constants.M * slack.clamp_min(0.0)
     if residual > 0.0:
         violation = violation + phase.residual_growth * residual / getattr(fields.value, "scale", 1.0) * slack.square()

@@ -13,8 +13,8 @@ class LevelledDual(Objective):
     r"""Maximise `max_c F_M(V - c) = E[V mu0] - CVaR(Q)`, the CVaR being the mean of the largest slacks, those on the part
     `1 / M` of the torus (Rockafellar and Uryasev, 2000).
 
-    It is concave in `V` as `F_M` is, does not feel a constant in `V`, and tends to `E[V mu0] - sup Q` as `M` grows. States
-    that `penalty_weight` leaves out are taken to have smaller slacks than those.
+    This is concave in `V` as `F_M` is, does not depend on a constant in `V`, and tends to `E[V mu0] - sup Q` as `M` grows.
+    States that `penalty_weight` leaves out are taken to have slacks below those largest ones.
     """
 
     players = {"value": (VALUE,)}
@@ -28,10 +28,9 @@ class LevelledDual(Objective):
             generator = self.generator(tail)
             slack = generator.hjb_slack(generator.chunked_jet(V))
             level = upper_quantile(slack, weight, len(samples) / (M * len(tail)))
-        # No gradient comes from below the level. What is not a number is not below, and is met by whoever looks at the loss.
-        # Those at the level have what the others leave of 1: weights of another sum move the constant in V at every step.
-        # With such the bound of a pendulum with limited torque was 2.958 after 2,100 steps, with these 2.973; after 4,500
-        # both have 2.993.
+        # Slacks below the level have no gradient; a NaN is not below, so that it shows in the loss. States at the level share
+        # what those above leave of the weight 1: with another sum the constant in V would move at every step (a pendulum's
+        # bound was then 2.958 after 2,100 steps, and 2.973 so).
         above = ~(slack < level)
         share = M * weight[above] / len(samples)
         higher = slack[above] > level

@@ -18,12 +18,11 @@ from ocp_torch.problems.samples import Samples
 # How a method turns its fields into mu: Lemma 2, Lemma 3, or a network for log mu.
 CLOSED, SADDLE, NETWORK = "closed", "saddle", "network"
 
-# Where no `M` is known, its weight grows geometrically from this part of `M` to all of it, over this part of each round. A
-# heavier start leaves `V` stuck far below `V*`; a longer growth leaves it less of the round to become feasible.
-LEAST_WEIGHT, GROWTH = 1.0 / 20.0, 0.7
-# And then the squared slack weighs so many times as much from the second round on. Simulated gaps in % with 1 and with 33:
-# six oscillators 2.05 (width 192) and 1.69 (128), dubins 1.42 and 1.06, a pendulum with limited torque 2.89 and 2.21, an arm
-# .55 and .51, a pendulum with noise .77 and .40. With 100 the arm has .99; where it weighs 10 from the first step on, 8.7.
+# Where no `M` is known to be large enough, the weight of the penalty grows geometrically to `M` during each round.
+LEAST_WEIGHT = 1.0 / 20.0  # part of `M` at the start of a round; a heavier one leaves `V` stuck far below `V*`
+GROWTH_PART = 0.7  # part of a round in which it grows; a longer growth leaves `V` less time to become feasible
+# There the squared slack weighs so many times as much from the second round on: the simulated gap of dubins was 1.42 %
+# without this factor, and 1.06 % with it.
 LATER_RESIDUAL = 32.0
 
 
@@ -47,17 +46,17 @@ class Phase:
         """The part of `M` that is in force: all of it, but where no `M` is known (see `Dual`)."""
         if self.growing is not None:
             return self.growing
-        return LEAST_WEIGHT ** max(0.0, 1.0 - self.progress / GROWTH) if self.constants.unbounded else 1.0
+        return LEAST_WEIGHT ** max(0.0, 1.0 - self.progress / GROWTH_PART) if self.constants.unbounded else 1.0
 
     @property
     def residual_growth(self) -> float:
-        """What the weight of the squared slack is multiplied by: 1, but later on, where no `M` is known (see `Dual`)."""
+        """The factor of the squared slack's weight: 1, but from the second round on where no `M` is known (see `Dual`)."""
         return LATER_RESIDUAL if self.later and self.constants.unbounded else 1.0
 
     @property
     def form(self) -> tuple:
-        """What stays the same for as long as losses are computed alike: all but `progress`, of which they may read `growth`,
-        and `Objective.needs_divergences`."""
+        """All by which the computation of losses may change, but for `growth` and `Objective.needs_divergences`, the only
+        things that losses may take from `progress`."""
         constants = self.constants
         return constants.M, constants.C_V, constants.C_u, constants.unbounded, self.shares, self.residual_growth
 
@@ -101,7 +100,7 @@ class Objective(ABC):
 
     @torch.no_grad()
     def diagnostics(self, fields: Fields, samples: Samples) -> dict[str, Tensor]:
-        """How far the two constraints are violated on ``samples``: the HJB slack and the Liouville residual."""
+        """By how much the two constraints are violated on ``samples``: the HJB slack and the Liouville residual."""
         shown: dict[str, Tensor] = {}
         generator = self.generator(samples)
         if fields.value is not None:

@@ -15,10 +15,9 @@ class PolicyEvaluation(Objective):
     `r = mu0 - mu (1 + (grad log mu . g_u + div g_u) / rho)`, and what noise adds, is the Liouville residual, `Q_u` the
     Bellman slack and `s` the scale of the `V` network: the strong forms of P(u) and D(u) (section 5.4 of the paper).
     The two players do not interact; there is no hinge and no game. Missing mass (`r > 0`) may cost the bounds more, or
-    less, than surplus: ``positive_weight`` is what `r^2` weighs there, where it weighs 1 elsewhere. And `r^2` is divided by
-    `1 + mu`, as data: a density of high peaks is then worth fitting. Its plain squares are larger than those of `mu = 0`, to
-    which fits collapsed (Lagrangian bound above Perf, plain and divided: dubins with noise 130 and 5 %; without, arm 106 and
-    62 %, kuramoto 22 and 9 %, pendulum 34 and 24 %, unicycle 4.8 and 5.2 %; on the torus they differ by 0.006 %).
+    less, than surplus: ``positive_weight`` is the weight of `r^2` there, which is 1 elsewhere. And `r^2` is divided by
+    `1 + mu`, as data, since fits to a density of high peaks else collapse to `mu = 0`, whose squares are smaller (with noise
+    dubins' Lagrangian bound was 130 % above Perf undivided, and 5 % divided).
     """
 
     def __init__(self, problem: ClosedLoop, with_value: bool, positive_weight: float = 1.0) -> None:
