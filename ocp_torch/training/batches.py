@@ -19,15 +19,14 @@ from ocp_torch.problems import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.training.importance import scores
 
-# The part of a batch that is visited states, where no `M` is known and nobody said otherwise: more of them make the penalty
-# more exact, and leave fewer states for the integrals.
-VISITED = 0.25
-# At least a tenth of a batch is for the integrals.
-MOST_VISITED = 0.9
-# From batch to batch a visited state moves on by Euler's method (with noise Euler and Maruyama's) for this part of 1 / rho,
-# but no further than this distance on the torus: longer steps leave the flow's paths, shorter ones repeat nearly the same
-# states.
-STEP_TIME, LONGEST_STEP = 0.05, 0.05
+# The part of a batch that is visited states where no `M` is known and none is configured: more of them make the penalty more
+# exact, and leave fewer states for the integrals.
+VISITED_PART = 0.25
+LARGEST_VISITED_PART = 0.9  # at least a tenth of a batch is for the integrals
+# From batch to batch visited states move by Euler-Maruyama steps: longer ones leave the flow's paths, shorter ones repeat
+# nearly the same states.
+STEP_TIME = 0.05  # of a step at most, in units of 1 / rho
+LONGEST_STEP = 0.05  # on the torus
 
 
 @dataclass(eq=False)
@@ -51,11 +50,11 @@ class Batches:
     size: int
     seed: int
     visited: float | None = None
-    ranks: Alone = field(default_factory=Alone, init=False)  # those with which each batch is shared
+    ranks: Alone = field(default_factory=Alone, init=False)  # the processes that share each batch
 
     def __post_init__(self) -> None:
         if self.visited is not None:
-            self.visited = require_number("sampler.visited", self.visited, at_least=0.0, at_most=MOST_VISITED)
+            self.visited = require_number("sampler.visited", self.visited, at_least=0.0, at_most=LARGEST_VISITED_PART)
         self._possible = VALUE in self.objective.fields and self.problem.has_simulator
         if self.visited and not self._possible:
             elsewhere = "a data set has no data at other states"
@@ -68,12 +67,12 @@ class Batches:
 
     def draw(self, phase: Phase) -> Samples:
         """This process's share of the next batch, with what the objective needs at ``phase``, in the precision and on the
-        device of the fields. All draw the same states, and evaluate the problem at their own. Raises `InputError` where there
-        are no equal shares."""
+        device of the fields. All processes draw the same states, and each evaluates the problem at its share. Raises
+        `InputError` where a batch cannot be shared equally."""
         like = next(self.fields.parameters())
         part = self.visited
         if part is None:
-            part = VISITED if self._possible and phase.constants.unbounded else 0.0
+            part = VISITED_PART if self._possible and phase.constants.unbounded else 0.0
         count = min(int(part * self.size), self.size - 1)
         divergences = self.objective.needs_divergences(phase)
         self.ranks.require_shares("trainer.batch", self.size)
@@ -89,7 +88,7 @@ class Batches:
         return Samples(*columns)
 
     def _drawn(self, count: int, phase: Phase, like: Tensor, divergences: bool) -> tuple[Tensor, Tensor | None]:
-        """``count`` states of the sampler, with weights where it has any. Before, where one is due, a look at a pool."""
+        """``count`` states of the sampler, and their weights where it has any; one that is due learns from a pool before."""
         sampler = self.sampler
         if not isinstance(sampler, ImportanceSampler):
             return sampler.draw(count, like.device)[self.ranks.share], None
@@ -102,7 +101,7 @@ class Batches:
         return x.to(like.device), weight.to(like)
 
     def _moves(self, count: int, like: Tensor) -> list[Tensor | None]:
-        """Where ``count`` visited states are, and the random numbers that decide where they go."""
+        """The ``count`` visited states, and the random numbers by which `_moved` moves them."""
         if self.states is None or len(self.states) != count:
             self.states = self._uniform(count, like)
         states, driven = self.states.to(like), None
@@ -112,7 +111,7 @@ class Batches:
         return [states, driven, torch.rand(count, generator=self.generator).to(like), self._uniform(count, like)]
 
     def _evaluated(self, divergences: bool, x: Tensor, weight: Tensor | None, *moves: Tensor) -> list[Tensor | None]:
-        """The columns of a batch at the states ``x``, and where visited states are then."""
+        """The columns of a batch at the states ``x`` and at the visited ones, and these after their move."""
         drawn = self.problem.samples(x, divergences=divergences)
         if weight is not None:
             drawn = replace(drawn, weight=weight)
@@ -120,7 +119,7 @@ class Batches:
             return [*drawn.columns, None]
         states, *numbers = moves
         visited = self.problem.samples(states, divergences=divergences)
-        # Of all, on every process: where they go next is then the same everywhere.
+        # Every process moves all of them, so that they are the same everywhere.
         moved, spent = self._moved(visited, *numbers)
         # The drawn states stand for all integrals, as they would without the visited ones; the penalties see both.
         part = self.size / (self.size - len(states))
@@ -130,8 +129,8 @@ class Batches:
 
     @torch.no_grad()
     def _moved(self, at: Samples, driven: Tensor | None, chance: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
-        """Where the visited states ``at`` are a short time along the closed loop later, or back at ``fresh`` uniform states,
-        ``(k, d)``; and the part of `STEP_TIME` it took, ``(k,)``."""
+        """The visited states ``at`` a short time later along the closed loop, or started again at ``fresh`` ones, ``(k, d)``;
+        and that time as a part of the longest, ``(k,)``."""
         policy, rho = ValuePolicy(self.problem, self.fields.value), self.problem.discount
         u = policy(at.x)
         velocity = at.velocity(u)
@@ -154,7 +153,7 @@ class Batches:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """The way back from `state_dict`. Raises `InputError` where the visited states are none."""
+        """Restore what `state_dict` gave. Raises `InputError` where the visited states are no states of the problem."""
         self.sampler.load_state_dict(state["sampler"])
         self.generator.set_state(state["generator"])
         states, dim = state["states"], self.problem.dim

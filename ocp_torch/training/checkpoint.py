@@ -15,11 +15,11 @@ from ocp_torch.files.reading import LARGEST_FILE, kind, opened
 from ocp_torch.files.storage import write_atomically
 
 SCHEMA = 2
-# The file is one line, this word with the schema and a digest, and then what torch.save wrote.
+# A file begins with one line: this word, the schema and a digest of the rest, which torch.save wrote.
 MAGIC = "ocp_torch-checkpoint"
 LAST, BEST = "last.pt", "best.pt"
-# Bytes of that first line at most, and how many are read at once for the digest.
-LONGEST_HEADER, PIECE = 256, 2**22
+LONGEST_HEADER = 256  # bytes of that line at most
+READ_AT_ONCE = 2**22  # bytes, for the digest
 
 
 def save_checkpoint(path: Path, state: dict, keep: int = 1) -> None:
@@ -39,7 +39,7 @@ def save_checkpoint(path: Path, state: dict, keep: int = 1) -> None:
 
 
 def older(path: Path, age: int) -> Path:
-    """Where the file that was ``age`` saves ago at ``path`` is kept."""
+    """The path of the file that was at ``path`` ``age`` saves ago."""
     return path.with_stem(f"{path.stem}-{age}") if age else path
 
 
@@ -68,7 +68,7 @@ def load_checkpoint(path: Path) -> dict:
         if words[1] != str(SCHEMA):
             raise InputError(f"{path} has schema {words[1][:20]!r}, but this version of ocp_torch reads {SCHEMA}.")
         sha = hashlib.sha256()
-        while piece := file.read(PIECE):
+        while piece := file.read(READ_AT_ONCE):
             sha.update(piece)
         if sha.hexdigest() != words[2]:
             raise InputError(f"{path} is damaged: its contents do not match the digest it carries.")
@@ -84,9 +84,9 @@ def load_checkpoint(path: Path) -> dict:
 
 
 def newest(folder: Path) -> tuple[dict, Path, list[str]]:
-    """The newest good checkpoint of ``folder``, where it lies, and a sentence on each newer one that is not good.
+    """The newest good checkpoint of ``folder``, its path, and a sentence on each newer one that is damaged.
 
-    Raises `InputError` when none is.
+    Raises `InputError` when there is no good one.
     """
     refused: list[str] = []
     for path in [*sorted(folder.glob("last*.pt"), key=_age), folder / BEST]:

@@ -25,12 +25,12 @@ from ocp_torch.training.state import TrainState
 
 
 class QuickSettings(CertificateSettings):
-    """Effort of a certificate that makes no claim: of 15 s in which an arm was simulated, audits were 9."""
+    """Settings of a certificate that makes no claim: without audits, which took 9 of the 15 s that simulated an arm."""
 
     audited = False
 
 
-# What a quick evaluation costs: enough for a curve, not for a claim.
+# The effort of a quick evaluation: enough for a curve, not for a claim.
 QUICK = QuickSettings(
     points=1024,
     replicates=4,
@@ -41,10 +41,11 @@ QUICK = QuickSettings(
     tolerance=5e-4,
     stage=StageSettings(steps=0),
 )
-# A full certificate has cost 5 to 10 times a quick one, beside its fits (measured on the circle, the pendulum and a
-# manufactured problem in four dimensions); and a state of `V` trained on for its bound that part of one in training, as all
-# slacks but the worst are only evaluated there (a unicycle's step of 2,048 took 24 ms, one of 512 in training 10 ms).
-QUICK_CERTIFICATES, TRAINED_ON = 6.0, 0.6
+# Seconds of a full certificate without its fits, relative to a quick one: 5 to 10 were measured.
+FULL_OVER_QUICK = 6.0
+# Seconds per state where `V` is trained on for its bound, relative to training: a unicycle's step took 24 ms for 2,048 states
+# there, 10 ms for 512 in training.
+TIGHTENING_OVER_TRAINING = 0.6
 
 
 @dataclass(eq=False)
@@ -58,8 +59,8 @@ class Evaluator:
     latest: tuple[int, Constants, Certificate] | None = None  # with the step and constants it was made with
 
     def quick(self, run: Run, settings: CertificateSettings) -> Certificate:
-        """A certificate on states that neither training nor the full one uses: these choose between fields, and on states of
-        their own they cannot flatter the full certificate of their choice."""
+        """A certificate on states that neither training nor the full certificate uses, so that a choice of fields by it does
+        not flatter the full certificate of the chosen ones."""
         elsewhere = replace(run, seed=derive_seed(run.seed, Branch.VALIDATION))
         return certify_fields(self.problem.validation_view, self.trained, self.state.constants, settings, elsewhere)
 
@@ -73,8 +74,8 @@ class Evaluator:
         return self.latest[2]
 
     def evaluation(self, certificate: Certificate) -> Evaluation:
-        """What ``certificate``, of the present step, tells of its fields. Where there is no `M` that is their performance:
-        their slack is spikes that come and go from step to step, and for the bound the full certificate trains `V` on."""
+        """How good the fields are by their ``certificate``, made at the present step. Where there is no `M` the performance
+        alone counts: spikes of the slack come and go, and the full certificate trains `V` on for its bound."""
         return Evaluation.at(self.state.step, certificate, by_gap=not self.state.constants.needs_no_M)
 
     def expected(self, settings: CertificateSettings) -> float | None:
@@ -85,8 +86,10 @@ class Evaluator:
         states = float(stage.steps * stage.batch)
         if settings.searches(state.constants) and self.trained.fields.value is not None and self.problem.has_simulator:
             longest = STEEP_FACTOR * 2 ** (stage.rounds - 1)  # as beside kinks
-            states = states * longest + TRAINED_ON * new_states(self.problem, settings.points, settings.bound_steps)
-        return QUICK_CERTIFICATES * self.seconds + states * state.seconds / max(state.samples, 1)
+            states = states * longest + TIGHTENING_OVER_TRAINING * new_states(
+                self.problem, settings.points, settings.bound_steps
+            )
+        return FULL_OVER_QUICK * self.seconds + states * state.seconds / max(state.samples, 1)
 
     def reaches(self, gap: float, run: Run) -> bool:
         """Whether a quick evaluation finds the averaged fields within ``gap``."""

@@ -16,13 +16,13 @@ from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
 
-# Weights or losses that have grown by so much since the run began are reported as divergence. Smaller factors would report
-# sooner, and also the growth of a run that learns.
-GROWN_WEIGHTS, GROWN_LOSS = 100.0, 1e4
-# States on which the bound of the best constant V is computed.
-CONSTANT_STATES = 2**13
+# Growth of weights and losses since the run began that is reported as divergence: smaller factors would also report the
+# growth of a run that learns.
+GROWN_WEIGHTS = 100.0
+GROWN_LOSS = 1e4
+CONSTANT_STATES = 2**13  # on which the bound of the best constant V is computed
 CONTRADICTED = "bounds contradicted each other at step"
-# A lower bound within this relative distance of that of the best constant is as good: both are sampled.
+# A lower bound this little below that of the best constant, relatively, is as good: both are sampled.
 ROUNDING = 1e-4
 
 
@@ -53,8 +53,8 @@ class Evaluation:
         return cls(step, gap, perf[1] if perf else None, noise, supposed)
 
     def better_than(self, other: "Evaluation | None", sure: bool = False) -> bool:
-        """By the gap, or by the performance where neither has one; with ``sure``, by more than the noise of both, and not
-        where it would be the other if `F_M` counts."""
+        """Whether this has the smaller gap, or the smaller performance where neither has a gap; with ``sure``, by more than
+        the noise of both, and not where the other would have the smaller gap if `F_M` counts."""
         if other is None:
             return self.gap is not None or self.perf is not None
         if sure and self.supposed is not None and other.supposed is not None and self.supposed > other.supposed:
@@ -77,7 +77,7 @@ class Evaluation:
 
 @dataclass(eq=False)
 class Health:
-    """Follows a run."""
+    """The health of a run, followed as it goes on."""
 
     unit: float  # the size of the problem's costs
     best: Evaluation | None = None  # so far
@@ -89,12 +89,12 @@ class Health:
 
     @classmethod
     def of(cls, problem: Problem) -> "Health":
-        """Of a run on ``problem``, before its first step."""
+        """The health of a run on ``problem`` before its first step."""
         (mean, spread), _ = typical_sizes(problem)
         return cls(unit=abs(mean) + spread)
 
     def evaluated(self, evaluation: Evaluation, fields: Fields, certificate: Certificate | None = None) -> bool:
-        """Take note of an evaluation of ``fields``; whether it is the best so far."""
+        """Take note of an ``evaluation`` of ``fields``. Returns whether it is the best so far."""
         if not evaluation.better_than(self.best):
             return False
         self.best, self.certificate = evaluation, certificate
@@ -102,7 +102,7 @@ class Health:
         return True
 
     def stepped(self, step: int, losses: dict[str, Tensor], parameters: Mapping[str, Sequence[Tensor]]) -> list[str]:
-        """Hold sizes against those at the start; a sentence, once, on each that has grown without end."""
+        """Compare losses and weights with those at the start. Returns a sentence, once in a run, on each that diverges."""
         sizes = {f"the loss of player {p!r}": (abs(float(loss)), GROWN_LOSS, self.unit) for p, loss in losses.items()}
         for player in losses:
             norm = float(torch.nn.utils.get_total_norm(parameters[player]))

@@ -15,13 +15,14 @@ from ocp_torch.fields import Fields
 from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems.samples import Samples
 
-# Directions `v` for each player, and how long they are, as a part of the weights: short enough to be a derivative (to some
-# percent, which is enough for a score), long enough for single precision.
-DIRECTIONS, LENGTH = 4, 1e-2
+DIRECTIONS = 4  # random directions `v` for each player
+# Length of the difference along them, as a part of the weights: short enough for a derivative to some percent, long enough
+# for single precision.
+STEP_LENGTH = 1e-2
 
 
 def integrands(objective: Objective, fields: Fields, samples: Samples, phase: Phase) -> dict[str, Tensor]:
-    """What each player's loss is the mean of, at each of the states, ``(N,)``: its derivative by that state's weight."""
+    """The values ``(N,)`` at the states whose mean is the loss, for each player: `N` times its derivatives by the weights."""
     weight = torch.ones_like(samples.weight).requires_grad_()
     with torch.enable_grad():
         losses = objective.losses(fields, replace(samples, weight=weight, penalty_weight=None), phase)
@@ -30,10 +31,10 @@ def integrands(objective: Objective, fields: Fields, samples: Samples, phase: Ph
 
 
 def scores(objective: Objective, fields: Fields, samples: Samples, phase: Phase, generator: torch.Generator) -> Tensor:
-    """How much each of the states counts for the players' gradients, ``(N,)``.
+    """The size of the gradient of each state's part of the losses, ``(N,)``.
 
-    Of several players, the root of the sum of squares, each in units of its own mean: that is the density for which the sum
-    of their relative variances is least. ``samples`` carry the divergences that the objective needs at ``phase``.
+    Several players' squares, each in units of its own mean, are added under the root: the sum of their relative variances is
+    then least. ``samples`` carry the divergences that the objective needs at ``phase``.
     """
     moved = copy.deepcopy(fields).requires_grad_(False)
     here = integrands(objective, moved, samples, phase)
@@ -41,7 +42,7 @@ def scores(objective: Objective, fields: Fields, samples: Samples, phase: Phase,
     for player, at in here.items():
         own = [p for name in objective.players[player] for p in moved.networks[name].parameters()]
         start, square = [p.clone() for p in own], torch.zeros_like(total)
-        length = LENGTH * torch.cat([p.flatten() for p in own]).square().mean().sqrt()
+        length = STEP_LENGTH * torch.cat([p.flatten() for p in own]).square().mean().sqrt()
         for _ in range(DIRECTIONS):
             for parameter, value in zip(own, start, strict=True):
                 step = torch.randn(parameter.shape, generator=generator, dtype=parameter.dtype).to(parameter.device)

@@ -28,7 +28,7 @@ from ocp_torch.training.trainer import Trainer
 log = logging.getLogger(__name__)
 # How the names of TensorBoard's files begin.
 EVENTS = "events.out.tfevents."
-# One chart in which the bracket closes, of running estimates, and one of the quick evaluations.
+# Two charts in which the bracket closes: by running estimates, and by quick evaluations.
 BRACKET = {
     "bracket": {
         "while it trains": ["Multiline", [r"running/.*"]],
@@ -196,7 +196,7 @@ def record(writer: SummaryWriter, certificate: Certificate, step: int) -> None:
 
 
 def in_words(seconds: float) -> str:
-    """A duration as one says it."""
+    """A duration for a user: in seconds, or in minutes from 90 seconds on."""
     return f"{max(1, round(seconds))} s" if seconds < 90.0 else f"{round(seconds / 60.0)} min"
 
 

@@ -1,4 +1,4 @@
-"""What is told of a run while it goes on."""
+"""What a run tells whoever watches it."""
 
 from ocp_torch.certificate import Certificate
 from ocp_torch.steppers import StepReport

@@ -26,14 +26,15 @@ from ocp_torch.training.observer import Silent
 if TYPE_CHECKING:
     from ocp_torch.training.trainer import Trainer
 
-# States on which `F_M` is compared: the same for both, so that it differs by what the steps do.
-JUDGED = 8192
-# States among which the largest slacks are sought, and how many steps are climbed from how many of either sign. Among 4,096
-# states in eight coordinates a spike of 1e-3 was missed, and the certified gap .010 %; among these it was found: .0006 %.
-SOUGHT, PEAKS, CLIMBED = 16384, 16, 20
-# A slack whose root mean square is so small a part of the mean state cost is small enough for the steps to end, and for
-# training: `F_M` was .0001 to .0003 % below OPT where it is below the first, .002 % where it is just below the second.
-ENOUGH, SOLVED = 5e-6, 4e-5
+COMPARISON_STATES = 8192  # the same ones for `F_M` before and after the steps
+# States among which ascents to the largest slacks begin: in eight coordinates 4,096 missed a spike of 1e-3 (certified gap
+# .010 %), and these found it (.0006 %).
+SCANNED_STATES = 16384
+ASCENT_STARTS = 16  # of either sign
+ASCENT_STEPS = 20
+# Root mean squares of the slack, as parts of the mean state cost.
+ENOUGH_SLACK = 5e-6  # at which the steps end: `F_M` was then .0001 to .0003 % below OPT
+SOLVED_SLACK = 4e-5  # at which training ends: just below it `F_M` was .002 % below OPT
 
 
 class Found(NamedTuple):
@@ -46,15 +47,15 @@ class Found(NamedTuple):
 def refine(trainer: "Trainer", monitor: Silent, checkpoint: Path | None, stop: Callable[[], bool]) -> None:
     """Refine the averaged `V` of ``trainer``, from which training goes on, if that helps.
 
-    It is to be done anew where told to ``stop``. Before the end of a round it is all or nothing: either the equation is
-    solved, and a quick evaluation finds a good gap, so that training is over, or all stays as it was.
+    It has to be called again where it was told to ``stop``. Before the end of a round it is all or nothing: either the
+    equation is solved, and a quick evaluation finds a good gap, so that training is over, or all stays as it was.
     """
     state, settings, started, told = trainer.state, trainer.settings, time.perf_counter(), []
     spent = lambda: time.perf_counter() - started
 
     def stopping() -> bool:
         if stop() or (settings.max_seconds is not None and state.elapsed + spent() >= settings.max_seconds):
-            told.append(True)  # what comes after the last step is late: then they are done
+            told.append(True)  # not where a request comes after the last step: the steps are then done
         return bool(told)
 
     seed, early = derive_seed(trainer.seed, Branch.REFINEMENT, state.round, trainer.step), trainer.step < trainer.end
@@ -90,15 +91,15 @@ def _put(trainer: "Trainer", weights: list[dict]) -> None:
     """Give both `V` their ``weights``."""
     for fields, own in zip((trainer.fields, trainer.averaged_fields), weights, strict=True):
         fields.value.load_state_dict(own)
-    trainer.evaluator.latest = None  # it is of the `V` before
+    trainer.evaluator.latest = None  # that certificate is of the `V` before
 
 
 def refined_value(
     problem: Problem, fields: Fields, M: float, steps: int, seed: int, stop: Callable[[], bool]
 ) -> tuple[Found | None, int]:
-    """What so many ``steps`` on the slack of the `V` of ``fields`` find, at evenly spread states of ``seed``; `None` where
-    they do not help, as beside kinks or with noise, or make `F_M` worse, and where told to ``stop``. And how many states
-    were drawn."""
+    """What at most ``steps`` steps on the slack of the `V` of ``fields`` find, at evenly spread states of ``seed``, and how
+    many states were drawn. `None` where the steps do not help, as beside kinks or with noise, make `F_M` worse, or were told
+    to ``stop``."""
     network = fields.value
     ours = isinstance(network, PeriodicMLP) and network.can_be_swept
     if not steps or problem.noisy or not problem.has_simulator or not ours:
@@ -110,21 +111,21 @@ def refined_value(
         return Samples.of(problem, x if also is None else torch.cat([also, x]))
 
     slack = lambda samples, V: Generator.of(problem, samples).hjb_slack(V)
-    judged = draw(JUDGED)
+    judged = draw(COMPARISON_STATES)
     unit = float(judged.mean(judged.f))
-    worst = lambda own: worst_states(problem, own, states.draw(SOUGHT))
-    found = refined(network, slack, draw, steps, ENOUGH * unit, stop, worst)
+    worst = lambda own: worst_states(problem, own, states.draw(SCANNED_STATES))
+    found = refined(network, slack, draw, steps, ENOUGH_SLACK * unit, stop, worst)
     if found is None or bound(problem, found.network, judged, M) < bound(problem, network, judged, M):
         return None, states.count
-    return Found(found.network.state_dict(), found.residual <= SOLVED * unit), states.count
+    return Found(found.network.state_dict(), found.residual <= SOLVED_SLACK * unit), states.count
 
 
 @torch.no_grad()
 def worst_states(problem: Problem, value: Field, x: Tensor) -> tuple[Tensor, float]:
-    """Where ascents from the states ``x`` ``(N, d)`` with the largest and the smallest slack of ``value`` end, ``(K, d)``,
-    and the largest slack there, whatever its sign."""
+    """The ends ``(K, d)`` of ascents from those states of ``x`` ``(N, d)`` with the largest slacks of ``value``, and of
+    descents from those with the smallest; and the largest size of the slack there."""
     slack = slack_function(problem, value)
-    ends = extremes(slack, x, batched(slack, x), PEAKS, CLIMBED)
+    ends = extremes(slack, x, batched(slack, x), ASCENT_STARTS, ASCENT_STEPS)
     return ends, float(slack(ends).abs().max())
 
 

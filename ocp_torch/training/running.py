@@ -25,12 +25,13 @@ from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.starts import evaluation_distribution, initial_points
 
-# States of the bounds from below, and of those from above, which take divergences; paths, and steps of each.
-STATES, FEW, PATHS, STEPS = 1024, 256, 32, 24
-# Where a path ends, in discount times: what is left weighs 2 %, and with `V` it is 2 % of a slack.
-HORIZON = 4.0
-# Seconds that every run has for these, ten points of most problems, and the part of its time that it has beyond them.
-SECONDS, PART = 0.5, 0.02
+LOWER_STATES = 1024  # for the bound from below
+UPPER_STATES = 256  # for the bound from above, which takes divergences
+PATHS = 32
+PATH_STEPS = 24
+HORIZON = 4.0  # of paths, in units of 1 / rho: what is left weighs 2 %, and with `V` it is 2 % of a slack
+FREE_SECONDS = 0.5  # that every run has for estimates: ten points of most problems
+TIME_PART = 0.02  # of a run's time that it has for estimates beyond these
 
 
 class RunningEstimates:
@@ -41,12 +42,13 @@ class RunningEstimates:
         self._spent = 0.0
 
     def due(self, elapsed: float) -> bool:
-        """Whether a run that has taken so many seconds has time for them; recorded samples are for training alone."""
-        return self.problem.has_simulator and self._spent <= SECONDS + PART * elapsed
+        """Whether a run that has taken ``elapsed`` seconds has time for estimates; never with recorded samples, which are for
+        training alone."""
+        return self.problem.has_simulator and self._spent <= FREE_SECONDS + TIME_PART * elapsed
 
     def __call__(self, constants: Constants) -> dict[str, float]:
-        """Estimates by name, in the order of the bracket. A problem that draws random numbers goes on as if it had not been
-        asked: whether it is depends on the clock."""
+        """Estimates by name, in the order of the bracket. The process's random generators stay as they were, as it depends on
+        the clock whether estimates are made."""
         started = time.perf_counter()
         with torch.no_grad(), generators_kept():
             found = self._estimates(constants)
@@ -79,17 +81,17 @@ class RunningEstimates:
         return float(self._few.mean(generator.primal_integrand(w, mu, residual, constants.C_V)))
 
     def _simulated(self, constants: Constants) -> float:
-        """What the controller costs beyond `E[V mu0]`, or in all where there is no `V`."""
+        """The simulated cost of the controller less `E[V mu0]`, or the whole cost where there is no `V`."""
         problem, fields, rho = self.problem, self.trained.fields, self.problem.discount
         policy = next(iter(trained_policies(self.trained.occupation, problem, fields, constants).values()))
         dynamics = loop_of(problem, policy, fields.value)
         (x0, mass), horizon = self._starts, HORIZON / rho
         if problem.noisy:
-            grid, sigma = Grid(torch.full_like(mass, horizon), STEPS, 1.0), cast(Tensor, problem.noise(x0[:1]))
+            grid, sigma = Grid(torch.full_like(mass, horizon), PATH_STEPS, 1.0), cast(Tensor, problem.noise(x0[:1]))
             moves = increments(grid, sigma.shape[-1], 0, self.seed, 0)
             integral, _ = path_integral(dynamics, problem.noise, x0, grid, moves, discounted(rho))
         else:
-            rates, _ = discounted_integral(dynamics, dynamics.start(x0), rho, horizon, STEPS, wrap=False)
+            rates, _ = discounted_integral(dynamics, dynamics.start(x0), rho, horizon, PATH_STEPS, wrap=False)
             integral = rates if fields.value is None else rates[:, 0]
         whole = 1.0 if fields.value is not None else -1.0 / math.expm1(-HORIZON)
         return whole * float((mass * integral).mean())
@@ -104,11 +106,11 @@ class RunningEstimates:
 
     @cached_property
     def _wide(self) -> Samples:
-        return self._samples(STATES, 0, False)
+        return self._samples(LOWER_STATES, 0, False)
 
     @cached_property
     def _few(self) -> Samples:
-        return self._samples(FEW, 1, True)
+        return self._samples(UPPER_STATES, 1, True)
 
     @cached_property
     def _starts(self) -> tuple[Tensor, Tensor]:

@@ -31,9 +31,7 @@ class TrainerSettings:
     figures: bool  # draw figures at the end and in TensorBoard
     progress: bool  # a progress bar, where the output is a terminal
     newton_steps: int = 0  # Gauss-Newton steps on V at the end of a round; runs from before there were any do not say
-    newton_after: int = (
-        0  # steps of the first round after which they are tried already, and may end training; 0 for never
-    )
+    newton_after: int = 0  # steps of the first round after which they are tried early, and may end it; 0 for never
     effort: float = 1.0  # by which null steps of training, warm start and certificate have been multiplied
     graphs: bool = True  # on a GPU, steps are replayed from CUDA graphs; runs from before there were any do not say
 
@@ -84,7 +82,7 @@ class TrainerSettings:
         return next((k for k in range(self.rounds - 1) if step < self.end(k)), self.rounds - 1)
 
     def moves(self, step: int, k: int, delay: float) -> int:
-        """How often a player has moved after ``step`` steps, in round ``k``, that waits for the part ``delay`` of each."""
+        """How often a player that waits for the part ``delay`` of each round has moved by ``step``, a step of round ``k``."""
         count = 0
         for j in range(k + 1):
             length = self.steps * 2**j

@@ -20,20 +20,17 @@ from ocp_torch.problems.samples import Samples
 if TYPE_CHECKING:
     from ocp_torch.training.trainer import Trainer
 
-# Steps of a round after which they are sought. With 32 coordinates one of 64 terms is missing at first, with 64 coordinates
-# 18 of 127; all are found after 200 steps, and F_M ends .026 and .021 % below OPT after 600 (with 32 .174 % without), on a
-# torus in three dimensions, with kinks, .041 for .074 %. Sought after 100 steps too, F_M is .109 % below OPT in 64 dimensions
-# after 165, and 1.06 % if not; a torus and eight coordinates end the same. The last time, which comes where no
-# Gauss-Newton steps have ended training, takes seconds: waves of many coordinates too.
-SOUGHT_AT = (100, 200, 300)
-# A slack below so much of the state cost's standard deviation is rounding in single precision.
+# Steps of a round after which missed waves are sought; the last time waves of many coordinates too, which takes seconds. In
+# 32 coordinates F_M ended .026 % below OPT with searches, .174 % without.
+WAVE_SEARCH_STEPS = (100, 200, 300)
+# A slack below this part of the state cost's standard deviation is rounding in single precision.
 ROUNDING = 1e-6
 
 
 @torch.no_grad()
 def missed_waves(problem: Problem, fields: Fields, coupled: bool = False) -> Tensor:
-    """Wave vectors ``(W, d)`` that the slack of `V` has and its embedding has not, at most as many as that has room for; with
-    `coupled_waves`, if they are asked for."""
+    """Wave vectors ``(W, d)`` that the slack of `V` has and its embedding lacks, at most as many as this has room for; with
+    `coupled_waves` if ``coupled``."""
     embedding = getattr(fields.value, "embedding", None)
     if not isinstance(embedding, FourierEmbedding) or not embedding.free:
         return torch.zeros(0, problem.dim)
@@ -66,10 +63,10 @@ def add_waves(fields: Fields, waves: Tensor) -> None:
 
 
 def seek_waves(trainer: "Trainer") -> None:
-    """Before some steps of a round: take what is missed."""
+    """Give all networks the waves that the slack shows to be missing, before the steps `WAVE_SEARCH_STEPS` of a round."""
     done = trainer.step - trainer.settings.start(trainer.state.round)
-    if done in SOUGHT_AT:
-        last = done == SOUGHT_AT[-1]
+    if done in WAVE_SEARCH_STEPS:
+        last = done == WAVE_SEARCH_STEPS[-1]
         waves = trainer.ranks.from_first(lambda: missed_waves(trainer.problem, trainer.averaged_fields, last))
         for fields in (trainer.fields, trainer.averaged_fields):
             add_waves(fields, waves)

@@ -20,15 +20,27 @@ from ocp_torch.training.health import Health
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.warm_start.iteration import ValueIteration
 
-# What decides the learning rates: where one of these differs at a resume, they are those of the new configuration.
+# What learning rates depend on: where it differs at a resume, the rates are those of the new configuration.
 rates_of = lambda config: (config["optimizer"], config["schedule"], config["trainer"]["steps"])
-# What is saved just as it is.
-PLAIN = ("config", "step", "round", "samples", "seconds", "elapsed", "pending", "retry", "ended", "refined", "solved")
+# Attributes that are saved as they are.
+SAVED_AS_IS = (
+    "config",
+    "step",
+    "round",
+    "samples",
+    "seconds",
+    "elapsed",
+    "pending",
+    "retry",
+    "ended",
+    "refined",
+    "solved",
+)
 
 
 @dataclass
 class TrainState:
-    """What a run needs to go on exactly, and what it is a run of."""
+    """All that a run needs to go on exactly, and the names of its problem and method."""
 
     names: tuple[str, str]  # of the problem and of the method
     config: dict  # what all parts were built from
@@ -55,7 +67,7 @@ class TrainState:
         constants = self.constants
         return {
             **dict(zip(("problem", "method"), self.names, strict=True)),
-            **{name: getattr(self, name) for name in PLAIN},
+            **{name: getattr(self, name) for name in SAVED_AS_IS},
             "bounds": {"M": constants.M, "warnings": list(constants.warnings), "unbounded": constants.unbounded},
             "fields": self.fields.state_dict(),
             "average": self.average.state_dict(),
@@ -67,11 +79,11 @@ class TrainState:
         }
 
     def load_state_dict(self, saved: dict, settings: TrainerSettings) -> None:
-        """The way back from `state_dict`: with the same configuration the run goes on to the same bits.
+        """Restore what `state_dict` gave: with the same configuration the run goes on to the same bits.
 
         With another `optimizer`, `schedule` or `trainer.steps` the run is taken as one of these ``settings``: its round, warm
         start and learning rates are those such a run would have at this step. Raises `InputError` for a state of another
-        problem or method, or weights that are none; a state that does not fit raises whatever its odd part leads to.
+        problem or method, or weights that do not fit; another odd state raises whatever its odd part leads to.
         """
         for what, own in zip(("problem", "method"), self.names, strict=True):
             if saved[what] != own:
@@ -103,11 +115,11 @@ class TrainState:
         self.health.load_state_dict(saved["watch"])
         if self.warm is not None:
             self.warm.load_state_dict(saved["warm"])
-        # Last: to restore the rest may draw from them.
+        # Last, since restoring the rest may draw from them.
         restore_generators(saved["generators"])
 
     def try_step(self, phase: Phase) -> None:
-        """One step of all players shows whether their optimisers can work with what they were given; it is not undone."""
+        """Make a step of all players, which shows whether their optimisers can work with what they were given; it stays."""
         with suppress(NonFiniteError):  # the run itself will say so
             advance(self.stepper, self.average, self.batches.draw, phase)
 
@@ -143,7 +155,7 @@ def seed_generators(seed: int) -> None:
 
 
 def generator_states() -> dict:
-    """Their states, as tensors and plain numbers that a checkpoint can hold."""
+    """The states of all global generators, as tensors and plain numbers that a checkpoint can hold."""
     state: Any = np.random.get_state()  # noqa: NPY002
     name, keys, *rest = state
     version, words, spare = random.getstate()

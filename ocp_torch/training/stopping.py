@@ -14,14 +14,14 @@ STEPS, TARGET_GAP, MAX_SECONDS = "steps", "target_gap", "max_seconds"
 SOLVED = "solved"  # Gauss-Newton steps found the solution before all others were made
 NOT_FINITE, FAILED = "not_finite", "failed"
 ASKED = "callback"  # whoever watches asked for it
-# After a certificate that did not reach the target gap, the next is tried at so many times the step: there are then few of
-# them, also in a long run, and it stops at most a quarter later than it could.
-RETRY = 1.25
-CAUGHT = (signal.SIGTERM, signal.SIGINT)
+# After a full certificate that did not reach the target gap, the next is tried at this multiple of the step: even a long run
+# makes few, and stops at most a quarter later than it could.
+RETRY_FACTOR = 1.25
+CAUGHT_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 def late(settings: TrainerSettings, state: TrainState) -> bool:
-    """Whether no seconds are left."""
+    """Whether the seconds of `trainer.max_seconds` are over."""
     return settings.max_seconds is not None and state.elapsed >= settings.max_seconds
 
 
@@ -35,7 +35,7 @@ def reason_to_stop(settings: TrainerSettings, state: TrainState, over: bool) -> 
 
 
 def in_words(reason: str, settings: TrainerSettings, state: TrainState) -> str:
-    """``reason`` as a user is told."""
+    """``reason`` as a sentence for the user."""
     at = f"step {state.step:,}"
     if reason == MAX_SECONDS:
         return f"trainer.max_seconds = {settings.max_seconds:g} are over, at {at} of {settings.end(state.round):,}"
@@ -53,7 +53,7 @@ def in_words(reason: str, settings: TrainerSettings, state: TrainState) -> str:
 
 def postpone(state: TrainState) -> None:
     """The full certificate did not reach the target gap: training goes on, and it is tried again later."""
-    state.pending, state.retry = False, round(RETRY * state.step)
+    state.pending, state.retry = False, round(RETRY_FACTOR * state.step)
 
 
 class Preempted(BaseException):
@@ -70,9 +70,9 @@ class Preempted(BaseException):
 
 
 class Signals:
-    """While it is entered, holds back the first signal for the trainer to `take`; where no step is in hand and the state is
-    saved (``saved = True``) the first one already raises `Preempted`. The second ends the process, if it is the run's own
-    (``exits``), and else raises `Preempted` too. Where the run is ``ending`` by itself, those that come later do nothing."""
+    """A context that holds back the first signal for the trainer to `take`; where no step is in hand and the state is saved
+    (``saved = True``) the first one already raises `Preempted`. The second ends the process, if it is the run's own
+    (``exits``), and else raises `Preempted` too. Where the run is ``ending`` by itself, later signals do nothing."""
 
     def __init__(self, exits: bool = True) -> None:
         self._exits = exits
@@ -84,7 +84,7 @@ class Signals:
     def __enter__(self) -> "Signals":
         # Only the main thread may; elsewhere whoever runs this decides what a signal does.
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._caught) for number in CAUGHT}
+            self._before = {number: signal.signal(number, self._caught) for number in CAUGHT_SIGNALS}
         return self
 
     def __exit__(self, *_) -> None:
@@ -100,12 +100,12 @@ class Signals:
             raise Preempted(number)
 
     def came(self) -> list[bool]:
-        """Which of `CAUGHT`."""
-        return [number == self.received for number in CAUGHT]
+        """Whether each of `CAUGHT_SIGNALS` came."""
+        return [number == self.received for number in CAUGHT_SIGNALS]
 
     def raise_first(self, came: Sequence[bool]) -> None:
-        """Raise `Preempted` by the first of `CAUGHT` that ``came``, here or to another process."""
-        raise Preempted(next(number for number, yes in zip(CAUGHT, came, strict=True) if yes))
+        """Raise `Preempted` by the first of `CAUGHT_SIGNALS` that ``came``, here or to another process."""
+        raise Preempted(next(number for number, yes in zip(CAUGHT_SIGNALS, came, strict=True) if yes))
 
     def take(self) -> None:
         """Raise `Preempted` if a signal came."""

@@ -77,17 +77,17 @@ class Trainer:
 
     @property
     def run(self) -> Run:
-        """Who and where this run is, for its certificate."""
+        """The names, seed and progress of this run, for its certificate."""
         return Run(*self.names, self.seed, self.step, self.samples, self.state.seconds, self.stopped)
 
     @property
     def end(self) -> int:
-        """Of the present round."""
+        """The number of steps after which the present round is over."""
         return self.settings.end(self.state.round)
 
     @property
     def phase(self) -> Phase:
-        """What the next step's losses may know of time."""
+        """The `Phase` of the next step."""
         k = self.state.round
         return Phase(self.constants, self.settings.part_done(self.step, k), self.batches.ranks.size, later=k > 0)
 
@@ -148,7 +148,7 @@ class Trainer:
         return ASKED if self.asked else reason_to_stop(self.settings, self.state, late(self.settings, self.state))
 
     def _warm_up(self, monitor: Silent, checkpoint: Path | None, signals: Signals) -> None:
-        """What is left of the warm start; `V` then begins as its best one, which itself stays a candidate."""
+        """Make the rounds left of the warm start; `V` then learns its best one, which itself stays a candidate."""
         state, warm = self.state, self.state.warm
         while warm is not None and not warm.done and self._reason() is None:
             started = time.perf_counter()
@@ -164,7 +164,7 @@ class Trainer:
             signals.take()
 
     def _advance(self, monitor: Silent, checkpoint: Path | None) -> None:
-        """One step, and what is due after it."""
+        """Make a step, and what is due after it."""
         settings, state, started = self.settings, self.state, time.perf_counter()
         seek_waves(self)
         report = whole_step(self.state, self.phase, self.ranks)

@@ -11,7 +11,7 @@ from ocp_torch.training.state import TrainState
 
 
 def whole_step(state: TrainState, phase: Phase, ranks: Alone) -> StepReport:
-    """One step of ``state`` at ``phase``. Where others of ``ranks`` are lost in the middle of it, all that it moved is put
+    """Make a step of ``state`` at ``phase``. Where others of ``ranks`` are lost in the middle of it, all that it moved is put
     back, and `LostError` raised. Raises `NonFiniteError` as `Stepper.step` does."""
     moved: Sequence[Any] = (state.batches,) if ranks.size > 1 else ()
     if moved and state.stepper.draws > 1:  # one of a single batch moves no weights before it has heard of all others

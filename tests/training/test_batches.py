@@ -16,7 +16,7 @@ from ocp_torch.objectives import Dual, Phase, primal
 from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.generator import Generator
-from ocp_torch.training.batches import VISITED, Batches
+from ocp_torch.training.batches import VISITED_PART, Batches
 from support import zoo
 
 
@@ -102,10 +102,10 @@ def test_the_penalty_sees_the_visited_states_too():
 
 def test_states_are_visited_where_no_M_is_known_and_nowhere_else():
     of = lambda batches: int((batches.next().weight == 0.0).sum())
-    assert of(build(zoo.build("arm n=2"), None)) == VISITED * 1000
+    assert of(build(zoo.build("arm n=2"), None)) == VISITED_PART * 1000
     assert of(build(zoo.build("arm n=2"), 0.0)) == 0
     assert of(build(zoo.build("arm n=2"), None, method=primal)) == 0
-    assert of(build(Sink(), None)) == VISITED * 1000
+    assert of(build(Sink(), None)) == VISITED_PART * 1000
     assert build(zoo.build("circle rho=2"), None).next().penalty_weight is None
 
 

@@ -64,7 +64,7 @@ def test_integrands_are_what_the_losses_are_the_mean_of(way):
 @pytest.mark.parametrize("way", ["dual", "primal", "dual, noise"])
 def test_scores_are_proportional_to_the_gradients_of_single_states(way, monkeypatch):
     monkeypatch.setattr(importance, "DIRECTIONS", 400)
-    monkeypatch.setattr(importance, "LENGTH", 1e-5)
+    monkeypatch.setattr(importance, "STEP_LENGTH", 1e-5)
     batches, phase = build(way)
     samples = batches.problem.samples(zoo.states(batches.problem, 60))
     before = [p.clone() for p in batches.fields.parameters()]

@@ -15,7 +15,7 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.finish import glimpse
 from ocp_torch.runs.run import run_to_end
-from ocp_torch.training.evaluator import TRAINED_ON
+from ocp_torch.training.evaluator import TIGHTENING_OVER_TRAINING
 from ocp_torch.training.monitor import Monitor, Stages, liouville_residual
 from ocp_torch.training.running import RunningEstimates
 from support.small import METHODS, small
@@ -32,7 +32,7 @@ WAYS = {**METHODS, "saddle with drift": ("method=pd", "method.augmentation=0", *
     "way", [pytest.param(w, marks=NIGHTLY) if w in METHODS and k % 2 else w for k, w in enumerate(WAYS)]
 )
 def test_the_game_is_shown_at_every_phase(way, tmp_path, monkeypatch):
-    monkeypatch.setattr("ocp_torch.training.running.SECONDS", 1e9)  # the clock is no part of this
+    monkeypatch.setattr("ocp_torch.training.running.FREE_SECONDS", 1e9)  # the clock is no part of this
     trainer = small(*WAYS[way], "trainer.log_every=5")
     with Monitor(tmp_path, trainer) as monitor:
         trainer.fit(monitor)
@@ -154,5 +154,5 @@ def test_the_time_that_is_told_counts_what_the_certificate_trains(monkeypatch):
     evaluator.seconds, trainer.state.seconds, trainer.state.samples = 2.0, 3.0, 1000
     assert evaluator.expected(plain) == pytest.approx(6.0 * 2.0 + 5000 * 0.003)
     searched = evaluator.expected(replace(plain, mollify=None))
-    assert searched == pytest.approx(6.0 * 2.0 + (STEEP_FACTOR * 5000 + TRAINED_ON * 40 * 2048) * 0.003)
+    assert searched == pytest.approx(6.0 * 2.0 + (STEEP_FACTOR * 5000 + TIGHTENING_OVER_TRAINING * 40 * 2048) * 0.003)
     assert evaluator.expected(replace(plain, mollify=None, points=1024)) < searched

@@ -210,7 +210,7 @@ def test_training_ends_once_the_equation_is_solved(solved, tmp_path):
     trainer = agreeing(small(*EARLY), True)
     assert trainer.fit(Silent(), tmp_path / "last.pt") == SOLVED
     assert trainer.step == 7
-    assert trainer.samples == 7 * trainer.settings.batch + refinement.JUDGED + 4
+    assert trainer.samples == 7 * trainer.settings.batch + refinement.COMPARISON_STATES + 4
     assert not trainer.averaged_fields.value.head.weight.any()
     assert not trainer.fields.value.head.weight.any()
     assert "solve the Hamilton-Jacobi-Bellman equation" in trainer.why_stopped
@@ -235,7 +235,7 @@ def test_else_training_goes_on_as_if_nothing_had_been_tried(solved, monkeypatch,
         agreeing(trainer, False)
     elif why == "the slack is not small":
         agreeing(trainer, True)
-        monkeypatch.setattr(refinement, "SOLVED", -1.0)
+        monkeypatch.setattr(refinement, "SOLVED_SLACK", -1.0)
     else:
         trainer = small(*EARLY, "trainer.target_gap=1e-9", "trainer.evaluate_every=100")
         trainer.evaluator.reaches = lambda gap, run: gap > 1e-9

@@ -94,7 +94,7 @@ def test_the_exact_value_lacks_nothing_and_without_room_or_a_value_nothing_is_so
 
 @pytest.mark.parametrize("method", ["dual", "pd"])
 def test_a_run_takes_them_and_goes_on_from_any_step_to_the_same_bits(method, monkeypatch, tmp_path):
-    monkeypatch.setattr("ocp_torch.training.slack_waves.SOUGHT_AT", (3, 5))
+    monkeypatch.setattr("ocp_torch.training.slack_waves.WAVE_SEARCH_STEPS", (3, 5))
     problem = ("problem=manufactured", "problem.dim=2", f"method={method}", "model.waves=24", "model.width=16")
     config = configured("trainer.device=cpu", "trainer.steps=7", "trainer.rounds=1", "trainer.batch=64", *problem)
 

@@ -27,7 +27,7 @@ from ocp_torch.runs.run import run_to_end
 from ocp_torch.training import evaluator
 from ocp_torch.training.monitor import Silent
 from ocp_torch.training.warm_start.grid import GridValues
-from ocp_torch.training.warm_start.iteration import ALONG, ValueIteration
+from ocp_torch.training.warm_start.iteration import GRADIENT_LENGTH, ValueIteration
 from ocp_torch.training.warm_start.pieces import Trajectories, lambda_returns, roll
 from ocp_torch.training.warm_start.settings import WarmStartSettings
 from ocp_torch.training.warm_start.targets import Targets
@@ -50,8 +50,8 @@ FEW = (
 @pytest.fixture
 def little(monkeypatch):
     """Grids, fits, trials and lessons as small as may be: for what does not depend on how good they are."""
-    fits, grid = {"iteration.BATCH": 64, "iteration.TAUGHT": 20}, {"grid.SIDE": 32}
-    for name, size in {**fits, **grid, "iteration.STARTS": 16, "trial.TIME": 2.0}.items():
+    fits, grid = {"iteration.BATCH": 64, "iteration.TEACHING_STEPS": 20}, {"grid.SIDE": 32}
+    for name, size in {**fits, **grid, "iteration.TRIAL_STARTS": 16, "trial.TRIAL_TIME": 2.0}.items():
         monkeypatch.setattr(f"ocp_torch.training.warm_start.{name}", size)
 
 
@@ -276,7 +276,7 @@ def test_a_gradient_that_is_off_counts_over_a_part_of_a_turn():
     own = jet(warm.network, x)
     found = lambda gradients: warm._squares(Targets(x, own.value, own.value, gradients), all_rows)
     assert float(found(own.gradient).detach().abs().max()) == 0.0
-    torch.testing.assert_close(found(own.gradient + 3.0), torch.full((64,), 2 * (3.0 * ALONG) ** 2))
+    torch.testing.assert_close(found(own.gradient + 3.0), torch.full((64,), 2 * (3.0 * GRADIENT_LENGTH) ** 2))
 
 
 def test_fits_end_at_no_rate_however_trials_turn_out():

@@ -19,26 +19,27 @@ from ocp_torch.problems import Problem
 from ocp_torch.problems.simulator.simulator import Simulator
 from ocp_torch.training.warm_start.targets import Targets
 
-# Nodes along each of two coordinates, controls from one limit to the other, and steps of the pace in one: longer steps are
-# interpolated less often. On a limited pendulum (discount 0.5) V is then 2.988 on average at the starts of a trial, and the
-# controller of the network fitted to it costs 2.974 there; that learnt from trajectories 3.06, after twice the time.
-DIM, SIDE, CONTROLS, STEPS = 2, 192, 17, 1.2
-# A policy is followed for so many sweeps before it is improved. It is over when an improvement moves V by less than this part
-# of its largest value, were it made for ever; or after so many policies.
-SWEEPS, SETTLED, MOST_POLICIES = 25, 0.002, 200
-# The first learning rate of a fit to them, in units of the usual one: nothing moves here from round to round. It falls to 0:
-# the pendulum in Gymnasium lost 1.6 % of the return then, and 4 % at the usual rate throughout.
-FASTEST = 2.5
+# On a limited pendulum (discount 0.5) a controller from this grid costs 2.974, one from trajectories 3.06 after twice the time.
+DIM = 2
+SIDE = 192  # nodes along each coordinate
+CONTROLS = 17  # tried at each node, from one limit to the other
+STEP_FACTOR = 1.2  # steps in units of those of the pace: longer ones are interpolated less often
+POLICY_SWEEPS = 25  # for which a policy is followed before it is improved
+SETTLED_PART = 0.002  # an improvement that moves V by less of its largest value, were it made for ever, is the last
+MOST_POLICIES = 200
+# The first learning rate of a fit, in units of the usual one, from which it falls to 0: Pendulum-v1 lost 1.6 % of the return
+# so, and 4 % at the usual rate throughout.
+FIRST_RATE = 2.5
 
 
 class GridValues:
-    """The value of every node of a grid; found when it is first asked for, always the same."""
+    """The values at the nodes of a grid, computed once, when they are first asked for."""
 
-    # A trial follows so many rounds, whose fits take no less time than it does.
-    trial_every, fastest = 40, FASTEST
+    trial_every = 40  # rounds, whose fits take no less time than a trial
+    fastest = FIRST_RATE
 
     def __init__(self, problem: Problem, pace: Pace, like: Tensor) -> None:
-        self.problem, self.pace, self.like = problem, pace.with_step(STEPS * pace.step), like
+        self.problem, self.pace, self.like = problem, pace.with_step(STEP_FACTOR * pace.step), like
         self.asked, self.drawn, self._found = False, 0, list[Targets]()
 
     @staticmethod
@@ -52,7 +53,7 @@ class GridValues:
         return f"fits to a grid of {SIDE} x {SIDE} nodes"
 
     def targets(self, average: Field) -> Targets:
-        """All nodes, the values there and their gradients, whatever the ``average``."""
+        """All nodes, with the values and their gradients there, whatever the ``average``."""
         self.drawn, self.asked = 0 if self.asked else CONTROLS * SIDE**DIM, True
         if not self._found:
             x, V = self._solved()
@@ -79,7 +80,7 @@ class GridValues:
         return x, solved(torch.stack(index), torch.stack(weight), torch.stack(cost), rate)
 
     def _kicked(self, x: Tensor, end: Tensor) -> Tensor:
-        """Where noise takes the ``end`` of a step from ``x``, ``(J, N, d)``, all as likely: right in mean and covariance."""
+        """Equally likely noisy ends ``(J, N, d)`` of a step from ``x`` to ``end``, right in mean and covariance."""
         sigma = self.problem.noise(x)
         if sigma is None:
             return end.unsqueeze(0)
@@ -90,12 +91,12 @@ class GridValues:
         return {"asked": self.asked}
 
     def load_state_dict(self, state: dict) -> None:
-        """The way back from `state_dict`: values are found anew, but their states are not counted again."""
+        """Restore what `state_dict` gave: values are computed anew, but their states are not counted again."""
         self.asked = bool(state["asked"])
 
 
 def slopes(V: Tensor) -> Tensor:
-    """The gradient ``(N, d)`` at all nodes of what is ``V`` ``(N,)`` there, by central differences."""
+    """The gradient ``(N, d)`` at all nodes, by central differences, of the function with the values ``V`` ``(N,)`` there."""
     cube = V.reshape((SIDE,) * DIM)
     return torch.stack([0.5 * SIDE * (cube.roll(-1, k) - cube.roll(1, k)) for k in range(DIM)], dim=-1).flatten(0, -2)
 
@@ -117,16 +118,16 @@ def stencil(points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def solved(index: Tensor, weight: Tensor, cost: Tensor, rate: float) -> Tensor:
-    """The fixed point ``(N,)`` of `V = min_k cost_k + sum_j weight_kj V(index_kj)`, of ``cost`` ``(K, N)``, ``index`` and
-    ``weight`` ``(K, N, J)``, whose weights add up to ``1 - rate``: policies are improved, and followed for some sweeps."""
+    """The fixed point ``(N,)`` of `V = min_k cost_k + sum_j weight_kj V(index_kj)`, for ``cost`` ``(K, N)`` and ``index`` and
+    ``weight`` ``(K, N, J)``, whose weights add up to ``1 - rate``: by modified policy iteration."""
     V, rows = torch.zeros_like(cost[0]), torch.arange(cost.shape[1])
     for _ in range(MOST_POLICIES):
         values = torch.stack([c + (w * V[i]).sum(dim=-1) for c, w, i in zip(cost, weight, index, strict=True)])
         best, policy = values.min(dim=0)
         moved, V = float((best - V).abs().max()), best
-        if moved <= SETTLED * rate * float(V.abs().max()):
+        if moved <= SETTLED_PART * rate * float(V.abs().max()):
             break
         c, w, i = (of[policy, rows] for of in (cost, weight, index))
-        for _ in range(SWEEPS):
+        for _ in range(POLICY_SWEEPS):
             V = c + (w * V[i]).sum(dim=-1)
     return V

@@ -16,20 +16,22 @@ from ocp_torch.problems import Problem
 from ocp_torch.problems.starts import drawn_starts
 from ocp_torch.steppers.fitting import optimizer_maker
 from ocp_torch.training.warm_start.grid import GridValues
-from ocp_torch.training.warm_start.pieces import POOLED, Trajectories
+from ocp_torch.training.warm_start.pieces import STARTS_PER_PIECE, Trajectories
 from ocp_torch.training.warm_start.settings import WarmStartSettings
 from ocp_torch.training.warm_start.targets import Targets
-from ocp_torch.training.warm_start.trial import STARTS, Trial
+from ocp_torch.training.warm_start.trial import TRIAL_STARTS, Trial
 
-# Of the least squares: steps a round, states a step, learning rate of SOAP, which a source multiplies. The average moves half
-# way after each round. A round of an acrobot takes six times as long to simulate as 16 steps do.
-FITS, BATCH, RATE, HALF = 32, 2048, 2e-3, 0.5
-# Errors of a gradient count over this part of a turn. Pendulum-v1 lost 1.1 to 1.4 % of the return with it, 1.3 to 1.8 with
-# 0.02 and controls held for two thirds of the time, 5 % and more without gradients.
-ALONG = 0.08
-# Steps in which another network learns what was found, at states of the whole torus, and the learning rate they begin with:
-# on a limited pendulum they leave an error of 1.4 % of the spread of `V`.
-TAUGHT, TEACHING = 400, 1e-2
+FIT_STEPS = 32  # of least squares in a round: an acrobot's round takes six times as long to simulate as 16 of them
+BATCH = 2048  # states of a step
+LEARNING_RATE = 2e-3  # of SOAP, multiplied by the `fastest` of a source
+AVERAGE_STEP = 0.5  # part of the way to the network that the average moves after each round
+# Length in turns over which errors of a gradient count: Pendulum-v1 lost 1.1 to 1.4 % of the return with it, 5 % and more
+# without gradients.
+GRADIENT_LENGTH = 0.08
+# By these steps the `V` that is trained for the bound learns the one found here, at states of the whole torus: on a limited
+# pendulum to 1.4 % of the spread of `V`.
+TEACHING_STEPS = 400
+TEACHING_RATE = 1e-2  # the first learning rate
 
 
 class ValueIteration:
@@ -42,27 +44,27 @@ class ValueIteration:
         self.problem, self.settings = problem, settings
         self.network = copy.deepcopy(network).requires_grad_(True)
         self.average = copy.deepcopy(network).requires_grad_(False)
-        self.optimizer = optimizer_maker("soap", RATE)(list(self.network.parameters()))
+        self.optimizer = optimizer_maker("soap", LEARNING_RATE)(list(self.network.parameters()))
         self.like, pace = next(network.parameters()).detach(), Pace.of(problem)
         place = lambda number: derive_seed(seed, Branch.WARM_START, number)
         self.generator = torch.Generator().manual_seed(derive_seed(seed, Branch.WARM_START))
         self.source: GridValues | Trajectories = GridValues(problem, pace, self.like)
         if not GridValues.suits(problem):
-            starts = drawn_starts(problem, POOLED * settings.pieces, place(0)).to(self.like)
+            starts = drawn_starts(problem, STARTS_PER_PIECE * settings.pieces, place(0)).to(self.like)
             self.source = Trajectories(problem, pace, starts, settings, self.generator, float(network.unit))
-        self.trial = Trial(problem, pace, drawn_starts(problem, STARTS, place(1)).to(self.like), place(2))
+        self.trial = Trial(problem, pace, drawn_starts(problem, TRIAL_STARTS, place(1)).to(self.like), place(2))
         self.round, self.done = 0, False
-        # Of the last fit, of the last trial and of the best one.
+        # The loss of the last fit, and the costs of the last trial and of the best one.
         self.loss, self.cost, self.least = math.nan, math.nan, math.inf
         self.found, self.best = False, self._weights()  # whether a controller is better than none, and its weights
 
     def advance(self) -> bool:
-        """One round; whether a trial was made after it."""
+        """Make a round. Returns whether a trial was made after it."""
         if self.round == 0:
             self.least = self.trial.cost_of_nothing()
         falling = 0.5 * (1.0 + math.cos(math.pi * self.round / self.settings.rounds))
         for group in self.optimizer.param_groups:
-            group["lr"] = RATE * self.source.fastest * falling
+            group["lr"] = LEARNING_RATE * self.source.fastest * falling
         self._fit(self.source.targets(self.average))
         self.round += 1
         due = self.round % self.source.trial_every == 0 or self.round >= self.settings.rounds or self.done
@@ -73,7 +75,7 @@ class ValueIteration:
     def _fit(self, to: Targets) -> None:
         """Least squares of the relative error: near the goal, where trajectories spend their time, small ones decide."""
         weight = (to.values.clamp_min(0.0) / self.network.unit + 1.0) ** -2.0
-        for _ in range(FITS):
+        for _ in range(FIT_STEPS):
             rows = torch.randint(len(to.x), (min(BATCH, len(to.x)),), generator=self.generator).to(self.like.device)
             loss = (weight[rows] * self._squares(to, rows)).mean() / self.network.unit.square()
             self.loss = float(loss.detach())
@@ -85,18 +87,18 @@ class ValueIteration:
             self.optimizer.step()
         with torch.no_grad():
             for mean, own in zip(self.average.parameters(), self.network.parameters(), strict=True):
-                mean.lerp_(own, HALF)
+                mean.lerp_(own, AVERAGE_STEP)
 
     def _squares(self, to: Targets, rows: Tensor) -> Tensor:
-        """Of what is off at ``rows`` of ``to``, ``(N,)``; of gradients, which decide on the control, over `ALONG`."""
+        """Squared errors ``(N,)`` at ``rows`` of ``to``, with those of gradients, which decide on the control, if known."""
         if to.gradients is None:
             return (self.network(to.x[rows]) - to.y[rows]).square()
         found = self.network.jet(to.x[rows])
-        along = ALONG * (found.gradient - to.gradients[rows])
+        along = GRADIENT_LENGTH * (found.gradient - to.gradients[rows])
         return (found.value - to.y[rows]).square() + along.square().sum(dim=-1)
 
     def _try(self) -> None:
-        """What the present controller costs; keep the best, and end where none is found half way."""
+        """Try the present controller and keep the best; end where none better than no control is found half way."""
         self.cost = self.trial.cost_of(self.average)
         if self.cost < self.least:
             self.least, self.best, self.found = self.cost, self._weights(), True
@@ -104,17 +106,17 @@ class ValueIteration:
 
     @property
     def drawn(self) -> int:
-        """For how many states the last round asked."""
+        """How many states the last round evaluated the problem at."""
         return self.source.drawn
 
     @property
     def plan(self) -> str:
-        """What is about to be done, as a user is told."""
+        """What is about to be done, as a sentence for the user."""
         return f"warm start: at most {self.settings.rounds} rounds of {self.source.plan}, now at round {self.round}"
 
     @property
     def outcome(self) -> str:
-        """How it ended, as a user is told."""
+        """How the warm start ended, as a sentence for the user."""
         if not self.found:
             return f"the warm start found no controller better than none in {self.round} rounds; training starts afresh"
         if not math.isfinite(self.loss):
@@ -122,8 +124,8 @@ class ValueIteration:
         return f"warm start: a controller of cost {self.least:.4g} after {self.round} rounds, a candidate from now on"
 
     def hand_over(self, all_fields: Sequence[Fields]) -> None:
-        """Put the best `V` so far, if there is one, in its place in each of ``all_fields``; and once it is over what the `V`
-        that is trained for its bound learns of it."""
+        """Put the best `V` so far, if there is one, in its place in each of ``all_fields``; at the end of the warm start the
+        `V` that is trained for its bound learns it too."""
         if not self.found:
             return
         for fields in all_fields:
@@ -137,10 +139,10 @@ class ValueIteration:
     def _taught(self, pupil: nn.Module, teacher: nn.Module) -> dict[str, Tensor]:
         """The weights of ``pupil``, a network in the problem's units, once it gives what ``teacher`` does."""
         pupil.requires_grad_(True)
-        optimizer = optimizer_maker("soap", TEACHING)(list(pupil.parameters()))
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, TAUGHT)
+        optimizer = optimizer_maker("soap", TEACHING_RATE)(list(pupil.parameters()))
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, TEACHING_STEPS)
         scale = getattr(pupil, "scale", 1.0)
-        for _ in range(TAUGHT):
+        for _ in range(TEACHING_STEPS):
             x = torch.rand(BATCH, self.problem.dim, generator=self.generator).to(self.like)
             with torch.no_grad():
                 wanted = teacher(x)
@@ -154,7 +156,7 @@ class ValueIteration:
         return {name: tensor.detach().clone() for name, tensor in self.average.state_dict().items()}
 
     def state_dict(self) -> dict:
-        plain = {name: getattr(self, name) for name in PLAIN}
+        plain = {name: getattr(self, name) for name in SAVED_AS_IS}
         if self.done:  # what is left of it is in the fields
             return plain
         modules = {name: getattr(self, name).state_dict() for name in ("network", "average", "optimizer")}
@@ -167,8 +169,8 @@ class ValueIteration:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """The way back from `state_dict`. Raises `InputError` where its states are none."""
-        for name in PLAIN:
+        """Restore what `state_dict` gave. Raises `InputError` where its states are no states of the problem."""
+        for name in SAVED_AS_IS:
             setattr(self, name, type(getattr(self, name))(state[name]))
         if self.done:
             return
@@ -180,5 +182,5 @@ class ValueIteration:
         self.generator.set_state(state["generator"])
 
 
-# What is saved just as it is.
-PLAIN = ("round", "done", "found", "loss", "cost", "least")
+# Attributes that are saved as they are.
+SAVED_AS_IS = ("round", "done", "found", "loss", "cost", "least")

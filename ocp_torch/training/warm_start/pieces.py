@@ -19,25 +19,29 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.training.warm_start.settings import WarmStartSettings
 from ocp_torch.training.warm_start.targets import Targets
 
-# Parts of the pieces that start uniformly, where earlier pieces ended, and about a state of rest, where there is one; the
-# others start as `mu0` says. Without the last a pendubot never came to rest upright, where its `V` was .13 in place of 0, and
-# stayed leaning by 22 degrees for ever.
-UNIFORM, GOING_ON, RESTING = 0.125, 0.5, 0.125
-# Those about a state of rest start where the quadratic `V` has risen by so many of its units: from next to nothing to a
-# standard deviation of the cost. Neither these heights nor `RESTING` were compared with other numbers.
-RISEN = (0.1, 100.0)
-# Along directions in which it is as good as flat, and in turns at most.
-FLAT, TINY, FARTHEST = 1e-6, 1e-300, 0.25
-# Starts that pieces draw from, for each piece.
-POOLED = 8
+# Parts of the pieces by where they start; the others start as `mu0` says.
+UNIFORM_PART = 0.125  # uniformly
+CONTINUED_PART = 0.5  # where earlier pieces ended
+RESTING_PART = (
+    0.125  # about a state of rest, if any: without these a pendubot leaned by 22 degrees for ever (not tuned)
+)
+# Values of the quadratic `V` at starts about a state of rest, in units of `V`: from next to nothing to a standard deviation of
+# the cost (not tuned).
+RISES = (0.1, 100.0)
+LEAST_CURVATURE = (
+    1e-6  # of the quadratic `V`, as a part of its largest, along directions in which it is as good as flat
+)
+TINY = 1e-300  # least curvature where all are 0
+LARGEST_OFFSET = 0.25  # of such a start in each coordinate, in turns
+STARTS_PER_PIECE = 8  # states of `mu0`, for each piece, in the pool that pieces draw their starts from
 
 
 class Trajectories:
     """Returns along pieces of trajectory of ``problem``, which start among ``starts`` ``(M, d)`` and elsewhere; ``unit`` is
-    that of `V`."""
+    the unit of `V`."""
 
-    # A trial follows so many rounds; and the first learning rate of a fit, in units of the usual one.
-    trial_every, fastest = 10, 1.5
+    trial_every = 10  # rounds
+    fastest = 1.5  # first learning rate of a fit, in units of the usual one
 
     def __init__(
         self,
@@ -65,27 +69,27 @@ class Trajectories:
         # No controller that is worth having costs more than the dearest state.
         values = pieces.values.clamp(0.0, self.largest)
         y = lambda_returns(pieces.costs, values, self.problem.discount, self.pace.step, self.settings.trace)
-        self.ends = pieces.states[-1][self._pick(len(x), round(GOING_ON * len(x)))]
+        self.ends = pieces.states[-1][self._pick(len(x), round(CONTINUED_PART * len(x)))]
         return Targets(pieces.states[:-1].flatten(0, 1), y.flatten(), values[:-1].flatten())
 
     def _draw(self) -> Tensor:
-        """Where the pieces of a round start, ``(N, d)``."""
+        """The starts ``(N, d)`` of the pieces of a round."""
         count = self.settings.pieces
         ends = [] if self.ends is None else [self.ends]
-        uniform = torch.rand(round(UNIFORM * count), self.problem.dim, generator=self.generator).to(self.starts)
-        about = [] if self.rest is None else [self._about(self.rest, round(RESTING * count))]
+        uniform = torch.rand(round(UNIFORM_PART * count), self.problem.dim, generator=self.generator).to(self.starts)
+        about = [] if self.rest is None else [self._about(self.rest, round(RESTING_PART * count))]
         left = count - len(uniform) - sum(map(len, ends)) - sum(map(len, about))
         return torch.cat([uniform, self.starts[self._pick(len(self.starts), left)], *ends, *about])
 
     def _about(self, rest: Equilibrium, count: int) -> Tensor:
-        """States ``(count, d)`` about that of ``rest``, in every direction at every height of the quadratic `V`."""
+        """States ``(count, d)`` about that of ``rest``, in all directions and at values of the quadratic `V` in `RISES`."""
         drawn = lambda sampler, n: sampler(count, n, dtype=torch.float64, generator=self.generator)
-        low, high = (math.log(self.unit * units) for units in RISEN)
+        low, high = (math.log(self.unit * units) for units in RISES)
         height = (low + (high - low) * drawn(torch.rand, 1)).exp()
         sizes, axes = torch.linalg.eigh(0.5 * rest.bend)
         along = height.sqrt() * normalize(drawn(torch.randn, self.problem.dim), dim=-1)
-        away = (along / sizes.clamp_min(max(FLAT * float(sizes[-1]), TINY)).sqrt()) @ axes.T
-        return (rest.at + away.clamp(-FARTHEST, FARTHEST)).remainder(1.0).to(self.starts)
+        away = (along / sizes.clamp_min(max(LEAST_CURVATURE * float(sizes[-1]), TINY)).sqrt()) @ axes.T
+        return (rest.at + away.clamp(-LARGEST_OFFSET, LARGEST_OFFSET)).remainder(1.0).to(self.starts)
 
     def _pick(self, of: int, count: int) -> Tensor:
         return torch.randint(of, (count,), generator=self.generator).to(self.starts.device)
@@ -94,7 +98,7 @@ class Trajectories:
         return {"ends": None if self.ends is None else self.ends.clone()}
 
     def load_state_dict(self, state: dict) -> None:
-        """The way back from `state_dict`. Raises `InputError` where its states are none."""
+        """Restore what `state_dict` gave. Raises `InputError` where its states are no states of the problem."""
         ends, dim = state["ends"], self.problem.dim
         if ends is not None and (ends.ndim != 2 or ends.shape[1] != dim or not ends.isfinite().all()):
             raise InputError(f"the checkpoint holds ends of trajectories that are no states of {dim} coordinates.")
@@ -113,9 +117,9 @@ class Pieces:
 
 
 def roll(problem: Problem, value: Field, x: Tensor, pace: Pace, steps: int, generator: torch.Generator) -> Pieces:
-    """From ``x`` ``(N, d)`` for ``steps``, with the control of ``value`` held in each; noise is drawn from ``generator``.
+    """Pieces of ``steps`` steps from ``x`` ``(N, d)``, with the control of ``value`` held in each; ``generator`` draws noise.
 
-    Of the cost of a step the part of the state is the mean of that at its ends, exact to second order.
+    The state cost of a step is the mean of those at its ends, exact to second order.
     """
     policy, cost = HeldPolicy(problem, value, pace), problem.control_cost
     states, values, costs = [x], list[Tensor](), list[Tensor]()

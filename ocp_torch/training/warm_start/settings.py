@@ -31,8 +31,8 @@ class WarmStartSettings:
         require_number("warm_start.trace", self.trace, at_least=0.0, at_most=1.0)
 
     def wanted(self, problem: Problem, objective: Objective, constants: Constants) -> bool:
-        """Whether a run of ``objective`` on ``problem`` is to begin with it. Raises `InputError` where it is ``on`` and
-        cannot be."""
+        """Whether a run of ``objective`` on ``problem`` is to begin with value iteration. Raises `InputError` where that is
+        ``on`` and impossible."""
         possible = problem.has_simulator and VALUE in objective.fields
         if self.mode == ON and not possible:
             lacks = "this method has no V" if problem.has_simulator else "a data set cannot be simulated"
@@ -41,9 +41,9 @@ class WarmStartSettings:
 
 
 def pays(problem: Problem, constants: Constants) -> bool:
-    """Whether good controllers are likely to come late without it, as in swing-ups: mass gathers, or would without noise,
-    more coordinates move by themselves than there are controls, and these are limited. Not for a simulator, each evaluation
-    of which may be dear. What is then found to be no better than doing nothing is not used."""
+    """Whether good controllers are likely to come late without a warm start, as in swing-ups: mass gathers, or would without
+    noise, there is drift and more coordinates than controls, and these are limited. Never for a simulator, whose evaluations
+    may be dear. A warm start that finds nothing better than doing nothing is not used."""
     underactuated = not problem.driftless and problem.control_dim < problem.dim
     if not underactuated or math.isinf(problem.control_cost.reach) or isinstance(problem, Simulator):
         return False

@@ -6,8 +6,8 @@ from torch import Tensor
 
 
 class Targets(NamedTuple):
-    """States ``(N, d)``, what `V` is to be there, and about what it is, in which chance has no part, both ``(N,)``; and its
-    gradient ``(N, d)``, where that is known as well."""
+    """States ``x`` ``(N, d)``; the targets ``y`` of `V` there, and ``values`` near them without random parts, both ``(N,)``;
+    and its gradients ``(N, d)``, where known."""
 
     x: Tensor
     y: Tensor

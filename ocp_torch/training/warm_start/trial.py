@@ -11,13 +11,13 @@ from ocp_torch.maths.jets import Field
 from ocp_torch.problems import Problem
 from ocp_torch.training.warm_start.pieces import lambda_returns, roll
 
-# Starts of a trial, and its time in units of `1 / rho`.
-STARTS, TIME = 256, 6.0
+TRIAL_STARTS = 256
+TRIAL_TIME = 6.0  # in units of 1 / rho
 
 
 @dataclass(frozen=True)
 class Trial:
-    """From ``starts`` ``(N, d)``, drawn from `mu0`, at ``pace``; ``seed`` is that of the noise, the same in each trial."""
+    """Trials from ``starts`` ``(N, d)``, drawn from `mu0`, at ``pace``; ``seed`` gives the noise, the same in each trial."""
 
     problem: Problem
     pace: Pace
@@ -25,9 +25,9 @@ class Trial:
     seed: int
 
     def cost_of(self, value: Field) -> float:
-        """The mean discounted cost of the controller of ``value``; infinite for none. An estimate, by which no bound is
-        made: the control is held in each step, and what comes after the end is taken to cost what it does there."""
-        steps = math.ceil(TIME / (self.problem.discount * self.pace.step))
+        """The mean discounted cost of the controller of ``value``; infinity where it is not finite. An estimate, by which no
+        bound is made: controls are held in each step, and the running cost is taken to stay what it is at the end."""
+        steps = math.ceil(TRIAL_TIME / (self.problem.discount * self.pace.step))
         noise = torch.Generator().manual_seed(self.seed)
         ran = roll(self.problem, value, self.starts, self.pace, steps, noise)
         rest = torch.cat([torch.zeros_like(ran.costs), ran.last.unsqueeze(0)])
@@ -35,5 +35,5 @@ class Trial:
         return cost if math.isfinite(cost) else math.inf
 
     def cost_of_nothing(self) -> float:
-        """That of no control."""
+        """The mean discounted cost without control."""
         return self.cost_of(lambda x: 0.0 * x.sum(dim=-1))
