@@ -1,7 +1,7 @@
 """All checks of a problem, the cheap ones first. Every failure is one sentence with function, shape or state.
 
-What is refused is certainly wrong. Rough and discontinuous functions are legal, so answers are compared only at states that
-are the same to the bit, in single precision too, and away from where functions like to jump.
+Only what is certainly wrong is refused. Rough and discontinuous functions are legal, so answers are compared only at states
+that are the same to the bit, in single precision too, and away from where functions often jump.
 """
 
 import difflib
@@ -32,21 +32,22 @@ from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import MOST_COORDINATES, Problem, shipped
 from ocp_torch.problems.simulator.simulator import Simulator
 
-# Sizes of the batches that shapes are checked with: none a likely d or m, and one a single state.
+# Sizes of the batches that shapes are checked with: 7 and 37 are no likely d or m, 1 is a single state.
 SIZES = (7, 1, 37, 2)
 SET_BY_INIT = ("dim", "control_dim", "discount", "exponent", "control_cost")
-# Methods that users write, and how alike the name of another must be to be taken for one of them, by `difflib`: drfit for
-# drift is 0.8.
+# Methods that users write of systems and of problems on the torus.
 OF_SYSTEMS = ("cost", "dynamics", "disturbance")
 OF_PROBLEMS = ("state_cost", "drift", "control_matrix", "noise", "initial_density")
+# Similarity by `difflib` from which on a method counts as a misspelled one of these: drfit for drift is 0.8.
 ALIKE = 0.8
 DECLARED = ("state_cost_bound", "occupation_bound", "control_bound", "value_bound", "exact_optimum")
-# Turns of a state round the torus within 1 / discount, and the square of those that noise spreads it over. Paths are
-# simulated in steps of a fraction of a turn, which are halved: for 300 turns 15,000 and 31,000 of them took two minutes on a
-# slow machine, and up to 245,000 may follow.
-MOST_TURNS, MOST_SPREAD = 1e3, 1e4
-# States at which typical speeds are taken, and the number of their fixed design.
-SPEED_STATES, SPEED_DESIGN = 64, 13
+# Turns of a state round the torus within 1 / discount. Paths are simulated in steps of a fraction of a turn, which are
+# halved: for 300 turns 15,000 and 31,000 steps took two minutes.
+MOST_TURNS = 1e3
+# The square of the turns that noise may spread a state over in that time.
+MOST_SPREAD = 1e4
+SPEED_STATES = 64  # at which typical speeds are taken
+SPEED_DESIGN = 13  # the number of their fixed design
 
 
 def check_once(problem: Problem) -> None:
@@ -92,7 +93,7 @@ def require_system(functions: SystemFunctions) -> None:
 
 
 def _require_functions(functions: Functions) -> Answers:
-    """They are functions of the state, of the right shapes; and what was first answered."""
+    """Raise where the functions have wrong shapes or depend on more than the state; their first answers."""
     _require_forms(functions, list(functions.data))
     first = require_purity(functions)
     if not functions.simulator:  # before the divergences, which autograd makes of these
@@ -111,7 +112,7 @@ def _require_forms(functions: Functions, names: list[str]) -> None:
 
 
 def require_made(problem: Problem) -> None:
-    """What `Problem.__init__` sets is there, and still what it was."""
+    """Raise where something that `Problem.__init__` sets is missing, or was changed afterwards."""
     missing = [name for name in SET_BY_INIT if not _has(problem, name)]
     if missing:
         call = "coordinates, controls, .." if isinstance(problem, System) else "dim=.."
@@ -143,8 +144,8 @@ def require_made(problem: Problem) -> None:
 
 
 def require_spelling(problem: Problem) -> None:
-    """No method is called almost like one that users write and this class does not, unless the class itself asks for it:
-    nothing would call it."""
+    """Raise where a method's name is almost that of one which users write and this class lacks: nothing would call it.
+    Methods that the class itself uses are left alone."""
     members = [member for kind in type(problem).__mro__ if not shipped(kind) for member in vars(kind).items()]
     own = {name for name, value in members if inspect.isfunction(value)}
     functions = [inspect.unwrap(getattr(value, "fget", None) or value) for _, value in members]
@@ -160,14 +161,14 @@ def require_spelling(problem: Problem) -> None:
 
 
 def _asked_for(code: CodeType) -> set[str]:
-    """What ``code`` asks for by name, in functions within it too."""
+    """All names that ``code``, and the functions within it, look up."""
     return {*code.co_names}.union(*(_asked_for(inner) for inner in code.co_consts if isinstance(inner, CodeType)))
 
 
 def require_units(problem: Problem) -> None:
-    """Units of cost and time in which a state can be followed for the time that counts."""
+    """Raise where units of cost and time make a state move too far within 1 / discount to be simulated."""
     x, f, a, B = problem.probe(SPEED_STATES, SPEED_DESIGN, "x", "f", "a", "B")
-    # A control that costs as much as the state cost varies.
+    # A typical control: it costs as much as the state cost varies.
     u = (problem.exponent * float(f.std())) ** (1.0 / problem.exponent)
     each = torch.as_tensor(problem.control_cost.sides).clamp_max(u).to(B)
     drift, push = float(a.norm(dim=-1).mean()), float((B * each).flatten(1).norm(dim=-1).mean())
@@ -194,5 +195,5 @@ def require_units(problem: Problem) -> None:
 def _has(problem: Problem, name: str) -> bool:
     try:
         return getattr(problem, name, None) is not None
-    except Exception:  # a property of a user's own that leans on what is missing
+    except Exception:  # a user's own property may need what is missing
         return False

@@ -11,30 +11,33 @@ from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.problems.blame import failing_state, named, origin, place, words
 from ocp_torch.problems.problem import Problem
 
-# Shape of the answer beyond N, in the letters of the documentation.
+# Function -> shape of its answer beyond N, in the letters of the documentation.
 DATA = {"state_cost": "", "drift": "d", "control_matrix": "dm", "initial_density": ""}
 DIVERGENCES = {"drift_divergence": "", "control_divergence": "m"}
 TRUTH = {"exact_value": "", "exact_control": "m", "exact_occupation": ""}
 FORMS = {**DATA, **DIVERGENCES, **TRUTH}
-# Beside these where there is noise, of `k` Brownian motions: `sigma`, and the two that `noise_divergences` gives.
-NOISE, DIV_D, DIV_DIV_D = "noise", "noise_divergences[0]", "noise_divergences[1]"
+NOISE = "noise"  # sigma, of `k` Brownian motions, where there is noise
+# Names for the two answers of `noise_divergences`.
+DIV_D = "noise_divergences[0]"
+DIV_DIV_D = "noise_divergences[1]"
 SPREAD = {DIV_D: "d", DIV_DIV_D: ""}
-# States at which everything must be finite; fewer where a matrix `B` for each would fill the memory, or each is a simulation,
-# and some in any case.
-STATES, MOST_ENTRIES, STATES_OF_A_SIMULATOR, FEWEST_STATES = 4096, 2**22, 512, 16
-# Denominator of the states that are compared a period apart: odd multiples of 1 / 2^17 lie on no grid of cells, and stay
-# what they are, in single precision too, when a few periods are added.
+STATES = 4096  # at which everything must be finite
+STATES_OF_A_SIMULATOR = 512  # instead, where each state may cost milliseconds
+MOST_ENTRIES = 2**22  # of `B` at all of these states, which bounds the memory
+FEWEST_STATES = 16  # however large `B` is
+# States that are compared a period apart are odd multiples of 1 / 2^17: on no grid of cells, and unchanged to the bit, in
+# single precision too, when a few periods are added.
 GRID = 2**17
-# States of a check are a fixed design, the same for every problem and run: its number is this plus that of the check.
+# Each check has a fixed design of states, the same for every problem and run: this plus the check's own number.
 FIRST_DESIGN = 11
 
 
 class Functions:
     """The functions of ``problem`` by name; ``simulator`` where each state may cost milliseconds.
 
-    ``name`` is the class as a command line has it, ``count`` the number of states for checks that need many, ``forms`` the
-    shapes of all there are and ``data`` of those that must be there; ``cost`` and ``density`` are the names of what is not
-    negative and ``sigma`` that of the noise, ``where`` says where all of it is finite.
+    ``name`` is the class as a command line has it, ``count`` the number of states for checks that need many. ``forms`` has
+    the shapes of all functions, ``data`` those of the functions that must give a tensor. ``cost`` and ``density`` name the
+    functions that must not be negative, ``sigma`` the noise; ``where`` says where all of them must be finite.
     """
 
     cost, density, sigma = "state_cost", "initial_density", NOISE
@@ -53,7 +56,7 @@ class Functions:
         if self.noisy:
             self.sizes["k"] = max(1, *first.shape[2:3]) if isinstance(first, Tensor) and first.ndim == 3 else 1
             self.data = {**self.own_data, self.sigma: "dk"}
-            # Those of a simulator are differences of its own.
+            # The divergences of a simulator's noise are differences already: there is nothing to compare.
             self.forms = {**self.own_forms, **self.data, **({} if simulator else self.spread)}
 
     def place(self, x: Tensor) -> str:
@@ -66,11 +69,11 @@ class Functions:
         return scrambled_sobol(count, self.problem.dim, FIRST_DESIGN + design, torch.float64)
 
     def exact_states(self, count: int, design: int) -> Tensor:
-        """States that survive both precisions and a few periods to the bit (see `GRID`), ``(count, d)``."""
+        """States ``(count, d)`` that are the same to the bit in both precisions, and after a few periods (see `GRID`)."""
         return ((self.states(count, design) * (GRID // 2)).floor() * 2.0 + 1.0) / GRID
 
     def require_silence(self, x: Tensor) -> None:
-        """Where there is no noise at some states there is none at ``x``."""
+        """Raise where the noise is `None` at some states and given at ``x``."""
         if not self.noisy and self.called(self.function(self.sigma), x.clone(), self.sigma) is not None:
             raise ProblemError(
                 f"{self.sigma} of {self.name} gives None for some states and a matrix for others; it must give None always, "
@@ -78,13 +81,13 @@ class Functions:
             )
 
     def ask(self, name: str, x: Tensor) -> Tensor:
-        """As `given`, of a function that must give a tensor."""
+        """`given` for a function that must give a tensor."""
         answer = self.given(name, x)
         assert answer is not None
         return answer
 
     def given(self, name: str, x: Tensor) -> Tensor | None:
-        """What the function ``name`` gives at ``x`` ``(N, d)``; `None` only where it may.
+        """What the function ``name`` gives at ``x`` ``(N, d)``; `None` only from a function that may give it.
 
         Raises `ProblemError` where it raises, changes ``x``, or gives another type, shape, precision or device.
         """
@@ -114,7 +117,7 @@ class Functions:
         return pair
 
     def called(self, function: Callable, x: Tensor, name: str):
-        """What ``function``, the one called ``name``, gives at ``x``; whatever it raises as one sentence."""
+        """What ``function``, called ``name``, gives at ``x``; whatever it raises becomes a `ProblemError` of one sentence."""
         try:
             return function(x)
         except InputError:

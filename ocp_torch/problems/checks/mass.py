@@ -16,22 +16,25 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.simulator import Simulator
 
 Density = Callable[[Tensor], Tensor]
-# Where densities peak ``(K, d)``, the half-widths of the peaks along each coordinate ``(K, d)``, and their heights ``(K,)``.
+# Places of a density's peaks ``(K, d)``, their half-widths along each coordinate ``(K, d)``, and their heights ``(K,)``.
 Peaks = tuple[Tensor, Tensor, Tensor]
 
-# Independent estimates, and Student's t quantile of their mean at the two-sided level 0.9999 (15 degrees of freedom).
-REPLICATES, QUANTILE = 16, 5.2391
-# A half-width of the interval that needs no closer look, and what quadrature and rounding may leave beyond it.
-CLOSE, TOLERANCE = 0.01, 1e-4
-# An interval with a half-width below this part of its value is taken to have met all of the mass; a wider one may owe it to
-# few states, and more may be missing.
+REPLICATES = 16  # independent estimates of the mass
+QUANTILE = 5.2391  # Student's t of their mean, two-sided level 0.9999, 15 degrees of freedom
+CLOSE = 0.01  # half-width of the interval below which no closer look is needed
+TOLERANCE = 1e-4  # what quadrature and rounding may leave beyond the interval
+# A half-width below this part of the value shows that no mass was missed: a wider one may owe its mass to few states.
 SETTLED = 0.5
-# Closer looks at most, peaks kept, and the part of the states of a look that stays evenly spread.
-LOOKS, PEAKS, EVEN = 4, 8, 0.3
-# A climb to a peak: random steps, the first, smallest and largest length, and what a success and a failure make of it.
-CLIMB, STEP, STEPS, GROWTH, DECAY = 120, 0.05, (1e-9, 0.3), 2.0, 0.8
-# Half-widths of a peak that are told apart: 2^-1 to 2^-NARROWEST. From BROAD on, a peak counts as flat along a coordinate.
-NARROWEST, BROAD = 30, 0.5
+LOOKS = 4  # closer looks, at most
+PEAKS = 8  # peaks kept
+EVEN = 0.3  # part of the states of a closer look that stays evenly spread
+CLIMB = 120  # random steps of a climb to a peak
+FIRST_STEP = 0.05  # length of the first, in turns
+STEP_RANGE = (1e-9, 0.3)  # of the lengths of all steps
+GROWTH = 2.0  # of the length after a step up
+DECAY = 0.8  # of the length after any other step
+NARROWEST = 30  # half-widths 2^-1 to 2^-NARROWEST of a peak are told apart
+BROAD = 0.5  # half-width from which on a peak counts as flat along a coordinate
 
 
 @dataclass(frozen=True)
@@ -44,18 +47,18 @@ class Mass:
 
     @property
     def wrong(self) -> bool:
-        """Whether it is certainly not 1. What was not met can only add mass: a value below 1 must be a settled one."""
+        """Whether the mass is certainly not 1. A missed peak can only add mass, so that a value below 1 must be settled."""
         settled = self.half <= SETTLED * self.value
         return self.value - self.half > 1.0 + TOLERANCE or (settled and self.value + self.half < 1.0 - TOLERANCE)
 
     @property
     def right(self) -> bool:
-        """Whether it is 1 as closely as needs be."""
+        """Whether the mass is 1 as closely as the check needs."""
         return self.half <= CLOSE and abs(self.value - 1.0) <= self.half + TOLERANCE
 
     @property
     def above(self) -> bool:
-        """Whether it is certainly more than 1 and known so closely that another look need not do as well."""
+        """Whether the mass is certainly above 1, and known closely enough to end the looks."""
         return self.half <= CLOSE and self.value - self.half > 1.0 + TOLERANCE
 
     @property
@@ -79,10 +82,9 @@ def require_mass(functions: Functions) -> None:
 
 
 def sampled_mass(density: Density, dim: int, count: int) -> Mass:
-    """The integral of ``density`` ``(N, d) -> (N,)`` over the torus.
+    """The integral of ``density`` ``(N, d) -> (N,)`` over the torus, from ``REPLICATES * count`` evenly spread states.
 
-    From ``REPLICATES * count`` evenly spread states and, where these do not settle it, from as many near its peaks, up to
-    `LOOKS` times: importance sampling from a mixture fitted to the peaks.
+    Where these do not settle it, up to `LOOKS` times as many are drawn from a mixture fitted to the peaks that were found.
     """
     sets = [scrambled_sobol(count, dim, derive_seed(0, Branch.MASS, r), torch.float64) for r in range(REPLICATES)]
     x = torch.cat(sets)
@@ -109,16 +111,16 @@ def _estimate(share: Tensor, states: int) -> Mass:
 
 
 def _climbed(density: Density, x: Tensor, share: Tensor) -> tuple[Peaks, int]:
-    """Peaks climbed to from the states with the largest ``share``, and how many states that took."""
+    """Peaks reached by random climbs from the states with the largest ``share``, and how many evaluations that took."""
     at = x[share.topk(PEAKS).indices].clone()
-    height, step = density(at), torch.full((PEAKS, 1), STEP, dtype=torch.float64)
+    height, step = density(at), torch.full((PEAKS, 1), FIRST_STEP, dtype=torch.float64)
     generator = fixed_generator()
     for _ in range(CLIMB):
         there = (at + step * torch.randn(at.shape, dtype=torch.float64, generator=generator)).remainder(1.0)
         reached = density(there)
         better = (reached > height).unsqueeze(-1)
         at, height = torch.where(better, there, at), torch.maximum(height, reached)
-        step = (step * torch.where(better, GROWTH, DECAY)).clamp(*STEPS)
+        step = (step * torch.where(better, GROWTH, DECAY)).clamp(*STEP_RANGE)
     distances = 2.0 ** -torch.arange(1, NARROWEST + 1, dtype=torch.float64)
     widths = torch.full_like(at, 1.0)
     for i in range(at.shape[1]):
@@ -131,7 +133,7 @@ def _climbed(density: Density, x: Tensor, share: Tensor) -> tuple[Peaks, int]:
 
 
 def _distinct(at: Tensor, widths: Tensor, heights: Tensor) -> Peaks:
-    """The highest of them, one of each that lie within a width of one another."""
+    """The highest peaks, one of each group that lies within a width of one another, at most `PEAKS`."""
     kept: list[int] = []
     for k in heights.argsort(descending=True).tolist():
         away = ((at[kept] - at[k] + 0.5).remainder(1.0) - 0.5).abs() > widths[kept]
@@ -142,7 +144,7 @@ def _distinct(at: Tensor, widths: Tensor, heights: Tensor) -> Peaks:
 
 
 def _drawn(peaks: Peaks, count: int, generator: torch.Generator) -> Tensor:
-    """States of the mixture `_density`: even ones, and around each peak wrapped Cauchy ones, coordinate by coordinate."""
+    """``count`` states ``(count, d)`` of the mixture `_density`: uniform ones, and wrapped Cauchy draws around each peak."""
     centres, widths, _ = peaks
     draw = lambda *shape: torch.rand(*shape, dtype=torch.float64, generator=generator)
     which = torch.randint(len(centres), (count,), generator=generator)
@@ -153,11 +155,13 @@ def _drawn(peaks: Peaks, count: int, generator: torch.Generator) -> Tensor:
 
 
 def _density(x: Tensor, peaks: Peaks) -> Tensor:
-    """Of the mixture, ``(N,)``: sinh g / (cosh g - cos 2 pi t) with g = 2 pi width is the wrapped Cauchy density."""
+    """The density of the mixture that `_drawn` draws from, ``(N,)``.
+
+    A wrapped Cauchy density is sinh g / (cosh g - cos 2 pi t) with g = 2 pi width."""
     total = torch.zeros_like(x[:, 0])
     for centre, width, _ in zip(*peaks, strict=True):
         g = 2.0 * math.pi * width
-        # cosh g - cos 2 pi t as a sum of squares, which does not cancel where both are small.
+        # cosh g - cos 2 pi t as a sum of squares, which loses no digits where both are small.
         gap = 2.0 * ((0.5 * g).sinh().square() + (math.pi * (x - centre)).sin().square())
         total += torch.where(width >= BROAD, 1.0, g.sinh() / gap).prod(dim=-1)
     return EVEN + (1.0 - EVEN) * total / len(peaks[0])

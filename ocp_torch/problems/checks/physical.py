@@ -1,4 +1,4 @@
-"""What a user writes of a system, `cost`, `dynamics` and `disturbance`, under the names and in the units he wrote it in."""
+"""Checks of what a user writes of a `System`, `cost`, `dynamics` and `disturbance`, in the user's own names and units."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,13 +12,17 @@ from ocp_torch.problems.checks.sameness import SAME, worst_of
 from ocp_torch.problems.physical.coordinates import Angle
 from ocp_torch.problems.physical.system import System
 
-COST, DRIFT, MATRIX, NOISE = "cost", "a of dynamics", "B of dynamics", "disturbance"
-# States that are compared a turn apart, and their design (see `functions.FIRST_DESIGN`).
+# Names of the functions in messages.
+COST = "cost"
+DRIFT = "a of dynamics"
+MATRIX = "B of dynamics"
+NOISE = "disturbance"
+# States that are compared a turn apart, and the number of their design (see `functions.FIRST_DESIGN`).
 TURNED, TURNED_DESIGN = 256, 8
 
 
 class SystemFunctions(Functions):
-    """The functions of a ``system`` at states of the torus, which is asked at the physical ones there."""
+    """The functions of a ``system`` in physical units, as functions of states on the torus."""
 
     cost, density, sigma = COST, "", NOISE
     own_forms = own_data = {COST: "", DRIFT: "d", MATRIX: "dm"}
@@ -58,7 +62,7 @@ class SystemFunctions(Functions):
 
 
 def require_turns(functions: SystemFunctions) -> None:
-    """The same values a whole turn of an angle away."""
+    """Raise where a function changes when an angle goes on by a whole turn."""
     system = functions.system
     s = system.from_torus(functions.states(min(TURNED, functions.count), TURNED_DESIGN))
     for i, c in enumerate(system.coordinates):

@@ -1,5 +1,5 @@
-"""A function of each state alone, with period 1: not of the other rows, nor of what was asked before, of whole turns, or of
-what another thread asks; and one that autograd may differentiate."""
+"""Checks that functions depend on each state alone, not on other rows, earlier calls or other threads; have period 1; and
+can be differentiated."""
 
 import math
 import time
@@ -13,17 +13,19 @@ from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.blame import words
 from ocp_torch.problems.checks.functions import Functions
 
-# Answers that differ by more than that part of the largest are not the same; rounding in single precision stays below.
+# Answers are the same within this part of the largest; rounding in single precision stays below.
 SAME = 1e-5
-# States of each check and their designs (see `functions.FIRST_DESIGN`), and the rows that are asked alone.
-COMPARED, DESIGN, ALONE = 37, 1, (0, 18, 36)
+# States of each check, and the numbers of their designs (see `functions.FIRST_DESIGN`).
+COMPARED, COMPARED_DESIGN = 37, 1
 DIFFERENTIATED, DIFFERENTIATED_DESIGN = 5, 2
 TURNED, TURNED_DESIGN = 256, 5
-# The whole numbers that are added to states, and how many of them a sentence shows.
-LOWEST, HIGHEST, MOST_SHOWN = -2, 3, 8
-# Batches that threads ask for side by side, the seconds for which they go on to, and the number of their design: of functions
-# that keep a state in `self` until they need it again, 19 of 20 times that all batches were asked for some answer was wrong.
-BATCHES, SECONDS, BATCHES_DESIGN = 16, 0.3, 10
+ALONE = (0, 18, 36)  # rows of the compared states that are asked alone too
+WHOLE_NUMBERS = (-2, 3)  # smallest and largest number of periods that is added to a coordinate
+MOST_SHOWN = 8  # of these numbers in a sentence
+# Batches that threads ask for side by side: of functions that keep a state in `self` until they need it again, 19 of 20 times
+# that all batches were asked for some answer was wrong.
+BATCHES, BATCHES_DESIGN = 16, 10
+SECONDS = 0.3  # for which threads go on to ask for these batches
 OTHER_ROWS = "is no function of the state alone, but changes with the other states or what was asked before"
 TWICE = "is no function of the state alone, but changes when it is asked again"
 OVERWRITES = "overwrites an answer it gave before; it must give a new tensor each time"
@@ -37,8 +39,8 @@ Answers = tuple[Tensor, dict[str, Tensor]]
 
 
 def require_purity(functions: Functions) -> Answers:
-    """Ask the same states in another order, among others and alone; what was answered first is given for `require_still`."""
-    x = functions.exact_states(COMPARED, DESIGN)
+    """Raise where answers change with the order or number of the states asked; the first answers, for `require_still`."""
+    x = functions.exact_states(COMPARED, COMPARED_DESIGN)
     kept = {name: functions.ask(name, x) for name in functions.data}
     first = {name: values.clone() for name, values in kept.items()}
     for name in reversed(functions.data):
@@ -53,7 +55,7 @@ def require_purity(functions: Functions) -> Answers:
 
 
 def require_still(functions: Functions, first: Answers) -> None:
-    """The same answers again, after some ten thousand others."""
+    """Raise where the answers ``first`` are not given again after some ten thousand other calls."""
     x, answers = first
     for name, values in answers.items():
         _require_same(functions, name, x, values, functions.ask(name, x), TWICE)
@@ -79,7 +81,7 @@ def require_concurrency(functions: Functions) -> None:
 
 
 def require_differentiable(functions: Functions) -> None:
-    """It can be called with states that need gradients, and gives them: ascents to suprema differentiate by the state."""
+    """Raise where a function cannot be differentiated by the state, as ascents to suprema do."""
     x = functions.states(DIFFERENTIATED, DIFFERENTIATED_DESIGN)
     for name in functions.data:
         function, at = functions.function(name), x.clone()
@@ -98,9 +100,10 @@ def require_differentiable(functions: Functions) -> None:
 
 
 def require_period(functions: Functions) -> None:
-    """The same values a few whole periods away, in all coordinates at once, added without rounding."""
+    """Raise where values change a few whole periods away, in all coordinates at once."""
     x = functions.exact_states(min(TURNED, functions.count), TURNED_DESIGN)
-    whole = torch.randint(LOWEST, HIGHEST + 1, x.shape, generator=fixed_generator()).to(x)
+    lowest, highest = WHOLE_NUMBERS
+    whole = torch.randint(lowest, highest + 1, x.shape, generator=fixed_generator()).to(x)
     for name in functions.data:
         here = functions.ask(name, x)
         worst, change = worst_of((here - functions.ask(name, x + whole)).abs())
@@ -118,7 +121,7 @@ def _require_same(
     """Raise where two answers at ``x`` differ, relative to the largest of ``whole`` (``one`` if left out) and ``other``."""
     whole = one if whole is None else whole
     size = float(torch.cat([whole, other]).nan_to_num(0.0, 0.0, 0.0).abs().max())
-    alike = (one == other) | (one.isnan() & other.isnan())  # what is not finite is told elsewhere
+    alike = (one == other) | (one.isnan() & other.isnan())  # `require_finite` reports these
     worst, change = worst_of(torch.where(alike, 0.0, (one - other).abs()))
     if not change <= SAME * size:
         raise ProblemError(
@@ -127,7 +130,7 @@ def _require_same(
 
 
 def worst_of(changes: Tensor) -> tuple[int, float]:
-    """The row of ``changes`` ``(N, ...)`` that holds the largest of them or a NaN, and that number."""
+    """The row of ``changes`` ``(N, ...)`` with the largest entry or a NaN, and that number."""
     change = changes.reshape(len(changes), -1).amax(dim=-1)
     worst = int(change.nan_to_num(nan=math.inf).argmax())
     return worst, float(change[worst])

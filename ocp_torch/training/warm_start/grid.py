@@ -19,7 +19,7 @@ from ocp_torch.problems import Problem
 from ocp_torch.problems.simulator.simulator import Simulator
 from ocp_torch.training.warm_start.targets import Targets
 
-# On a limited pendulum (discount 0.5) a controller from this grid costs 2.974, one from trajectories 3.06 after twice the time.
+# On a limited pendulum (discount 0.5) a controller from this grid costs 2.974, one from trajectories 3.06 in twice the time.
 DIM = 2
 SIDE = 192  # nodes along each coordinate
 CONTROLS = 17  # tried at each node, from one limit to the other

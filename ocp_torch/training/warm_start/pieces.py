@@ -25,8 +25,8 @@ CONTINUED_PART = 0.5  # where earlier pieces ended
 RESTING_PART = (
     0.125  # about a state of rest, if any: without these a pendubot leaned by 22 degrees for ever (not tuned)
 )
-# Values of the quadratic `V` at starts about a state of rest, in units of `V`: from next to nothing to a standard deviation of
-# the cost (not tuned).
+# Values of the quadratic `V` at starts about a state of rest, in units of `V`, from next to nothing to a standard deviation
+# of the cost (not tuned).
 RISES = (0.1, 100.0)
 LEAST_CURVATURE = (
     1e-6  # of the quadratic `V`, as a part of its largest, along directions in which it is as good as flat
