@@ -1,4 +1,4 @@
-"""Between states in physical units and on the torus, and the cut-off that closes an interval to a circle."""
+"""The map between physical states and states of the torus, and the cut-off that closes an interval to a circle."""
 
 import torch
 from torch import Tensor
@@ -8,22 +8,26 @@ from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.problems.physical.coordinates import Coordinate, Interval
 from ocp_torch.problems.placed import Placed
 
-# Coordinates of a state that a sentence shows, and the part of a turn by which rounding may carry a state beyond a seam.
-MOST_SHOWN, ROUNDING = 8, 1e-6
-# The number of the design of states spread over a box, and how many corners of it are among them at most.
-DESIGN, MOST_CORNERS = 31, 2**12
+# Coordinates of a state that a sentence shows.
+MOST_SHOWN = 8
+# Rounding may carry a state beyond a seam by this part of a turn, or beyond the box by this part of its half-width.
+ROUNDING = 1e-6
+# Number of the fixed design of states spread over a box.
+DESIGN = 31
+# Corners of a box are added to these states where there are no more than this.
+MOST_CORNERS = 2**12
 
 
 def smooth_step(z: Tensor) -> Tensor:
-    """From 1 at `z <= 0` to 0 at `z >= 1`, twice differentiable: `t^3 (10 - 15 t + 6 t^2)` of `t = 1 - z`, a form in which
-    rounding makes no density negative."""
+    """A twice differentiable step from 1 at `z <= 0` to 0 at `z >= 1`: `t^3 (10 - 15 t + 6 t^2)` with `t = 1 - z`, a form in
+    which rounding makes no density negative."""
     t = 1.0 - z.clamp(0.0, 1.0)
     return (t**3 * (10.0 - 15.0 * t + 6.0 * t**2)).clamp_max(1.0)
 
 
 class Chart(Placed):
-    """`x_i = (s_i - centre_i) / length_i` mod 1, of ``coordinates``; an interval's seam is at `x_i = 1/2`. States are shown
-    from ``start``, in turns, on."""
+    """The map `x_i = (s_i - centre_i) / length_i` mod 1 of ``coordinates``; an interval's seam is at `x_i = 1/2`. Physical
+    states begin at ``start``, in turns from the centre."""
 
     def __init__(self, coordinates: tuple[Coordinate, ...]) -> None:
         self.coordinates = coordinates
@@ -58,7 +62,7 @@ class Chart(Placed):
         return turns.remainder(1.0)
 
     def clipped(self, s: Tensor) -> Tensor:
-        """`to_torus`, but what is beyond a seam is taken at it."""
+        """`to_torus`, with coordinates beyond a seam moved to it."""
         turns = self.turns(s)
         turns[:, self.boxed] = turns[:, self.boxed].clamp(-0.5, 0.5)
         return turns.remainder(1.0)
@@ -68,7 +72,7 @@ class Chart(Placed):
         return (s - self._like(s, "centre", self.centre)) / self.lengths(s)
 
     def lengths(self, like: Tensor) -> Tensor:
-        """What a turn of each coordinate is in its unit, ``(d,)``."""
+        """The length of a turn of each coordinate in its unit, ``(d,)``."""
         return self._like(like, "length", self.length)
 
     def wrapped(self, offset: Tensor) -> Tensor:
@@ -97,7 +101,7 @@ class Chart(Placed):
         return steps.prod(dim=-1), slope
 
     def _beyond(self, s: Tensor) -> Tensor:
-        """How far each interval's coordinate is between its end and the seam, 0 to 1, ``(N, K)``."""
+        """How far along each interval's coordinate is from its end (0) to the seam (1), ``(N, K)``."""
         off = self._from_centre(s).abs()
         return ((off - self._like(s, "half", self._half)) / self._like(s, "seam", self._seam)).clamp(0.0, 1.0)
 
@@ -111,13 +115,13 @@ class Chart(Placed):
         return (off > self._like(s, "half", self._half) * (1.0 + ROUNDING)).any(dim=-1)
 
     def nearest(self, s: Tensor) -> Tensor:
-        """The states of the box that are nearest to ``s`` ``(N, d)``, coordinate by coordinate."""
+        """The states of the box nearest to ``s`` ``(N, d)``, coordinate by coordinate."""
         low = [c.low if isinstance(c, Interval) else -torch.inf for c in self.coordinates]
         high = [c.high if isinstance(c, Interval) else torch.inf for c in self.coordinates]
         return s.clamp(s.new_tensor(low), s.new_tensor(high))
 
     def spread(self, count: int) -> Tensor:
-        """``count`` states spread over the box, and its corners where they are few, an angle there at 0 and half a period."""
+        """``count`` states spread over the box, and its corners where these are few, with angles at 0 and half a period."""
         ends = [(c.low, c.high) if isinstance(c, Interval) else (0.0, 0.5 * c.length) for c in self.coordinates]
         low, high = (torch.tensor(side, dtype=torch.float64) for side in zip(*ends, strict=True))
         turns = torch.tensor([1.0 if isinstance(c, Interval) else 2.0 for c in self.coordinates], dtype=torch.float64)

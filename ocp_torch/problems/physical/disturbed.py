@@ -1,4 +1,4 @@
-r"""Noise in physical units, and what it is on the torus: cut off at the seams as all motion is."""
+r"""Noise in physical units, and the noise on the torus that it makes, cut off at the seams like all motion."""
 
 import torch
 from torch import Tensor
@@ -9,18 +9,18 @@ from ocp_torch.problems.problem import Problem
 
 
 class Disturbed(Problem):
-    """A problem with a ``chart``, whose noise is that of `disturbance`, or constant columns that `disturb` was given."""
+    """A problem with a ``chart``, whose noise comes from `disturbance` or from constant columns given to `disturb`."""
 
     chart: Chart
     _columns: Tensor | None = None
 
     def disturbance(self, s: Tensor) -> Tensor | None:
-        """`sigma`, ``(N, d, k)``, units of the coordinates per square root of the unit of time; `None` for no noise: 0
-        counts as some. By default what `disturb` was given where there is a box."""
+        """`sigma`, ``(N, d, k)``, units of the coordinates per square root of the unit of time; `None`, not 0, for no noise.
+        By default the columns given to `disturb` where there is a box."""
         return None if self._columns is None else self._like(s, "columns", self._columns).expand(len(s), -1, -1)
 
     def disturb(self, columns: Tensor) -> None:
-        """Noise ``columns`` ``(d, k)`` that are the same everywhere in the box, as `disturbance` has them; for `__init__`."""
+        """Add noise ``columns`` ``(d, k)``, constant in the box and in the units of `disturbance`; for `__init__` alone."""
         columns = columns.double()[:, columns.any(dim=0)]
         if not self.chart.boxed:  # on the torus it is the same everywhere too
             self.add_noise(columns / self.chart.length.unsqueeze(-1))
@@ -33,7 +33,7 @@ class Disturbed(Problem):
         return type(self).disturbance is Disturbed.disturbance
 
     def _disturbance_at(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Physical states, and `disturbance` there; neither is asked for where there is none."""
+        """Physical states and `disturbance` there; ``x`` and `None` where there is no disturbance."""
         quiet = self._constant and self._columns is None
         s = x if quiet else self.chart.from_torus(x)
         return s, None if quiet else self.disturbance(s)
@@ -47,7 +47,8 @@ class Disturbed(Problem):
         return sigma if even is None else torch.cat([even, sigma], dim=-1)
 
     def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
-        """Of `D_ij = chi^2 E_ij / (length_i length_j)` with `E = sigma sigma^T / 2` of `disturbance`, by the product rule."""
+        """`div D` ``(N, d)`` and `div div D` ``(N,)`` by the product rule, for `D_ij = chi^2 E_ij / (length_i length_j)` with
+        `E = sigma sigma^T / 2` of `disturbance`."""
         zero, (s, sigma) = (torch.zeros_like(x), torch.zeros_like(x[:, 0])), self._disturbance_at(x)
         if sigma is None:
             return zero

@@ -1,4 +1,4 @@
-"""What states and controls of a problem are called and measured in, in words that a file can hold."""
+"""Names and units of states and controls, in a form that a file can hold."""
 
 from dataclasses import asdict, dataclass
 
@@ -15,7 +15,7 @@ from ocp_torch.problems.physical.coordinates import (
 
 @dataclass(frozen=True)
 class Measures:
-    """The ``coordinates``, the ``controls``, and as ``scales`` what one unit of each is as a control of the torus problem."""
+    """The ``coordinates``, the ``controls``, and in ``scales`` one unit of each control as a control of the torus problem."""
 
     coordinates: tuple[Coordinate, ...]
     controls: tuple[Control, ...]
@@ -23,21 +23,21 @@ class Measures:
 
     @property
     def plain(self) -> dict:
-        """As JSON can hold them."""
+        """All measures as data for JSON."""
         given = [{k: v for k, v in asdict(c).items() if v is not None} for c in self.coordinates]
         controls = [{**asdict(c), "scale": scale} for c, scale in zip(self.controls, self.scales, strict=True)]
         return {"coordinates": given, "controls": controls}
 
     @property
     def text(self) -> str:
-        """As a line to be read."""
+        """All measures as a line of text."""
         coordinates, controls = (", ".join(c.label for c in group) for group in (self.coordinates, self.controls))
         return f"coordinates: {coordinates}; controls: {controls}"
 
     @classmethod
     def of(cls, plain: dict, dim: int, control_dim: int) -> "Measures":
-        """Those that ``plain``, of a stranger's file, describes; `ValueError`, `KeyError`, `TypeError` or `AttributeError`
-        unless it does so for ``dim`` coordinates and ``control_dim`` controls."""
+        """The measures that ``plain``, from an untrusted file, describes. Raises `ValueError`, `KeyError`, `TypeError` or
+        `AttributeError` unless it describes ``dim`` coordinates and ``control_dim`` controls."""
         rows, others = plain["coordinates"], plain["controls"]
         if (len(rows), len(others)) != (dim, control_dim):
             raise InputError(f"it names {len(rows)} coordinates and {len(others)} controls of {dim} and {control_dim}")

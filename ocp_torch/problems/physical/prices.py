@@ -1,4 +1,4 @@
-"""The price and the limits of physical controls, as those of the controls of the torus problem, `v_i = r_i^{1/q} u_i`."""
+"""Prices and limits of physical controls `u`, converted to the controls `v_i = r_i^{1/q} u_i` of the torus problem."""
 
 import math
 from collections.abc import Sequence
@@ -8,12 +8,12 @@ from ocp_torch.problems.constant_noise import one_or_each
 
 
 def positive_each(name: str, value: object, count: int) -> list[float]:
-    """``value`` of the field ``name``, one number above 0 or ``count`` of them, as a list."""
+    """``value`` of the field ``name``, one number above 0 or ``count`` of them, as a list of ``count``; else `InputError`."""
     return [require_number(name, one, above=0.0) for one in one_or_each(name, value, count)]
 
 
 def weight_roots(weight: object, count: int, exponent: float) -> list[float]:
-    """`r_i^{1/q}` of each control."""
+    """`r_i^{1/q}` of each of ``count`` controls; `InputError` for weights that differ where `q` is not 2."""
     each = positive_each("problem.control_weight", weight, count)
     if exponent != 2.0 and min(each) != max(each):
         raise InputError(
@@ -24,7 +24,7 @@ def weight_roots(weight: object, count: int, exponent: float) -> list[float]:
 
 
 def scaled_limit(limit: object, roots: list[float]):
-    """``limit``, of `u`, as one of `v = roots u`."""
+    """The ``limit`` on `u` as a limit on `v = roots u`; `InputError` for one number where the roots differ."""
     if limit is None:
         return None
     if isinstance(limit, Sequence) and not isinstance(limit, str):

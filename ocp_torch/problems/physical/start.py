@@ -19,19 +19,21 @@ from ocp_torch.problems.placed import Placed
 EDGE = 0.1
 # The integral of the kernel (1 - z^2)^3 from -1 to 1.
 KERNEL_MASS = 32.0 / 35.0
-# States for each of the estimates of a density's mass; what may be uncertain of it, and what may lie outside the box.
-STATES, UNCERTAIN, OUTSIDE = 2**13, 5e-3, 1e-3
-# Independent estimates, and Student's t quantile of their mean at the two-sided level 0.999 (7 degrees of freedom).
-REPLICATES, QUANTILE = 8, 5.4079
-# Starts in a range are drawn normally, with a deviation of that part of its half, where four of five weigh about the same; or
-# evenly where it fills at least that part of a turn.
-DEVIATION, MOST = 0.6, 0.75
+STATES = 2**13  # for each estimate of a density's mass
+REPLICATES = 8  # independent estimates
+QUANTILE = 5.4079  # Student's t of their mean, two-sided level 0.999, 7 degrees of freedom
+UNCERTAIN = 5e-3  # part of the mass that may be uncertain
+OUTSIDE = 1e-3  # mass outside the box that is allowed, as a part of that inside
+# Starts in a range are drawn normally with a deviation of this part of its half: four of five then weigh about the same.
+DEVIATION = 0.6
+# Starts in a range that fills more than this part of a turn are drawn evenly.
+EVEN_FROM = 0.75
 
 
 @dataclass(frozen=True)
 class Points:
     """Starts near ``states``, a list of physical ones: density `(1 - z^2)^3` in each coordinate up to a distance
-    of ``spread``, one number for each of them; the standard deviation is a third of it."""
+    of ``spread``, one number for each coordinate; the standard deviation is a third of it."""
 
     states: Sequence[Sequence[float]]
     spread: Sequence[float]
@@ -46,10 +48,10 @@ Start = Mapping[str, Sequence[float]] | Points | Callable[[Tensor], Tensor] | No
 
 
 def start_density(chart: Chart, start: object) -> Density:
-    """The density that ``start`` means; raises `InputError` where it means none, or has mass outside the box.
+    """The density that ``start`` describes; raises `InputError` where it describes none, or has mass outside the box.
 
-    `None` is the box, and a mapping of names to (low, high) a part of it, uniform but for smooth edges inside the ranges; or
-    `Points`; or a function of physical states that is the density up to a factor.
+    `None` is the whole box and a mapping of names to (low, high) a part of it, both uniform but for smooth edges inside the
+    ranges. `Points` are bumps; a function of physical states is the density up to a factor.
     """
     if start is None or isinstance(start, Mapping):
         return _Ranges(chart, start or {})
@@ -96,10 +98,10 @@ class _Ranges(Placed):
 
     @property
     def mixture(self) -> Mixture:
-        """A normal density over the ranges, which is flat along coordinates that fill most of a turn."""
+        """A normal density over the ranges, flat along coordinates that fill most of a turn."""
         length = self.chart.length[self.columns]
         widths = torch.full_like(self.middle, WIDEST)
-        widths[self.columns] = torch.where(2.0 * self.half > MOST * length, WIDEST, DEVIATION * self.half / length)
+        widths[self.columns] = torch.where(2.0 * self.half > EVEN_FROM * length, WIDEST, DEVIATION * self.half / length)
         return _normal(self.chart, self.middle.unsqueeze(0), widths)
 
 
@@ -124,12 +126,12 @@ class _Bumps(Placed):
 
     @property
     def mixture(self) -> Mixture:
-        """Normal densities of the deviation of the kernels, and a little more."""
+        """Normal densities a little wider than the kernels, whose standard deviation is a third of the spread."""
         return _normal(self.chart, self.states, (0.4 * self.spread / self.chart.length).clamp_max(WIDEST))
 
 
 class _Scaled:
-    """A user's function, over its integral, and brought to 0 at the ends of the box by the edges of `_Ranges`."""
+    """A user's function, normalised to mass 1 and brought to 0 at the ends of the box by the edges of `_Ranges`."""
 
     def __init__(self, chart: Chart, function: Callable[[Tensor], Tensor]) -> None:
         self.chart, self.function, self.total = chart, function, 1.0
@@ -167,7 +169,7 @@ def _normal(chart: Chart, centres: Tensor, widths: Tensor) -> Mixture:
 
 
 def _mass(chart: Chart, density: Density) -> tuple[float, float]:
-    """The integral of ``density`` over the torus, and how uncertain that is: from states drawn where it is large."""
+    """The integral of ``density`` over the torus and the half-width of its interval, from states drawn where it is large."""
     found = lambda x: chart.volume * density(chart.from_torus(x))
     fit = fitted_mixture(found, len(chart.coordinates))
     draws = (fit.draw(STATES, r, derive_seed(0, Branch.START_MASS, r)) for r in range(REPLICATES))

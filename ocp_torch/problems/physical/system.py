@@ -19,8 +19,8 @@ from ocp_torch.problems.physical.start import Density, Start, start_density
 from ocp_torch.problems.problem import VectorFields
 
 # States at which the largest cost in the box is sought.
-COSTED = 2**14
-# What one evaluation of `dynamics` gives.
+COST_STATES = 2**14
+# Methods whose answers all come from one evaluation of `dynamics`.
 TOGETHER = ("drift", "control_matrix", "drift_divergence", "control_divergence")
 
 
@@ -91,7 +91,7 @@ class System(Disturbed):
         raise InputError(f"{type(self).__name__} must define action(control), as it names an environment.")
 
     def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
-        """What is beyond a seam is taken at it."""
+        """The torus state ``(d,)`` of an observation of `gymnasium`; coordinates beyond a seam are moved to it."""
         if env != self.gymnasium:
             return super().from_observation(env, observation)
         s = np.asarray(self.observed(np.asarray(observation, dtype=np.float64)), dtype=np.float64)
@@ -116,8 +116,8 @@ class System(Disturbed):
         raise InputError(f"{type(self).__name__} must define dynamics(s), which gives a and B.")
 
     def divergences(self, s: Tensor) -> tuple[Tensor, Tensor] | None:
-        """`div a` ``(N,)`` and that of each column of `B` ``(N, m)``, of `dynamics`; `None` leaves them to autograd. For
-        those that know them, which is faster."""
+        """`div a` ``(N,)`` and that of each column of `B` ``(N, m)``, of `dynamics`; `None` leaves them to autograd. An
+        override is faster."""
         return (torch.zeros_like(s[:, 0]), s.new_zeros(len(s), self.control_dim)) if self.divergence_free else None
 
     def to_torus(self, s: Tensor) -> Tensor:
@@ -155,27 +155,27 @@ class System(Disturbed):
         return self._scaled(*self.dynamics(s), self.chart.cut(s) if self.chart.boxed else None)
 
     def _scaled(self, a: Tensor, B: Tensor, chi: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Those of `dynamics` on the torus, times `chi` ``(N,)`` where there is a box."""
+        """``a`` and ``B`` of `dynamics` on the torus, times `chi` ``(N,)`` where there is a box."""
         lengths, factor = self.chart.lengths(a), self._like(a, "factor", self._factor)
         if chi is not None:
             chi = chi.unsqueeze(-1)
             return chi / lengths * a, chi.unsqueeze(-1) * factor * B
-        # One matrix for all states stays one.
+        # A constant matrix stays an expanded view, which takes no memory for each state.
         return a / lengths, (B[:1] * factor).expand(B.shape) if B.stride(0) == 0 else B * factor
 
     def _places(self, x: Tensor) -> Tensor:
-        """`from_torus`, but for whole turns where there are only angles: functions of them are periodic."""
+        """`from_torus`, up to whole turns where there are only angles: functions of them are periodic."""
         return self.from_torus(x) if self.chart.boxed else x * self.chart.lengths(x)
 
     def vector_fields(self, x: Tensor, divergences: bool = True) -> VectorFields:
-        """From one evaluation of `dynamics`, unless a subclass has put a function of its own in the place of one of them."""
+        """`Problem.vector_fields` from one evaluation of `dynamics`, unless a subclass overrides one of its parts."""
         if any(getattr(type(self), name) is not getattr(System, name) for name in TOGETHER):
             return super().vector_fields(x, divergences)
         return self._together(x, divergences)
 
     def _together(self, x: Tensor, divergences: bool = True) -> VectorFields:
-        """From one evaluation of `dynamics`, and for divergences nobody knows a reverse pass through it for each entry that
-        varies: the lengths cancel in `d(chi a_i / length_i) / dx_i = d(chi a_i) / ds_i`, and `grad chi` is known."""
+        """`vector_fields` from one evaluation of `dynamics`, and a reverse pass through it for each entry that varies where
+        `divergences` gives none: `d(chi a_i / length_i) / dx_i = d(chi a_i) / ds_i`, and `grad chi` is known."""
         if not divergences:
             return *self._moved(x), None, None
         s, chi = self._places(x).detach(), None
@@ -222,7 +222,7 @@ class System(Disturbed):
     @cached_property
     @torch.no_grad()
     def _failure(self) -> float:
-        """What a state at a seam costs."""
+        """The cost of a state at a seam: ``failure_cost``, or the largest cost met in the box."""
         if self.failure_cost is not None:
             return self.failure_cost
-        return float(self.cost(self.chart.spread(COSTED)).max())
+        return float(self.cost(self.chart.spread(COST_STATES)).max())

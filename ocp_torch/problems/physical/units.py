@@ -4,11 +4,11 @@ import re
 
 from ocp_torch.errors import InputError, shown
 
-# SI's units of mechanics, electricity and heat, with tonnes, and others in common use; and the prefixes that those of SI may
-# have.
+# Units of mechanics, electricity and heat that may have a prefix: those of SI and a few more.
 SI = "m g t s A K mol rad Hz N Pa J W C V F Ohm S Wb T H L bar eV".split()
-OTHERS = "deg turn rev rpm min h d day wk yr kg degC % ppm dB EUR USD 1".split()
 PREFIXES = ("", *"n u m c d k M G".split())
+# Other units in common use, without prefixes.
+OTHERS = "deg turn rev rpm min h d day wk yr kg degC % ppm dB EUR USD 1".split()
 SYMBOLS = {prefix + unit for prefix in PREFIXES for unit in SI} | set(OTHERS)
 # Full turns, by the unit of an angle.
 TURN = 6.283185307179586

@@ -15,14 +15,14 @@ from ocp_torch.problems.recorded.implied import completed, same_everywhere
 from ocp_torch.problems.recorded.recording import Recording, read
 from ocp_torch.problems.samples import Samples
 
-# The part of what is not held out that evaluations during training are made on.
+# Part of the samples that are not held out on which evaluations during training are made.
 VALIDATION_PART = 0.1
-# Fewest samples of a part that anything is estimated from.
+# Fewest samples in each of the three parts.
 FEWEST = 32
 
 
 def _unknown(what: str) -> Callable[..., Tensor]:
-    """The method that refuses to give ``what``."""
+    """A method that raises `InputError`, as ``what`` is unknown between samples."""
 
     def refuse(self: Problem, x: Tensor) -> Tensor:
         raise InputError(
@@ -101,9 +101,9 @@ class Dataset(Problem):
         return self._recording
 
     def _split(self, found: Recording) -> None:
-        """The three parts, and what the file says of units."""
+        """Split the samples into three parts, and take over units and the largest cost. Raises `InputError` for too few."""
         samples, self.measures = found.samples, found.measures
-        # The largest cost among the samples, with head-room: an estimate, and the certificate calls it one.
+        # An estimate from the samples, with head-room; the certificate calls it one.
         self.state_cost_bound = MARGIN * float(samples.f.max())
         samples = completed(samples)
         count = len(samples)
@@ -120,26 +120,26 @@ class Dataset(Problem):
 
     @property
     def training(self) -> Samples:
-        """What may be learned from."""
+        """The samples to train on."""
         _ = self.recording
         return self._training
 
     @property
     def held_out(self) -> Samples:
-        """What nothing was learned from or chosen by."""
+        """The samples for the certificate alone: nothing was trained on them or chosen by them."""
         _ = self.recording
         return self._held_out
 
     @property
     def validation_view(self) -> "Dataset":
-        """The same problem with other held-out samples, for evaluations by which choices are made."""
+        """This problem with the validation samples as held-out ones, for evaluations by which choices are made."""
         _ = self.recording
         other = copy.copy(self)
         other._held_out = self._validation
         return other
 
     def samples(self, places: Tensor, divergences: bool = True) -> Samples:
-        """The training samples of the rows ``places``; a recording gives its divergences for nothing."""
+        """The training samples of the rows ``places``, with the recorded divergences whether asked for or not."""
         return self.training.take(places.to("cpu"))
 
     def probe(self, count: int, branch: int, *columns: str) -> tuple[Tensor, ...]:
@@ -150,7 +150,7 @@ class Dataset(Problem):
 
     @property
     def rows(self) -> int:
-        """How many samples there are to train on."""
+        """The number of samples to train on."""
         return len(self.training)
 
     @property

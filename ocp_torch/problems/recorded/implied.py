@@ -1,4 +1,4 @@
-"""What recorded samples say without words: divergences that are 0, and noise that is none."""
+"""What recorded samples imply: divergences of constant fields are 0, and noise that is 0 everywhere is none."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ocp_torch.problems.samples import Samples
 
-# Matrices that differ by less, relative to 1 + their size, are the same.
+# Matrices that differ by less, relative to 1 + their largest entry, are the same.
 CONSTANT = 1e-9
 
 
@@ -18,8 +18,8 @@ def same_everywhere(matrices: Tensor) -> bool:
 
 
 def completed(samples: Samples) -> Samples:
-    """``samples`` with the divergences, where not given, of no drift, of a constant `B` and of constant noise, which are 0;
-    and without noise that is 0 everywhere."""
+    """``samples`` with missing divergences set to 0 where drift is 0, `B` constant or noise constant, and without noise that
+    is 0 everywhere."""
     zero = torch.zeros_like(samples.f)
     if samples.div_a is None and not samples.a.any():
         samples = replace(samples, div_a=zero)

@@ -1,4 +1,4 @@
-"""Whether recorded columns are functions of the state: then samples that are neighbours have values that are alike."""
+"""Whether recorded columns are functions of the state: then neighbouring samples have similar values."""
 
 from pathlib import Path
 
@@ -10,18 +10,24 @@ from ocp_torch.problems.recorded.plausible import TESTED
 from ocp_torch.problems.samples import Samples
 
 COLUMNS = ("f", "a", "B", "mu0", "noise")
-# Samples whose neighbours are looked for, and so many at once; and how few that do not have the commonest value say nothing.
-ASKED, AT_ONCE, FEWEST = 2**10, 2**9, 64
-# Neighbours are near where waves of that many periods in a turn lose so much of the mean square of a difference. It is none
-# that a column loses, where that part of it is more than so many standard errors away.
-PERIODS, NEAR, PART, SURELY = 4, 0.5, 0.3, 3.0
-# Values that differ by less, relative to 1 + the largest, are the same: files may be in single precision.
+ASKED = 2**10  # samples whose nearest neighbours are looked for
+AT_ONCE = 2**9  # of these, which bounds the memory
+# Samples, and values other than the commonest, below which nothing is said.
+FEWEST = 64
+# Nearest neighbours are near enough for the test if waves of so many periods in a turn have, between them, at most the part
+# 1 - NEAR of the mean square difference of any two samples.
+PERIODS = 4
+NEAR = 0.5
+# A column has nothing to do with the state if the mean square difference of its ranks is less than this part smaller between
+# neighbours than between any two samples, by so many standard errors.
+PART = 0.3
+STANDARD_ERRORS = 3.0
+# A column whose values differ by less, relative to 1 + the largest, is constant: files may be in single precision.
 CONSTANT = 1e-5
 
 
 def neighbour_notes(path: Path, samples: Samples) -> tuple[str, ...]:
-    """What a user should be told of columns in ``path`` in which neighbours are hardly more alike than any two of
-    ``samples``."""
+    """A sentence for each column of ``path`` in which neighbours are hardly more alike than any two of ``samples``."""
     return tuple(
         f"{name} of {path.name} has nothing to do with x by these samples, as it differs between neighbours almost as much "
         "as between any two: its rows are in another order, or it varies faster, or is noisier, than they show; bounds take "
@@ -31,7 +37,7 @@ def neighbour_notes(path: Path, samples: Samples) -> tuple[str, ...]:
 
 
 def unrelated(samples: Samples) -> list[str]:
-    """Names of such columns, with the entry where only some of them are."""
+    """Names of columns in which neighbours are hardly more alike than any two, with the entries where only some are."""
     if len(samples) < FEWEST:
         return []
     samples = samples.take(slice(None, None, max(1, len(samples) // TESTED)))
@@ -54,7 +60,7 @@ def unrelated(samples: Samples) -> list[str]:
 
 
 def _nearest(points: Tensor, rows: Tensor) -> Tensor:
-    """The row of ``points`` ``(N, k)`` that is nearest to each of ``rows`` ``(K,)`` and another."""
+    """For each of ``rows`` ``(K,)`` the nearest other row of ``points`` ``(N, k)``, ``(K,)``."""
     apart = torch.cdist(points[rows], points)
     apart[torch.arange(len(rows)), rows] = torch.inf
     return apart.argmin(dim=1)
@@ -69,7 +75,9 @@ def _strange(values: Tensor, asked: Tensor, nearest: Tensor) -> bool:
     here = ranks[asked]
     if int((here != here.mode().values).sum()) < FEWEST:
         return False
-    other = nearest[torch.randperm(len(nearest), generator=fixed_generator())]  # evenly spread states have an order
+    other = nearest[
+        torch.randperm(len(nearest), generator=fixed_generator())
+    ]  # rows may have an order: take random pairs
     any_two, beside = (here - ranks[other]).square(), (here - ranks[nearest]).square()
     lost = any_two - beside
-    return float(lost.mean()) + SURELY * float(lost.std()) / len(lost) ** 0.5 < PART * float(any_two.mean())
+    return float(lost.mean()) + STANDARD_ERRORS * float(lost.std()) / len(lost) ** 0.5 < PART * float(any_two.mean())

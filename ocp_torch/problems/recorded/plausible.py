@@ -12,17 +12,17 @@ from ocp_torch.problems.samples import Samples
 
 # Standard errors that a mean may be from what it must be: a normal variable is further off once in 5e8 times.
 SURE = 6.0
-# What is forgiven beside that, absolutely, of a mean that must be 0 or 1.
+# Absolute error of a mean that must be 0 or 1 that is allowed beside that.
 FORGIVEN = 1e-3
 # Rounding of states and costs, relative to their size: files may be in single precision.
 ROUNDING = 1e-6
-# Of more samples than that the divergences of so many at least are looked at: of all of a million in twelve coordinates it
-# took minutes.
+# Divergences of longer recordings are tested at no fewer samples than this: all of a million in twelve coordinates took
+# minutes.
 TESTED = 2**14
 
 
 def samples_of(path: Path, arrays: dict[str, np.ndarray], wrap: bool) -> Samples:
-    """The ``arrays`` of the file ``path``, of known names and shapes and finite, as samples; with ``wrap`` states are taken
+    """The finite ``arrays`` of the file ``path``, whose names and shapes were checked, as samples; ``wrap`` takes states
     modulo 1. Raises `InputError` where values cannot be what their names say."""
     x, f = arrays["x"], arrays["f"]
     outside = (x < -ROUNDING) | (x > 1.0 + ROUNDING)
@@ -49,7 +49,7 @@ def samples_of(path: Path, arrays: dict[str, np.ndarray], wrap: bool) -> Samples
 
 
 def _require_distribution(path: Path, samples: Samples, given: bool) -> None:
-    """The weighted means of what integrates to a known number: 1, `mu0`, and waves along each coordinate."""
+    """Raise where the weighted mean of a function with a known integral is off: of 1, `mu0`, divergences and plane waves."""
 
     def off(values: Tensor, truth: float) -> float:
         """Standard errors between the weighted mean and ``truth``, less `FORGIVEN`."""
@@ -72,7 +72,9 @@ def _require_distribution(path: Path, samples: Samples, given: bool) -> None:
                     f"{path}: {name} has mean {mean:.4g} over the torus, but a divergence must have mean 0."
                 )
     waves = plane_waves(samples.x.shape[1])
-    for k in waves[(waves != 0.0).sum(dim=1).argsort(stable=True)]:  # those of a single coordinate say most
+    for k in waves[
+        (waves != 0.0).sum(dim=1).argsort(stable=True)
+    ]:  # waves of a single coordinate first: they tell most
         angle = 2.0 * torch.pi * samples.x @ k
         if bool(k.any()) and max(off(angle.cos(), 0.0), off(angle.sin(), 0.0)) > SURE:
             uniform = "the uniform law; give the density of the law it was drawn from"
@@ -83,8 +85,10 @@ def _require_distribution(path: Path, samples: Samples, given: bool) -> None:
 
 
 def stray_divergences(samples: Samples) -> dict[str, str]:
-    """Columns of divergences, and of what each is not the divergence: `E[phi div F + F . grad phi] = 0` by parts, for plane
-    waves `phi`, unless some of `div F` is hidden in jumps of `F`, or in places too small for a sample to be in one."""
+    """Names of wrong divergence columns, with the field `F` that each is not the divergence of.
+
+    By parts `E[phi div F + F . grad phi] = 0` for plane waves `phi`, unless some of `div F` is in jumps of `F`, or in places
+    too small for a sample to be in one."""
     samples = samples.take(slice(None, None, max(1, len(samples) // TESTED)))
     D = None if samples.noise is None else 0.5 * samples.noise @ samples.noise.mT
     columns = {
@@ -111,7 +115,7 @@ def stray_divergences(samples: Samples) -> dict[str, str]:
 
 
 def divergence_notes(path: Path, samples: Samples) -> tuple[str, ...]:
-    """What a user should be told of the divergences in ``path``."""
+    """A sentence on each divergence in ``path`` that is wrong by its ``samples``."""
     return tuple(
         f"by these samples {name} of {path.name} is not the divergence of its {of}: one of them is in another order or unit, "
         f"or {of} jumps, or nearly so where none of them is; bounds take it as it is."

@@ -36,18 +36,18 @@ NUMBERS = ("discount", "exponent", "control_limit")
 UNITS = "units"
 KNOWN = (*REQUIRED, *OPTIONAL, *NUMBERS, UNITS)
 SUFFIXES = (".npz", ".safetensors")
-# Fewer samples say too little of their own distribution for it to be checked.
+# With fewer samples their distribution cannot be checked.
 FEWEST = 100
-# What is read into memory at most, unpacked.
+# Bytes that are read into memory at most, unpacked.
 MOST_BYTES = 2**33
-# Bytes of names and units: some two hundred for each of the most coordinates and controls there may be.
+# Bytes of names and units at most: some two hundred for each of 1024 coordinates and 1024 controls.
 MOST_UNITS = 2**19
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Samples in float64, weighted by one over the density of their law; the numbers of the file; its SHA-256; what a user
-    should be told of it; and names and units, where it has some."""
+    """Samples in float64, weighted by one over the density of their law; the numbers of the file; the SHA-256 of its arrays;
+    notes for the user; and names and units, where the file has some."""
 
     samples: Samples
     numbers: dict[str, Any]  # each a float, but a limit for each control is a list
@@ -102,7 +102,7 @@ def read(path: str | Path, wrap: bool = False) -> Recording:
 
 
 def _measures(path: Path, units: np.ndarray, dim: int, control_dim: int) -> tuple[Measures | None, tuple[str, ...]]:
-    """Names and units as they were written; or none, as they are but labels, and what is wrong with them."""
+    """Names and units of a file; or `None` and a note where they are damaged, as they are labels only."""
     try:
         if units.ndim != 1 or units.size > MOST_UNITS or not ((units >= 0) & (units < 256)).all():
             raise NotPlain("it is no text")

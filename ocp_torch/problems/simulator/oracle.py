@@ -1,4 +1,4 @@
-"""A stranger's NumPy function, asked with care: what it gives is checked, and what goes wrong is named with the state."""
+"""A user's NumPy function as an oracle: its answers are checked, and failures are reported with the state."""
 
 from collections.abc import Callable
 
@@ -10,23 +10,25 @@ from ocp_torch.errors import InputError, ProblemError, first_line, require_integ
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.problems.simulator.target import Workers, asked, resolved
 
-# Two calls may differ by so much, relative to the size of the answer, and still be a function of the state; in single
-# precision by the second number.
-SAME, SAME_IN_FLOAT32 = 1e-6, 1e-3
-# At the seam, where a coordinate passes from 1 to 0, states this far on both sides are compared: so many for each coordinate,
-# and at most so many coordinates.
-SEAM_STEP, SEAM_PROBES, MOST_SEAMS = 1e-7, 4, 32
-# What changes across the seam by more than that part of the answer's size jumps there. The size is the largest answer at so
-# many states of the whole torus: at the seam itself an odd function is nearly 0.
-SEAM_JUMP, SIZED = 1e-3, 32
+# Two answers at a state may differ by this, relative to the size of the answer: rounding.
+SAME = 1e-6
+SAME_IN_FLOAT32 = 1e-3
+# Where a coordinate passes from 1 to 0, states this far on both sides are compared.
+SEAM_STEP = 1e-7
+SEAM_PROBES = 4  # pairs of states for each coordinate
+MOST_SEAMS = 32  # coordinates that are looked at, at most
+# An answer jumps at the seam if it changes by more than this part of its size.
+SEAM_JUMP = 1e-3
+# The size is the largest answer at so many states of the whole torus too: at the seam itself an odd function is nearly 0.
+SIZE_STATES = 32
 
 
 class Oracle:
-    """The ``target`` of a `Simulator`, by name or the function itself, asked with ``workers`` processes: made only if it
-    keeps to what is said there at a few states and across the seam, and held to it whenever it is asked.
+    """The ``target`` of a `Simulator`, by name or the function itself, asked with ``workers`` processes.
 
-    ``driftless``: `None` stands for `a`; ``gives_mu0``: there is a `mu0`; ``motions``: how many columns `sigma` has, 0 for no
-    noise; ``in_float32``: `f` is in single precision.
+    `__init__` raises `InputError` unless its answers at a few states and across the seam have the form that `Simulator`
+    describes; every later answer is checked too. ``driftless``: the target gives `None` for `a`; ``gives_mu0``: it gives a
+    `mu0`; ``motions``: columns of `sigma`, 0 for no noise; ``in_float32``: `f` is in single precision.
     """
 
     def __init__(self, target: str | Callable, dim: int, control_dim: int, workers: int = 1) -> None:
@@ -47,14 +49,14 @@ class Oracle:
             self._pool = Workers(target, workers)
 
     def answers(self, at: Tensor) -> dict:
-        """All parts at float64 states ``(N, dim)`` of the unit cell, by name; those of the last batch are kept, for they are
-        asked for in turn, in a dict that takes what is worked out from them as well."""
+        """All parts at float64 states ``(N, dim)`` of the unit cell, by name. The last batch's dict is kept, as its parts are
+        asked for in turn; callers may add to it what they derive."""
         if self._kept is None or self._kept[0].shape != at.shape or not torch.equal(self._kept[0], at):
             self._kept = at, self.checked(at)
         return self._kept[1]
 
     def checked(self, at: Tensor) -> dict[str, Tensor]:
-        """As `answers`, but asked anew and not kept."""
+        """The parts of `answers`, by a new call and not kept; `ProblemError` for failures and values that are not finite."""
         x = at.numpy()
         try:
             answer = self._pool.map(x, self.one_by_one) if self._pool else asked(self._function, x, self.one_by_one)
@@ -70,7 +72,7 @@ class Oracle:
         return found
 
     def _failure(self, x: np.ndarray, error: Exception) -> str:
-        """What it raised, and the state it raises it at, found by halving the batch."""
+        """A sentence with what the target raised and a state at which it does, found by halving the batch."""
         while len(x) > 1:
             half, x = x[: len(x) // 2], x[len(x) // 2 :]
             try:
@@ -115,7 +117,8 @@ class Oracle:
         return found
 
     def _understand(self) -> None:
-        """Whether it takes batches or single states, and whether its answers depend on the state alone."""
+        """Find out whether the target takes batches or single states, and which parts it gives. Raises `InputError` where its
+        answers do not depend on the state alone."""
         x = scrambled_sobol(self._dim + 3, self._dim, 0, torch.float64)
         self.one_by_one = self._form(x.numpy())
         found = self.checked(x)
@@ -136,10 +139,10 @@ class Oracle:
                 )
 
     def _form(self, x: np.ndarray) -> bool:
-        """Whether it takes states one by one: what gives an answer of the right shape at any of the states ``x``."""
+        """Whether the target takes states one by one: the way that gives an answer of the right shape at any of ``x``."""
         complaints = []
         for one_by_one in (False, True):
-            # As many copies of a state as no coordinate has: a batch that cannot be taken for anything else.
+            # d + 3 rows, which cannot be taken for a single state: the given states, then copies of each of them.
             for batch in (x, *(np.repeat(state[None], len(x), axis=0) for state in x)):
                 self.one_by_one, answer = one_by_one, None
                 try:
@@ -149,13 +152,12 @@ class Oracle:
                 except Exception as error:  # whatever a stranger's code may raise
                     fitting = _fitting(answer, len(batch), self._dim, self._control_dim)
                     complaints.append((isinstance(error, InputError), fitting, error, one_by_one))
-        # A function of batches is not to be told that it cannot take single states, nor the other way round: the complaint
-        # is of the way in which most of what it gives is right.
+        # The complaint reported is that of the way, batches or single states, in which more of the answer is right.
         told, _, complaint, self.one_by_one = max(complaints, key=lambda c: c[:2])
         raise (complaint if told else InputError(self._failure(x, complaint))) from None
 
     def _check_the_seam(self) -> None:
-        everywhere = self.checked(scrambled_sobol(SIZED, self._dim, 0, torch.float64))
+        everywhere = self.checked(scrambled_sobol(SIZE_STATES, self._dim, 0, torch.float64))
         for i in range(min(self._dim, MOST_SEAMS)):
             after = scrambled_sobol(SEAM_PROBES, self._dim, 1 + i, torch.float64)
             before = after.clone()

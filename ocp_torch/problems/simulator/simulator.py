@@ -1,4 +1,4 @@
-"""A problem given by one plain function, somebody's simulator: a black box that is asked, and never differentiated."""
+"""A problem given by one plain function, a simulator: a black box that is evaluated, and never differentiated."""
 
 from collections import abc
 
@@ -11,7 +11,7 @@ from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.oracle import Oracle
 
-# States scanned for narrow features for each at which a bound is evaluated, where the oracle takes batches.
+# Where the oracle takes batches: states scanned for narrow features for each state at which a bound is evaluated.
 SCAN_FACTOR = 8
 
 
@@ -53,12 +53,12 @@ class Simulator(Problem):
 
     @property
     def scan_factor(self) -> int:
-        """None where each state is a call of its own."""
+        """0 where each state is a call of its own, or workers share the batch: such evaluations are dear."""
         return 0 if self._oracle.one_by_one or self.workers > 1 else SCAN_FACTOR
 
     @property
     def concurrent(self) -> bool:
-        """A stranger's function may keep a state of its own."""
+        """False: the function may keep a state of its own."""
         return False
 
     @property
@@ -74,7 +74,7 @@ class Simulator(Problem):
         return self.diffusion is not None or self._oracle.motions > 0
 
     def _part(self, name: str, x: Tensor) -> Tensor:
-        """One part of the answers; without differences an ascent follows the networks alone."""
+        """The part ``name`` of the answers; without differences it has derivative 0, so that ascents follow the networks."""
         answer = lambda at: self._oracle.answers(_unit_cell(at))[name].to(at)
         return Differenced.apply(x, answer, self._step, self.differences)
 

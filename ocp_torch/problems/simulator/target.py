@@ -1,4 +1,4 @@
-"""Somebody's function: found by its name, and asked for a batch of states at once, one by one, or by several processes."""
+"""A user's function: found by its name, and called for a whole batch of states, one by one, or by several processes."""
 
 import importlib
 import importlib.util
@@ -19,13 +19,13 @@ from ocp_torch.errors import InputError, nearest
 from ocp_torch.files.reading import kind, require_file
 from ocp_torch.problems.simulator import worker
 
-# Seconds that a process has to end by itself, so that a simulator can put its things away, before it is ended.
+# Seconds that a process has to end by itself, so that a simulator can clean up, before it is killed.
 PATIENCE = 2.0
 DIED = "a process of problem.workers died; try problem.workers=1 to see why."
 
 
 def resolved(target: str, field: str = "problem.target") -> Callable:
-    """The function that module:function or FILE.py:function names; ``field`` is where it was asked for."""
+    """The function that module:function or FILE.py:function names; ``field`` names the setting in the `InputError`."""
     source, _, name = target.rpartition(":")
     if not source or not name:
         raise InputError(f"{field} is {target!r}, but must be module:function or FILE.py:function.")
@@ -53,7 +53,7 @@ def resolved(target: str, field: str = "problem.target") -> Callable:
 
 
 def asked(function: Callable, x: np.ndarray, one_by_one: bool):
-    """``function`` at ``x`` ``(N, d)``, at all of them at once or one by one."""
+    """``function`` at the states ``x`` ``(N, d)``, all at once or one by one."""
     try:
         if not one_by_one:
             return function(x.copy())
@@ -63,7 +63,7 @@ def asked(function: Callable, x: np.ndarray, one_by_one: bool):
 
 
 def joined(answers: list, join: Callable):
-    """The ``answers`` at parts of the states as one: each of their columns by ``join``, `None` where there is none."""
+    """The ``answers`` at parts of the states as one answer: each column put together by ``join``, `None` where one is."""
     if not all(isinstance(answer, tuple | list) for answer in answers):
         return answers[0]
     columns = zip(*answers, strict=True)
@@ -97,7 +97,7 @@ class Workers:
             self.close()
             raise InputError(DIED) from None
         except BaseException:
-            self.close()  # answers on their way are to nobody's question
+            self.close()  # else the next `map` would read the answers that are still on their way
             raise
         for good, answer in found:
             if not good:
@@ -105,7 +105,7 @@ class Workers:
         return joined([answer for _, answer in found], np.concatenate)
 
     def _start(self) -> None:
-        # Closed by whatever end this process meets; children get the reading end alone.
+        # However this process ends, its end of the pipe closes; children get the reading end alone.
         lifeline, held = os.pipe()
         self._end = weakref.finalize(self, _dismiss, self._team, held)
         before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))

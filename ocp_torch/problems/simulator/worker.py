@@ -1,6 +1,6 @@
-"""The program of one process of `Workers`, run as a file of its own: it answers what its parent asks, and ends with it.
+"""The program of one process of `Workers`, run as a file of its own: it answers its parent's requests, and ends with it.
 
-Nothing of the package is imported before the watch stands, so that no moment of a start outlives the parent.
+The package is imported only once the parent is watched, so that even a process that is starting ends with its parent.
 """
 
 import ctypes
@@ -11,7 +11,7 @@ import threading
 
 # What the C library calls it: `prctl(PR_SET_PDEATHSIG, ...)`.
 PR_SET_PDEATHSIG = 1
-# What a pipe raises when the parent is gone, or wants no more.
+# Exceptions of a pipe whose other end, the parent's, is closed.
 GONE = (EOFError, BrokenPipeError, ConnectionResetError)
 
 
@@ -34,8 +34,8 @@ def end_with_parent(lifeline: int, parent: int, mortal: bool) -> None:
 
 
 def heed_the_parent_alone() -> None:
-    """Ctrl-C and a scheduler's SIGTERM reach all processes of a run, but what to do then is the parent's to say; by handlers,
-    since an ignored or blocked signal would stay so in the programs that a simulator starts."""
+    """Leave Ctrl-C and a scheduler's SIGTERM, which reach all processes of a run, to the parent. By handlers: an ignored or
+    blocked signal would stay so in the programs that a simulator starts."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: None)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
@@ -64,7 +64,7 @@ def serve(connection) -> None:
 
 
 if __name__ == "__main__":
-    sys.path.pop(0)  # this file's folder, whose names are nobody's
+    sys.path.pop(0)  # this file's folder, whose modules must not be imported by name
     requests, lifeline, parent, mortal = map(int, sys.argv[1:])
     end_with_parent(lifeline, parent, bool(mortal))
     heed_the_parent_alone()
