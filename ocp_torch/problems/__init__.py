@@ -23,7 +23,7 @@ from ocp_torch.problems.systems.robot import RobotArm
 from ocp_torch.problems.systems.satellite import Satellite
 from ocp_torch.problems.systems.unicycle import Unicycle
 
-# `Simulator` is not among them: a file may not name a function to be imported.
+# Without `Simulator`: a file may not name a function to be imported.
 PROBLEMS: dict[str, type[Problem]] = {
     "circle": Circle,
     "torus": Torus,

@@ -1,4 +1,4 @@
-"""Whose fault an exception is: what came out of a user's own code becomes one sentence with the place and the state."""
+"""Tell a user's own errors from the package's: an exception from a user's code becomes one sentence with place and state."""
 
 import sys
 import sysconfig
@@ -15,22 +15,23 @@ from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
 
 PACKAGE = Path(__file__).resolve().parent.parent
-# Not a user's code: this package, its scripts, Python's own library and what was installed beside it.
+# Folders of code that is not the user's: this package, its scripts, Python's own library and installed packages.
 LIBRARIES = tuple(
     {str(PACKAGE), str(PACKAGE.parent / "scripts"), str(Path(torch.__file__).resolve().parent.parent)}
     | {sysconfig.get_paths()[key] for key in ("stdlib", "platstdlib", "purelib", "platlib")}
 )
-# What a user writes of physical states.
+# Methods of a `System` that take physical states.
 PHYSICAL = ("cost", "dynamics", "disturbance", "divergences")
-# Coordinates of a state, and signs of a message, that a sentence shows.
-MOST_SHOWN, LONGEST = 8, 300
-# States that are asked whether a failure is everybody's; where a tenth of all states fail, all eight do once in 1e8.
+MOST_SHOWN = 8  # coordinates of a state in a sentence
+LONGEST = 300  # characters of a message in a sentence
+# Other states that are tried, to see whether a function fails everywhere; where a tenth of all states fail, all eight do once
+# in 1e8 times.
 OTHERS = 8
 
 
 def blamed(error: BaseException, of: type | None = None) -> ProblemError | None:
-    """The sentence on an ``error`` that came out of a user's code, else `None`; ``of`` is the class of the problem at hand,
-    whose file is a user's wherever it lies."""
+    """A `ProblemError` for an ``error`` that a user's code raised, else `None`; the file of the class ``of``, the problem at
+    hand, counts as a user's wherever it lies."""
     if isinstance(error, InputError):
         return error if isinstance(error, ProblemError) else None
     frames = _frames(error, of)
@@ -43,7 +44,7 @@ def blamed(error: BaseException, of: type | None = None) -> ProblemError | None:
 
 
 def origin(error: BaseException, of: type | None = None) -> str:
-    """`` (my_module.py, line 7)``: where in a user's code it was raised; nothing where in none."""
+    """`` (my_module.py, line 7)``: where in a user's code ``error`` was raised; empty if in none."""
     if isinstance(error, SyntaxError) and error.filename:
         return f" ({_short(error.filename)}, line {error.lineno})"
     frames = _frames(error, of)
@@ -55,8 +56,8 @@ def _frames(error: BaseException, of: type | None) -> list[tuple[FrameType, int]
 
 
 def in_their_words(action: Callable[[], object], who: str, of: type | None = None):
-    """What ``action``, which runs a user's code, gives; whatever that raises as one sentence, about ``who`` where the place
-    is not known."""
+    """The result of ``action``, which runs a user's code; whatever it raises becomes a `ProblemError` of one sentence, about
+    ``who`` where the place is not known."""
     try:
         return action()
     except InputError:
@@ -71,7 +72,7 @@ def named(problem: object) -> str:
 
 
 def words(error: BaseException) -> str:
-    """The last line of its own traceback: kind and message, without line breaks and what a terminal would obey."""
+    """Kind and message of ``error``, as in the last line of a traceback, without line breaks and control characters."""
     text = " ".join(str(error).split()) if not isinstance(error, SyntaxError) else str(error.msg)
     text = "".join(c if c.isprintable() else "?" for c in text).rstrip(".")
     if "tensor.detach().numpy()" in text:  # PyTorch's advice would lose the derivatives
@@ -88,8 +89,8 @@ def place(x: Tensor) -> str:
 
 
 def failing_state(function: Callable[[Tensor], object], x: Tensor) -> Tensor | None:
-    """A state of ``x`` ``(N, d)`` at which ``function`` raises; `None` where it raises at each of the `OTHERS` that are asked
-    too, or at none of them alone."""
+    """A state ``(d,)`` of ``x`` ``(N, d)`` at which ``function`` raises; `None` if it raises at no single state, or at up to
+    `OTHERS` other states as well."""
 
     def raises(rows: Tensor) -> bool:
         try:
@@ -116,7 +117,7 @@ def _at(frame: FrameType, owner: object) -> str:
         return ""
     try:
         state = failing_state(function, x.detach()) if x.ndim == 2 else None
-    except Exception:  # a tensor of a transform that is over
+    except Exception:  # the tensor belonged to a transform of `torch.func` that has ended
         return ""
     if state is None:
         return ""
@@ -131,7 +132,7 @@ def _is_users(file: str, of: type | None) -> bool:
     path = file if file.startswith("<") else str(Path(file).resolve())
     if not path.startswith(LIBRARIES):
         return True
-    # Where the classes that ``of`` is made of are written.
+    # Files in which ``of`` and its base classes are written.
     modules = [sys.modules.get(c.__module__) for c in (of.__mro__ if of is not None else ())]
     own = {str(Path(f).resolve()) for f in (getattr(m, "__file__", None) for m in modules) if f}
     return path in own and not path.startswith(str(PACKAGE))

@@ -1,4 +1,4 @@
-"""A problem whose controller is fixed: an uncontrolled system, on which policy evaluation is the same mathematics."""
+"""A problem whose controller is fixed: an uncontrolled system, so that policy evaluation needs no code of its own."""
 
 from collections.abc import Callable
 
@@ -25,7 +25,7 @@ class ClosedLoop(Problem):
         return False
 
     def samples_of(self, sets: list[Samples]) -> list[Samples]:
-        """Its data at the states of ``sets``, with their weights."""
+        """The closed loop's data at the states of ``sets``, with their weights."""
         pieces = lambda s: [Samples.of(self, part.x, weight=part.weight) for part in s.split(jets.CHUNK)]
         return [Samples.concatenate(pieces(samples)) for samples in sets]
 
@@ -36,7 +36,7 @@ class ClosedLoop(Problem):
         return self.problem.velocity(x, self.policy(x))
 
     def drift_divergence(self, x: Tensor) -> Tensor | None:
-        """`div g_u = div a + (div B) . u + sum_k (d u_k along column k of B)`: one reverse pass for each of the controls."""
+        """`div g_u = div a + (div B) . u + sum_k (d u_k along column k of B)`, ``(N,)``: a reverse pass for each control."""
         return self.vector_fields(x)[2]
 
     def vector_fields(self, x: Tensor, divergences: bool = True) -> VectorFields:
@@ -48,7 +48,8 @@ class ClosedLoop(Problem):
         return f + self.problem.control_cost.cost(u), own
 
     def _controlled(self, x: Tensor, fields: VectorFields) -> tuple[Tensor, VectorFields]:
-        """The control ``(N, m)``, asked for once, and the `vector_fields`, from those of the problem."""
+        """The control ``(N, m)`` and the closed loop's `vector_fields`, from the problem's ``fields`` and one call of the
+        policy."""
         a, B, div_a, div_B = fields
         if div_a is None or div_B is None:
             u, divergence = self.policy(x), None

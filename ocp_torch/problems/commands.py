@@ -1,4 +1,4 @@
-"""How problems are named: in what a user is told to type, and by the files of earlier versions."""
+"""Names of problems: in commands that users are told to type, and in files of earlier versions."""
 
 import re
 from typing import Any
@@ -9,15 +9,17 @@ from ocp_torch.errors import InputError
 PACKAGE = "ocp_torch.problems"
 # Class in an earlier version -> class now.
 RENAMED = {"Callable": "Simulator"}
-# What Hydra takes for a word as it stands.
-PLAIN = re.compile(r"(?!(?:null|true|false|nan|inf)$)[A-Za-z_/][\w./:@-]*", re.IGNORECASE)
+# A word that Hydra reads as it stands, without quotes.
+UNQUOTED = re.compile(r"(?!(?:null|true|false|nan|inf)$)[A-Za-z_/][\w./:@-]*", re.IGNORECASE)
+# The dotted name of a class, and what stands for one that is not known.
 TARGET = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)+")
-LONGEST = 500
 UNKNOWN = "my_module.MyProblem"
+# Characters of a value that are shown.
+LONGEST = 500
 
 
 class ForeignProblem(InputError):
-    """A file is of a problem that only a user can name; ``arguments`` are what a command lacks."""
+    """A file belongs to a problem of a user's own, which only the user may name; ``arguments`` are what a command lacks."""
 
     def __init__(self, sentence: str, arguments: list[str]) -> None:
         super().__init__(sentence)
@@ -25,12 +27,12 @@ class ForeignProblem(InputError):
 
 
 def quoted(value: object) -> str:
-    """A value as Hydra reads it back, whatever signs it holds."""
+    """A value in quotes, so that Hydra reads it back whatever characters it holds."""
     return "'" + str(value).replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def as_typed(value: object) -> str:
-    """A plain value as an override has it after the equals sign; what no terminal should be shown is left out."""
+    """A plain value as an override has it after the equals sign, without characters that a terminal should not print."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, list | tuple):
@@ -40,11 +42,11 @@ def as_typed(value: object) -> str:
     if isinstance(value, int | float):
         return repr(value)
     text = "".join(c if c.isprintable() else "?" for c in str(value)[:LONGEST])
-    return text if PLAIN.fullmatch(text) else quoted(text)
+    return text if UNQUOTED.fullmatch(text) else quoted(text)
 
 
 def naming(section: dict, mark: str = "+") -> list[str]:
-    """The overrides that make the problem of ``section``, a run's own, again."""
+    """The overrides that make the problem of ``section``, the problem part of a run's configuration, again."""
     target = str(section.get("_target_"))
     named = target if TARGET.fullmatch(target) else UNKNOWN
     own = [f"{mark}problem.{name}={as_typed(value)}" for name, value in _arguments(section).items()]
@@ -52,7 +54,7 @@ def naming(section: dict, mark: str = "+") -> list[str]:
 
 
 def made_by(section: dict) -> str:
-    """The same as Python: ``Pendula(coupling=0.2)``."""
+    """The problem of ``section`` as Python: ``Pendula(coupling=0.2)``."""
     name = str(section.get("_target_")).rpartition(".")[2]
     arguments = ", ".join(f"{k}={v!r}" for k, v in _arguments(section).items())
     return f"{name if name.isidentifier() and name != 'None' else 'MyProblem'}({arguments})"
@@ -63,8 +65,8 @@ def _arguments(section: dict) -> dict:
 
 
 def current_target(target: Any) -> Any:
-    """The class that ``target``, of a configuration of any version, names now: classes of the package have had other names
-    and lain in other modules of it. Anything else comes back as it is."""
+    """The present name of the class ``target``, from a configuration of any version: classes of the package have had other
+    names and modules. Anything else comes back unchanged."""
     package, _, name = str(target).rpartition(".")
     now = RENAMED.get(name, name)
     ours = package == PACKAGE or package.startswith(f"{PACKAGE}.")
@@ -72,14 +74,14 @@ def current_target(target: Any) -> Any:
 
 
 def current_section(section: Any) -> Any:
-    """``section``, the problem of a configuration, with its `current_target`; as it is where it names none."""
+    """``section``, the problem part of a configuration, with its `current_target`; unchanged where it names none."""
     if not isinstance(section, dict) or "_target_" not in section:
         return section
     return {**section, "_target_": current_target(section["_target_"])}
 
 
 def current_name(name: object, section: object) -> object:
-    """The name by which the problem of ``section``, saved under ``name``, goes now."""
+    """The present name of the problem of ``section``, which was saved under ``name``."""
     target = str(section.get("_target_")) if isinstance(section, dict) else ""
     cls = target.rpartition(".")[2]
     renamed = cls in RENAMED and current_target(target) != target

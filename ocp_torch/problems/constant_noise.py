@@ -1,4 +1,4 @@
-"""Noise that is the same at every state, as users give it: numbers, checked."""
+"""Noise that is the same at every state: the numbers a user gives, checked."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""The three constants the bounds rest on, `M`, `C_V` and `C_u`, and where each came from."""
+"""The three constants `M`, `C_V` and `C_u` that bounds and training rest on, and where each came from."""
 
 import math
 from dataclasses import dataclass, replace
@@ -14,30 +14,32 @@ from ocp_torch.problems.problem import MARGIN, Problem
 from ocp_torch.problems.scan import odd_states
 from ocp_torch.problems.starts import drawn_starts, starts_narrowly
 
-# Without any knowledge of mu*, M is this multiple of sup mu0 on recorded data, where there is no bound without M.
+# On recorded data nobody knows mu*, and there is no bound without M: M is guessed as this multiple of sup mu0.
 OCCUPATION_GUESS = 4.0
-# And where training aims at the bound without M: what won on flows that contract onto a goal.
+# Where no M is known to be large enough, training aims at the bound without M, and M is a weight: this multiple of sup mu0,
+# which won on flows that contract onto a goal.
 OCCUPATION_WEIGHT = 40.0
-# States a problem is searched at for what it does not say: for f and mu0, for a and B, whose pseudo-inverse takes longer, and
-# starts where mu0 is narrow.
-PROBED, PROBED_MATRICES, PROBED_STARTS = 2**13, 2**11, 2**8
-# States scanned for a spike of `f`, for each that `Problem.scan_factor` asks for.
+PROBED = 2**13  # states at which suprema of f and mu0 are sought
+PROBED_MATRICES = 2**11  # states at which a and B are asked for: pseudo-inverses take longer
+PROBED_STARTS = 2**8  # starts at which sup mu0 is sought where mu0 is narrow
+# States scanned for a spike of `f`, times `Problem.scan_factor`.
 SCANNED = 2**15
 
-# Once a controller is known, bounds take this multiple of the largest density met under it instead: it need not be the
-# optimal one, and a search meets less than the supremum.
+# A guessed M becomes this multiple of the largest density met under a controller: the controller need not be optimal, and a
+# search meets less than the supremum.
 OBSERVED_ROOM = 1.2
 
+# Sources of a constant.
 FROM_CONFIGURATION, FROM_PROBLEM, ESTIMATED = "configuration", "problem", "estimated"
 FROM_DENSITY = f"{OBSERVED_ROOM:g} times the controller's density"
 
 
 @dataclass(frozen=True)
 class Constants:
-    """`M >= sup mu*`, `C_V >= sup V*`, `C_u >= sup |u*|` and, per name, its source.
+    """`M`, `C_V` and `C_u`, meant to be at least `sup mu*`, `sup V*` and `sup |u*|`, and the source of each by its name.
 
-    Where ``unbounded``, no `M` is known to be large enough: it is but a weight of training, which then aims at the bound
-    that needs none.
+    Where ``unbounded``, no `M` is known to be large enough: it is only a weight of training, which then aims at the bound
+    without `M`.
     """
 
     M: float
@@ -57,16 +59,16 @@ class Constants:
         return self.unbounded or self.basis("M") == GUESSED
 
     def basis(self, name: str) -> str:
-        """Where the constant ``name`` comes from, as what rests on it must say (see `ocp_torch.problems.needs`)."""
+        """The basis of the constant ``name``: given, searched or guessed (see `ocp_torch.problems.needs`)."""
         if self.sources[name] not in (ESTIMATED, FROM_DENSITY):
             return GIVEN
         return GUESSED if name == "M" else SEARCHED
 
     def informed(self, density: float | None) -> "Constants":
-        """With an `M` that nobody gave guessed anew from the largest ``density`` met under a controller.
+        """These constants with a guessed `M` guessed anew from the largest ``density`` met under a controller.
 
-        A density below its own mean of 1 is no density, and one within that factor of `M` may be what training with `M` made
-        of it: both leave the guess as it is, and so does one that is not finite."""
+        The guess stays where the density is below 1, which is the mean of any density, or not finite; and where it is within
+        a factor of `OBSERVED_ROOM` of `M`, as training with `M` may have made it so."""
         if self.basis("M") != GUESSED or density is None or not 1.0 <= density < math.inf:
             return self
         if self.M / OBSERVED_ROOM <= density <= self.M * OBSERVED_ROOM:
@@ -121,15 +123,16 @@ def resolve_constants(
 
 
 def is_unbounded(problem: Problem, occupation_bound: float | None = None) -> bool:
-    """Whether no `M` is known to be large enough: `mu*` has no bound, or neither problem nor user (``occupation_bound``)
-    gives one. A data set has no bound without `M` to aim at instead."""
+    """Whether no `M` is known to be large enough: `mu*` is declared unbounded, or neither problem nor user
+    (``occupation_bound``) bounds it. Never so for a data set of unknown `mu*`, which has no bound without `M`."""
     if problem.occupation_bound is None:
         return occupation_bound is None and problem.has_simulator
     return math.isinf(problem.occupation_bound)
 
 
 def state_cost_supremum(problem: Problem) -> float:
-    """`sup f`: the problem's own bound, unless more is met; or a sampled and climbed estimate with head-room."""
+    """`sup f`: the problem's own bound unless a larger value is met; else an estimate by sampling and ascents, with
+    head-room. Raises `ProblemError` where `f` is not finite."""
     given = problem.state_cost_bound
     if given is not None and not (problem.has_simulator and problem.scan_factor):
         return given

@@ -49,7 +49,7 @@ class PowerCost:
 
     Raises `InputError` when the exponent is outside (1, 2].
 
-    What limits there are: ``limit`` as the problem has it, ``reach`` the largest `|u|`, ``sides`` the largest `|u_i|`, a
+    Limits of the control: ``limit`` as the problem has it, ``reach`` the largest `|u|`, ``sides`` the largest `|u_i|`, a
     number or one for each `i`.
     """
 
@@ -80,8 +80,8 @@ class PowerCost:
         return norm_power(p, self.conjugate_exponent - 2.0).unsqueeze(-1) * p
 
     def argmax_along(self, p: Tensor, moved: Tensor) -> Tensor:
-        r"""How `argmax` changes at ``p`` ``(N, m)`` along each column of ``moved`` ``(N, m, k)``: with `n = p / |p|`,
-        `|p|^{q'-2} (I + (q'-2) n n^T)` times it."""
+        r"""The derivative of `argmax` at ``p`` ``(N, m)`` along each column of ``moved`` ``(N, m, k)``: that column times
+        `|p|^{q'-2} (I + (q'-2) n n^T)` with `n = p / |p|`."""
         power = self.conjugate_exponent - 2.0
         if power == 0.0:
             return moved
@@ -99,21 +99,21 @@ class PowerCost:
         """`mu R(w / mu)`, with its closure at `mu = 0`: 0 if `w = 0`, infinity otherwise; ``(N, m), (N,) -> (N,)``."""
         positive = mu > 0
         safe = torch.where(positive, mu, 1.0)
-        # Literally mu R(w / mu): powers of a small mu on their own overflow in the backward pass.
+        # As mu R(w / mu), not as powers of mu alone: these overflow in the backward pass where mu is small.
         inside = safe * self.cost(w / safe.unsqueeze(-1))
         outside = torch.where((w != 0).any(dim=-1), math.inf, 0.0).to(mu)
         return torch.where(positive, inside, outside)
 
     def gauge(self, w: Tensor) -> Tensor:
-        """The least `mu` ``(N,)`` that carries ``w`` ``(N, m)`` with controls within the limit; 0 where there is none."""
+        """The least `mu` ``(N,)`` for which the control ``w / mu`` is within the limit; 0 where there is no limit."""
         return torch.zeros_like(w[..., 0])
 
     def within(self, w: Tensor, mu: Tensor | float) -> Tensor:
-        """``w`` ``(N, m)``, cut to the nearest that `mu` ``(N,)`` allows; without a limit on `u` as it is."""
+        """The nearest to ``w`` ``(N, m)`` of the `w` that `mu` ``(N,)`` allows; ``w`` itself without a limit on `u`."""
         return w
 
     def admissible(self, control_density: Field, occupation: Field) -> Field:
-        """The field ``control_density`` as far as the field ``occupation`` allows it; without a limit as it is."""
+        """The field ``control_density`` cut to what the field ``occupation`` allows; unchanged without a limit on `u`."""
         return control_density
 
     def primal_occupation(self, w: Tensor, f: Tensor, value_bound: float, residual: Tensor) -> Tensor:

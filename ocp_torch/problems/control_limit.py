@@ -2,8 +2,8 @@ r"""Limits on the control as control costs: `R_K(u) = |u|^q / q` within a convex
 
 The paper's Corollary 1 allows any compact set. What changes against `PowerCost`: the conjugate is linear where its maximiser
 is at the limit; and since `mu R_K(w / mu)` is finite for `w` in `mu K` only, both pointwise minimisers over `mu` are clipped
-from below there (the functions they minimise are convex in `mu`). Two methods say what `K` is: `gauge`, the least `mu` that
-carries a `w`, and `within`, the point of `mu K` nearest to `w`.
+from below there (the functions they minimise are convex in `mu`). Two methods define `K`: `gauge`, the least `mu` with `w` in
+`mu K`, and `within`, the point of `mu K` nearest to `w`.
 """
 
 import math
@@ -17,17 +17,20 @@ from ocp_torch.maths.jets import Field
 from ocp_torch.problems.control_cost import PowerCost, norm_power, radial_part
 from ocp_torch.problems.placed import Placed
 
-# What a problem may be told: the largest `|u|`, or a list of the largest `|u_i|`; `None` where there is no limit.
+# The largest `|u|`, or a list of the largest `|u_i|`; `None` where there is no limit.
 Limit = float | Sequence[float] | None
-# How far, relative to the limit, rounding may carry a control beyond it: in double, and in any other precision.
-ROOM, COARSE_ROOM = 1e-9, 1e-4
-# Limits whose powers up to the second, and one over them, stay far from the ends of single precision.
-SMALLEST, LARGEST = 1e-9, 1e9
+# How far, relative to the limit, rounding may carry a control beyond it in double precision.
+ROOM = 1e-9
+# The same in any other precision.
+COARSE_ROOM = 1e-4
+# Range of limits: their squares, and one over these, stay far from the ends of single precision.
+SMALLEST_LIMIT = 1e-9
+LARGEST_LIMIT = 1e9
 
 
 class ConstrainedCost(PowerCost):
-    """`R_K` of a class that gives `gauge` and `within`. Within ``bend`` times `K` the conjugate is `R*`; and the maximiser at
-    any other `p` is that of the nearest point there."""
+    """`R_K` for a subclass that defines `K` by `gauge` and `within`. At `p` within ``bend`` times `K` the conjugate is `R*`;
+    at any other `p` the maximiser is that at the nearest point of this set."""
 
     bend = 1.0
 
@@ -35,23 +38,23 @@ class ConstrainedCost(PowerCost):
         return torch.where(self.gauge(u.detach()) <= 1.0 + _room(u), super().cost(u), math.inf)
 
     def conjugate(self, p: Tensor) -> Tensor:
-        near = self.within(p, self.bend)  # of a larger p the power would overflow
+        near = self.within(p, self.bend)  # the power of a larger p would overflow
         return super().conjugate(near) + (super().argmax(near) * (p - near)).sum(dim=-1)
 
     def argmax(self, p: Tensor) -> Tensor:
         u = super().argmax(self.within(p, self.bend))
-        return u if self.q == 2.0 else self.within(u, 1.0)  # the power of what was rounded may be beyond the limit
+        return u if self.q == 2.0 else self.within(u, 1.0)  # rounding in the power may lead beyond the limit
 
     def perspective(self, w: Tensor, mu: Tensor) -> Tensor:
         """`mu R_K(w / mu)`: infinite where `w` is not in `mu K`, beyond rounding, so also where `mu = 0` and `w != 0`."""
         allowed = self.gauge(w.detach()) <= (1.0 + _room(w)) * mu.detach()
-        # Only what is allowed goes in: an infinite cost would spoil the gradients of the branch that is not taken.
+        # Zeros in place of what is not allowed: an infinite cost there would make gradients NaN.
         inside = super().perspective(torch.where(allowed.unsqueeze(-1), w, 0.0), mu)
         return torch.where(allowed, inside, math.inf)
 
     def admissible(self, control_density: Field, occupation: Field) -> Field:
-        """`w` cut to `mu K`, state by state. Everything that is made of `w` is made of this field, its divergence too: `J` is
-        then finite and a bound for whatever two networks say, and its gradients reach both of them."""
+        """`w` cut to `mu K`, state by state. As all that follows, divergences too, is made of this field, `J` is finite and a
+        bound for any two networks, and its gradients reach both of them."""
         return lambda x: self.within(control_density(x), occupation(x))
 
     def primal_occupation(self, w: Tensor, f: Tensor, value_bound: float, residual: Tensor) -> Tensor:
@@ -70,7 +73,8 @@ class ConstrainedCost(PowerCost):
         return torch.maximum(super().saddle_occupation(w, beta, occupation_bound), least)
 
     def saddle_minimum(self, w: Tensor, beta: Tensor, occupation_bound: float) -> Tensor:
-        """As in Lemma 3 from the gauge of `w` up to `M`, and infinite where that is empty: hand in ``within(w, M)``."""
+        """The minimum of Lemma 3 over `mu` from the gauge of `w` to `M`; infinite where the gauge is above `M`, so that
+        callers hand in ``within(w, M)``."""
         least = self.gauge(w)
         clipped = super().saddle_occupation(w.detach(), beta.detach(), occupation_bound) < least
         at_limit = least * beta + self._at_limit(w)
@@ -78,7 +82,7 @@ class ConstrainedCost(PowerCost):
         return torch.where(least > occupation_bound * (1.0 + _room(w)), math.inf, found)
 
     def _at_limit(self, w: Tensor) -> Tensor:
-        """`mu R(w / mu)` at the least `mu`, ``(N,)``; of `w` in units of its largest entry: squares do not underflow."""
+        """`mu R(w / mu)` at the least `mu`, ``(N,)``; `w` is scaled by its largest entry, so that squares do not underflow."""
         size = w.detach().abs().amax(dim=-1)
         size = torch.where(size > 0.0, size, 1.0)
         w = w / size.unsqueeze(-1)
@@ -106,12 +110,12 @@ class LimitedCost(ConstrainedCost):
     def within(self, w: Tensor, mu: Tensor | float) -> Tensor:
         size, room = norm_power(w, 1.0), self.limit * mu
         beyond = size > room
-        # The quotient by a tiny size would overflow, and spoil the gradient of the branch that is taken.
+        # A quotient by a tiny size would overflow in the branch that is not taken, and make the gradient NaN.
         scale = torch.where(beyond, room / torch.where(beyond, size, 1.0), 1.0)
         return w * scale.unsqueeze(-1)
 
     def argmax_along(self, p: Tensor, moved: Tensor) -> Tensor:
-        """At the limit `(c / |p|) (I - n n^T)`: only its direction changes."""
+        """`PowerCost.argmax_along`, but `(c / |p|) (I - n n^T)` at the limit, where only the direction of `u` changes."""
         at_limit, factor = self._turning(p)
         return torch.where(at_limit, factor * (moved - radial_part(p, moved)), super().argmax_along(p, moved))
 
@@ -160,14 +164,14 @@ class BoxLimitedCost(ConstrainedCost, Placed):
         return w.clamp(-room, room)
 
     def argmax_along(self, p: Tensor, moved: Tensor) -> Tensor:
-        """An entry at its limit stays there."""
+        """The derivative of `argmax`: that of ``moved`` itself, and 0 for entries at their limit."""
         return torch.where((p.abs() > self._like(p, "sides", self._sides)).unsqueeze(-1), 0.0, moved)
 
     argmax_root = argmax_along  # a matrix of ones and zeros
 
 
 def _size(name: str, limit: object) -> float:
-    return require_number(name, limit, above=0.0, at_least=SMALLEST, at_most=LARGEST)
+    return require_number(name, limit, above=0.0, at_least=SMALLEST_LIMIT, at_most=LARGEST_LIMIT)
 
 
 def _room(like: Tensor) -> float:

@@ -3,7 +3,7 @@ what is made of it; `D = sigma sigma^T / 2` is there where there is noise.
 
 Every loss and every bound is a mean or a supremum of two constraint violations: the slack of the Hamilton-Jacobi-Bellman
 equation for `V`, and the residual of Liouville's (with noise Fokker and Planck's) equation, the adjoint one, for `(w, mu)`.
-They are written here, once.
+Both are written here, once.
 """
 
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ from ocp_torch.problems.samples import Samples
 def hjb_slack(value, state_cost, transport, conjugate):
     r"""`Q = V - f - L^0 V / rho + R*(-B^T grad V / rho)` from its four terms, ``(N,)``: `V` is a subsolution where `Q <= 0`.
 
-    The terms are tensors, NumPy arrays or Taylor models. ``transport``, the third, is `None` where `L^0 = 0`, and
-    where ``value`` is `V - L^0 V / rho` already.
+    The terms are tensors, NumPy arrays or Taylor models. ``transport``, the third, is `None` where `L^0 = 0`, or where
+    ``value`` is already `V - L^0 V / rho`.
     """
     free = value - state_cost if transport is None else value - state_cost - transport
     return free + conjugate
@@ -52,7 +52,7 @@ class Generator:
 
     @classmethod
     def of(cls, problem: Problem, samples: Samples) -> "Generator":
-        """That of ``problem`` at ``samples`` of it."""
+        """The generator of ``problem`` at ``samples`` of it."""
         return cls(samples, problem.discount, problem.control_cost)
 
     def jet(self, field: Field) -> Jet:
@@ -84,7 +84,7 @@ class Generator:
         return -pull_back(self.data.B, V.gradient) / self.rho
 
     def reduced_cost(self, V: Jet) -> Any:
-        """`f - V + L^0 V / rho`, ``(N,)``: cost of a unit of uncontrolled mass, less what the multiplier `V` pays."""
+        """`f - V + L^0 V / rho`, ``(N,)``: the cost of a unit of uncontrolled mass, less what the multiplier `V` pays."""
         return self.data.f - V.value + self.transport(V)
 
     def __call__(self, V: Jet, u: Tensor) -> Tensor:
@@ -109,14 +109,14 @@ class Generator:
         return (self.uncontrolled(V) * mu + self.controlled(V, w)) / self.rho - V.value * mu
 
     def control_inflow(self, control_density: Field) -> tuple[Tensor, Tensor]:
-        """`w` ``(N, m)`` and `mu0 - div(B w) / rho` ``(N,)``: the mass that starts there, and that control brings."""
+        """`w` ``(N, m)`` and `mu0 - div(B w) / rho` ``(N,)``: the mass that starts at a state and that control brings there."""
         _, div_B = self.data.require_divergences("the primal objective")
         w, flux = control_flux_divergence(control_density, self.data.x, self.data.B, div_B)
         return w, self.data.mu0 - flux / self.rho
 
     def occupation_outflow(self, log_occupation: Field) -> tuple[Tensor, Tensor]:
-        """`mu` and `mu + (div(a mu) - div div(D mu)) / rho`, both ``(N,)``: the mass that is discounted, and that drift and
-        noise carry away.
+        """`mu` and `mu + (div(a mu) - div div(D mu)) / rho`, both ``(N,)``: the latter is the mass that is discounted, and
+        that drift and noise carry away.
 
         `control_inflow` less this is the residual `r = mu0 - mu - (div(a mu + B w) - div div(D mu)) / rho`.
         """
@@ -124,7 +124,7 @@ class Generator:
         return mu, outflow
 
     def occupation_flux(self, log_occupation: Field) -> tuple[Tensor, Tensor, Tensor]:
-        """Those two, and the flux `a mu - div(D mu)` ``(N, d)`` that carries the mass."""
+        """`mu` and the outflow of `occupation_outflow`, and the flux `a mu - div(D mu)` ``(N, d)`` that carries the mass."""
         div_a, _ = self.data.require_divergences("the primal objective")
         log_mu = self.jet(log_occupation)
         mu = log_mu.value.exp()
@@ -135,7 +135,7 @@ class Generator:
         return mu, mu * (1.0 + carried / self.rho), self._flux(mu, mu.unsqueeze(-1) * log_mu.gradient)
 
     def drift_flux(self, occupation: Field) -> tuple[Tensor, Tensor, Tensor]:
-        """`mu`, `div F` ``(N,)`` and `F = a mu - div(D mu)` ``(N, d)``, where `mu` itself is the field, which may be 0."""
+        """`mu` ``(N,)``, `div F` ``(N,)`` and `F = a mu - div(D mu)` ``(N, d)`` of the field `mu` itself, which may be 0."""
         div_a, _ = self.data.require_divergences("J")
         mu = self.jet(occupation)
         carried = mu.value * div_a + self.advection(mu)
@@ -146,8 +146,8 @@ class Generator:
     def liouville_residual(
         self, control_density: Field, occupation: Field, still: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """`w` ``(N, m)``, `mu` and `r = mu0 - mu - (div(a mu + B w) - div div(D mu)) / rho` ``(N,)``, of `mu` itself, which
-        may be 0; ``still`` says that there is neither drift nor noise."""
+        """`w` ``(N, m)``, `mu` and `r = mu0 - mu - (div(a mu + B w) - div div(D mu)) / rho`, both ``(N,)``, of the field `mu`
+        itself, which may be 0; ``still`` says that there is neither drift nor noise."""
         w, inflow = self.control_inflow(control_density)
         mu, drifted = (occupation(self.data.x), 0.0) if still else self.drift_flux(occupation)[:2]
         return w, mu, inflow - mu - drifted / self.rho
@@ -161,11 +161,12 @@ class Generator:
         return flux - value.unsqueeze(-1) * div_D - 0.5 * (sigma @ pull_back(sigma, gradient).unsqueeze(-1)).squeeze(-1)
 
     def _spread(self, value: Tensor, gradient: Tensor, curvature: Tensor) -> Tensor:
-        """`div div(D mu) = D : hess mu + 2 div D . grad mu + mu div div D`, ``(N,)``; or all of it over `mu`."""
+        """`div div(D mu) = D : hess mu + 2 div D . grad mu + mu div div D`, ``(N,)``, from `mu`, `grad mu` and `D : hess mu`;
+        or this over `mu`, from all three over `mu`."""
         div_D, div_div_D = self.data.noise_divergences
         return curvature + 2.0 * (div_D * gradient).sum(-1) + value * div_div_D
 
     def primal_integrand(self, w: Tensor, mu: Tensor, residual: Tensor, value_bound: float) -> Tensor:
-        """The integrand of `J`: `f mu + mu R(w/mu) + C_V max(residual, 0)`, ``(N,)``; 0 for `f mu` where `f = 0`."""
+        """The integrand of `J`, `f mu + mu R(w/mu) + C_V max(residual, 0)`, ``(N,)``; `f mu` counts as 0 where `f = 0`."""
         running = torch.where(self.data.f > 0, self.data.f * mu, 0.0) + self.cost.perspective(w, mu)
         return running + value_bound * residual.clamp_min(0.0)

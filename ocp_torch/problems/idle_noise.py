@@ -1,18 +1,20 @@
-"""Noise that is there as a function, but 0 wherever it was asked: it costs what noise costs, and may be an oversight."""
+"""Noise that is given but 0 at all states tried: it takes the time that noise takes, and may be an oversight."""
 
 import torch
 
 from ocp_torch.problems.physical.disturbed import Disturbed
 from ocp_torch.problems.problem import Problem
 
-# States that are asked: at others the noise may differ, so that nothing but a sentence follows.
-ASKED, DESIGN = 4096, 41
+# States that are tried; elsewhere the noise may not be 0, so that only a sentence follows.
+ASKED = 4096
+# Number of their fixed design.
+DESIGN = 41
 
 
 @torch.no_grad()
 def idle_noise(problem: Problem) -> str | None:
-    """That the noise of ``problem`` is 0 at all states that were asked, in words; `None` where it is not, or where there
-    is none."""
+    """A sentence that the noise of ``problem`` is 0 at all states that were tried; `None` where it is not, or where there is
+    no noise."""
     if not problem.has_simulator or not problem.noisy:
         return None
     sigma = problem.noise(*problem.probe(ASKED, DESIGN, "x"))

@@ -1,4 +1,4 @@
-"""Constants of a problem's data, from which a lower bound can be proved."""
+"""Lipschitz constants of a problem's data, from which a lower bound can be proved."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 class Lipschitz:
     """`|g(x) - g(y)| <= L |x - y|`, Euclidean in torus units, for each entry `g` of the data; `None` where `L` is unknown.
 
-    A method that is not overridden needs none.
+    A method that is not overridden needs no constant.
     """
 
     state_cost: float | None = None

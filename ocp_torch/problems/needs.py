@@ -1,16 +1,17 @@
-"""What a bound rests on, and where each of those things comes from: only what is not guessed makes a bound count."""
+"""The assumptions that a bound rests on, and the basis of each: a bound counts only if none of them is guessed."""
 
 from dataclasses import dataclass
 
-# The problem declares it or the user sets it; a theorem or interval arithmetic shows it; the largest value that a search of
-# a known function met; a multiple of something seen, which nothing ties to what it stands for.
-GIVEN, PROVED, SEARCHED, GUESSED = "given", "proved", "searched", "guessed"
+GIVEN = "given"  # the problem declares it or the user sets it
+PROVED = "proved"  # by a theorem or interval arithmetic
+SEARCHED = "searched"  # the largest value that a search of a known function met
+GUESSED = "guessed"  # a multiple of something seen, without a reason that it suffices
 
 
 @dataclass(frozen=True)
 class Need:
-    """One thing a bound rests on: its ``name``, where it comes from (``basis``), what it says (``condition``), and whether
-    it ``holds``, that is whether it was held against what could refute it, and stands."""
+    """One assumption of a bound: its ``name``, its ``basis``, the ``condition`` in words, and whether it ``holds``, that is
+    whether nothing that was checked refutes it."""
 
     name: str
     basis: str
@@ -23,5 +24,5 @@ class Need:
 
     @property
     def sentence(self) -> str:
-        """As one takes it who believes the bound."""
+        """The assumption as a clause: the condition, marked where it is given."""
         return f"{self.condition}, as given" if self.basis == GIVEN else self.condition

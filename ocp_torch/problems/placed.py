@@ -1,18 +1,18 @@
-"""Constants where they are needed: in the precision and on the device of the states they meet."""
+"""Constant tensors in the precision and on the device of the states that they are used with."""
 
 import torch
 from torch import Tensor
 
 
 class Placed:
-    """Keeps constant tensors in every precision and on every device they were asked for."""
+    """Keeps a copy of its constant tensors for every precision and device that they were asked for in."""
 
     def _like(self, x: Tensor, name: str, constant: Tensor) -> Tensor:
         """``constant`` on the device of ``x`` and, unless it is of whole numbers, in its precision; converted once. ``name``
-        is its own."""
+        must be different for each constant."""
         placed = vars(self).setdefault("_placed", {})
         key = (name, x.dtype, x.device)
         if key not in placed:
-            with torch.inference_mode(False):  # what is kept may meet a graph later
+            with torch.inference_mode(False):  # the copy may be used in a graph later
                 placed[key] = constant.to(x if constant.is_floating_point() else x.device)
         return placed[key]

@@ -1,4 +1,4 @@
-"""What a problem knows of somebody else's environments that it is a model of."""
+"""Translation between a problem and other people's Gymnasium environments that it is a model of."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from ocp_torch.errors import InputError
 
 
 class Played:
-    """Override both for the Gymnasium environments a problem is a model of; those of this package need neither."""
+    """Override both methods for the Gymnasium environments a problem is a model of; those of this package need neither."""
 
     def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
         """The state ``(d,)`` that an observation of the environment ``env`` shows. Raises `InputError` for an unknown one."""

@@ -22,14 +22,14 @@ from ocp_torch.problems.played import Played
 from ocp_torch.problems.reproducible import Reproducible
 from ocp_torch.problems.samples import Samples, driven
 
-# With more, `B` alone would take over 8 GB for a batch of a thousand states.
+# With more coordinates and controls `B` alone would take over 8 GB for a batch of a thousand states.
 MOST_COORDINATES = 1024
-# Discounts per unit of time outside these are taken for a mistake in the unit.
-LEAST_DISCOUNT, LARGEST_DISCOUNT = 1e-6, 1e6
-# Head-room on a sampled supremum that is going to be used as a bound, since a search meets less than the supremum.
+# Discounts per unit of time outside this range are taken for a mistake in the unit.
+LEAST_DISCOUNT = 1e-6
+LARGEST_DISCOUNT = 1e6
+# Head-room on a sampled supremum that is used as a bound, since a search meets less than the supremum.
 MARGIN = 1.05
-# States scanned for narrow features of a user's own data, for each at which a bound is evaluated: more find narrower ones,
-# and take longer.
+# States scanned for narrow features of a user's own functions, for each state at which a bound is evaluated.
 SCAN_FACTOR = 32
 
 
@@ -58,15 +58,15 @@ class Problem(Reproducible, Placed, Played):
     proved in one and two dimensions (a class may have sharper models: see `ocp_torch.certificate.proof.enclosures`).
     """
 
-    # Whether the functions can be called at any state; a data set knows them at its own only (see `samples`).
+    # Whether the functions can be called at any state; a data set knows them at its own samples only (see `samples`).
     has_simulator: bool = True
-    # Whether the control matrix can, which the controller from V needs.
+    # Whether the control matrix can be called at any state, which the controller from V needs.
     knows_control_matrix: bool = True
     # Arguments that say where the data come from, not what they are: another run may give others.
     incidental: tuple[str, ...] = ()
-    # What coordinates and controls are called and measured in, where they have names.
+    # Names and units of coordinates and controls, where they have some.
     measures: Measures | None = None
-    # What a subclass may know: set in its body, in its `__init__` or after it.
+    # Facts that a subclass may declare, in its body, in its `__init__` or after it.
     state_cost_bound: float | None = None
     occupation_bound: float | None = None
     control_bound: float | None = None
@@ -114,10 +114,10 @@ class Problem(Reproducible, Placed, Played):
         return None if self._sigma is None else self._like(x, "sigma", self._sigma).expand(len(x), -1, -1)
 
     def add_noise(self, columns: Tensor) -> None:
-        """Put ``columns`` ``(d, k)``, torus units per square root of time, beside those of `sigma`; for `__init__` alone.
+        """Add ``columns`` ``(d, k)``, torus units per square root of time, to those of `sigma`; for `__init__` alone.
 
-        Each is a Brownian motion of its own; those that are 0 are left out. Of more than `d` in all, `d` with the same
-        `sigma sigma^T` take the place: states have the same law, and there are fewer directions to differentiate along."""
+        Each column is a Brownian motion of its own; zero columns are left out. More than `d` columns in all are replaced by
+        `d` with the same `sigma sigma^T`: states have the same law, and there are fewer directions to differentiate along."""
         columns = columns.double()[:, columns.any(dim=0)]
         if columns.shape[1]:
             sigma = columns if self._sigma is None else torch.cat([self._sigma, columns], dim=1)
@@ -135,7 +135,7 @@ class Problem(Reproducible, Placed, Played):
 
     def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
         """`div D` ``(N, d)``, with components `sum_j d_j D_ij`, and its divergence ``(N,)``, where there is noise: by
-        autograd through `noise`. Override it where they are known, or give `None`."""
+        autograd through `noise`. An override may give known formulas, or `None` where they are unknown."""
         if type(self).noise is Problem.noise:
             return torch.zeros_like(x), torch.zeros_like(x[:, 0])
         return jets.diffusion_divergences(self.noise, x)
@@ -146,19 +146,19 @@ class Problem(Reproducible, Placed, Played):
 
     @property
     def initial_mixture(self) -> Mixture | None:
-        """A density to draw starts from, of which `mu0` is nowhere a large multiple; `None` where one has to be found."""
+        """A density to draw starts from, of which `mu0` is nowhere a large multiple; `None` where one has to be fitted."""
         return None
 
     @property
     def scan_factor(self) -> int:
-        """How many states are scanned for narrow features of the data, for each at which a bound is evaluated. The package's
-        own problems have none narrower than those states show."""
+        """States scanned for narrow features of the data, for each state at which a bound is evaluated. 0 for the package's
+        own problems, which have no narrower features than those states show."""
         return 0 if shipped(type(self)) else SCAN_FACTOR
 
     @property
     def concurrent(self) -> bool:
         """Whether two threads may call the functions at once, as pure functions of the state in PyTorch: true of the
-        package's own problems; a subclass that knows it of its own may say so, and certificates take less time."""
+        package's own problems. A subclass that returns `True` gets its certificates sooner."""
         return shipped(type(self))
 
     @property
@@ -167,7 +167,7 @@ class Problem(Reproducible, Placed, Played):
         return type(self).drift is Problem.drift
 
     def drift_divergence(self, x: Tensor) -> Tensor | None:
-        """`div a`, ``(N,)``: by autograd through `drift`. Override where it is known, or give `None`."""
+        """`div a`, ``(N,)``: by autograd through `drift`. An override may give a known formula, or `None` where unknown."""
         return torch.zeros_like(x[:, 0]) if self.driftless else jets.divergence(self.drift, x)
 
     def control_divergence(self, x: Tensor) -> Tensor | None:
@@ -180,18 +180,18 @@ class Problem(Reproducible, Placed, Played):
         return torch.einsum("inim->nm", tangents)
 
     def vector_fields(self, x: Tensor, divergences: bool = True) -> VectorFields:
-        """`a`, `B` and their divergences (`None` where unknown, or where no ``divergences`` are asked for): what `drift`,
-        `control_matrix`, `drift_divergence` and `control_divergence` give, for a class that has them from one evaluation."""
+        """The results of `drift`, `control_matrix`, `drift_divergence` and `control_divergence`, the last two `None` where
+        unknown or without ``divergences``. An override may compute all of them from one evaluation."""
         div_a, div_B = (self.drift_divergence(x), self.control_divergence(x)) if divergences else (None, None)
         return self.drift(x), self.control_matrix(x), div_a, div_B
 
     def cost_and_fields(self, x: Tensor, divergences: bool = True) -> tuple[Tensor, VectorFields]:
-        """`f` and `vector_fields`, for a class that has all of it from one evaluation."""
+        """`f` and `vector_fields`. An override may compute all of them from one evaluation."""
         return self.state_cost(x), self.vector_fields(x, divergences)
 
     @property
     def unknown_divergences(self) -> str:
-        """Of which of `a`, `B` and, where there is noise, `D` no divergences are to be had, in words; empty for none."""
+        """The names of those of `a`, `B` and, where there is noise, `D` whose divergences are unknown, as in "a and B"."""
         x = torch.full((1, self.dim), 0.5, dtype=torch.float64)
         found: dict[str, object] = {"a": self.drift_divergence(x), "B": self.control_divergence(x)}
         found |= {"D": self.noise_divergences(x)} if self.noisy else {}
@@ -199,7 +199,7 @@ class Problem(Reproducible, Placed, Played):
 
     @property
     def gives_divergences(self) -> bool:
-        """Whether all of these are to be had."""
+        """Whether the divergences of `a`, `B` and, where there is noise, `D` are known."""
         return not self.unknown_divergences
 
     # Exact truth, where known: `None` otherwise.
@@ -221,23 +221,23 @@ class Problem(Reproducible, Placed, Played):
 
     @torch.no_grad()
     def probe(self, count: int, branch: int, *columns: str) -> tuple[Tensor, ...]:
-        """``columns`` of `Samples` (x, f, a, B, mu0 or weight) at states spread over the torus, in float64, at most ``count``
-        of them: what sizes and bounds are estimated from."""
+        """``columns`` of `Samples` (x, f, a, B, mu0 or weight) at up to ``count`` states spread over the torus, in float64,
+        to estimate sizes and bounds from."""
         x = scrambled_sobol(count, self.dim, branch, torch.float64)
         of = {"f": self.state_cost, "a": self.drift, "B": self.control_matrix, "mu0": self.initial_density}
         of |= {"x": lambda x: x, "weight": lambda x: torch.ones_like(x[:, 0])}
         return tuple(of[name](x) for name in columns)
 
     def independent_samples(self, count: int) -> Samples:
-        """Data at independent draws of states, at most ``count``, the same ones always: evenly spread states show waves
-        that are not there."""
+        """Data at up to ``count`` independent states, always the same ones: evenly spread states show waves that are not
+        there."""
         x = torch.rand(count, self.dim, dtype=torch.float64, generator=fixed_generator())
         return Samples.of(self, x, divergences=False)
 
     @property
     def validation_view(self) -> "Problem":
-        """The problem as evaluations during training see it, by which choices are made: itself, where fresh states cost
-        nothing; a data set gives other samples than the certificate's."""
+        """The problem for evaluations during training, by which choices are made: itself, or for a data set one with other
+        samples than the certificate's."""
         return self
 
     def velocity(self, x: Tensor, u: Tensor) -> Tensor:

@@ -1,17 +1,17 @@
-"""An object that can be made again: what a checkpoint or a saved controller keeps of a problem."""
+"""Objects that can be made again from their arguments, which checkpoints and saved controllers keep of a problem."""
 
 import inspect
 
 
 class Reproducible:
-    """Remembers what it was made of, so that ``type(x)(**x.parameters)`` makes it again."""
+    """Remembers its arguments, so that ``type(x)(**x.parameters)`` makes an object ``x`` again."""
 
     # Arguments whose attributes of the same name hold something else.
     not_arguments: tuple[str, ...] = ()
     _given: tuple[tuple, dict]  # what `__init__` was called with
 
     def __init_subclass__(cls, **options) -> None:
-        """A class takes what its `__init__` does, its own or inherited: Python 3.10 would ask `__new__` below instead."""
+        """Give the class the signature of its `__init__`, own or inherited: Python 3.10 would show that of `__new__`."""
         super().__init_subclass__(**options)
         first, *rest = inspect.signature(cls.__init__).parameters.values()
         cls.__signature__ = inspect.Signature(rest)  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""What the learner may see of a problem: evaluations at a batch of states, and nothing that could be differentiated."""
+"""The data of a problem that losses see: evaluations at a batch of states, and nothing that could be differentiated."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -65,8 +65,8 @@ class Samples:
 
     @classmethod
     def live(cls, problem: "Problem", x: Tensor) -> "Samples":
-        """``problem`` at states ``x`` as what is differentiated in `x` needs it: with derivatives where ``x`` has any, and
-        without start and divergences."""
+        """``problem`` at states ``x`` for functions that are differentiated in `x`: with a graph where ``x`` requires
+        gradients, with `mu0` and weights of 1, and without divergences."""
         one = torch.ones_like(x[:, 0])
         with torch.set_grad_enabled(x.requires_grad and torch.is_grad_enabled()):
             f, (a, B, _, _) = problem.cost_and_fields(x, divergences=False)
@@ -75,7 +75,7 @@ class Samples:
 
     @property
     def columns(self) -> list[Tensor | None]:
-        """All of it, in the order in which `Samples` takes them."""
+        """All columns, in the order in which `Samples` takes them."""
         return [getattr(self, f.name) for f in fields(self)]
 
     def __len__(self) -> int:
@@ -94,14 +94,14 @@ class Samples:
         return ((self.weight if self.penalty_weight is None else self.penalty_weight) * violation).mean()
 
     def require_divergences(self, who: str) -> tuple[Tensor, Tensor]:
-        """`div a` and `div B`, or an `InputError` that names ``who`` needs them."""
+        """`div a` ``(N,)`` and `div B` ``(N, m)``; raises `InputError` that ``who`` needs them where they are missing."""
         if self.div_a is None or self.div_B is None:
             raise InputError(f"{who} needs the divergences of a and B, which this problem does not give.")
         return self.div_a, self.div_B
 
     @property
     def noise_divergences(self) -> tuple[Tensor, Tensor]:
-        """`div D` ``(N, d)`` and `div div D` ``(N,)``, or an `InputError` that says that they are missing."""
+        """`div D` ``(N, d)`` and `div div D` ``(N,)``; raises `InputError` where they are missing."""
         if self.div_D is None or self.div_div_D is None:
             raise InputError("the residual with noise needs the divergences of D, which this problem does not give.")
         return self.div_D, self.div_div_D
@@ -111,7 +111,7 @@ class Samples:
         return self._map(lambda column: column[index])
 
     def take_weighted(self, most: int | None = None) -> "tuple[Samples, Tensor]":
-        """Those that carry weight, the first ``most`` of them, and their rows; `mean` estimates the same integrals."""
+        """The first ``most`` samples with a weight above 0, and their rows; `mean` estimates the same integrals."""
         none = self.weight == 0.0
         count = len(self) - decided(none.sum())
         rows = none.sort(stable=True)[1][: count if most is None else min(count, most)]
@@ -139,7 +139,7 @@ class Samples:
         return Samples(**columns)
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> "Samples":
-        """With each column there is ``change``d."""
+        """The samples with every column ``change``d."""
         columns: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         columns |= {name: change(column) for name, column in columns.items() if column is not None}
         return Samples(**columns)

@@ -1,9 +1,9 @@
-"""Where a problem's data are odd: states that a few thousand would miss, and at which suprema are then looked for too.
+"""Finds odd states, at which a problem's data are extreme or narrow: suprema are then sought from there too.
 
-A network varies slowly; what is narrow in a slack comes from `f`, `a` or `B`. They are far cheaper to evaluate than `V` and
+A network varies slowly; narrow features of a slack come from `f`, `a` or `B`, which are far cheaper to evaluate than `V` and
 its gradient, so that millions of states can be scanned: a set that takes the part `3 / N` of the torus is met by `N` states
-with 95 % probability. Kept are the states where a column of the data is smallest or largest, those that are reached from
-there downhill and uphill, and the states where a column differs most from its value nearby.
+with 95 % probability. Kept are the states where a column of the data is smallest or largest, the states reached from there
+downhill and uphill, and the states where a column differs most from its value nearby.
 """
 
 import torch
@@ -17,16 +17,16 @@ from ocp_torch.problems.problem import Problem
 CHUNK = 2**16
 # States kept for each column and kind of oddity: each costs an ascent of every supremum later.
 KEPT = 16
-# How far off the neighbour is that a column is compared with: narrower features differ from it, wider ones are met anyway.
+# Distance, in turns, of the neighbour that a column is compared with: narrower features stand out, wider ones are met anyway.
 NEARBY = 0.02
-# Steps downhill and uphill, along gradients where there are some and then in random directions.
+# Steps of each ascent or descent, along gradients where there are some and then in random directions.
 STEPS = 60
 
 
 @torch.no_grad()
 def odd_states(problem: Problem, count: int, seed: int) -> Tensor:
-    """States ``(K, d)`` in float64 at which the data of ``problem`` are odd, found among ``count`` uniform ones; found once
-    for a problem, so that evaluations during training cost no more."""
+    """States ``(K, d)`` in float64 at which the data of ``problem`` are odd, from about ``count`` random ones. Computed once
+    for a problem, ``count`` and ``seed``."""
     kept = vars(problem).setdefault("_odd_states", {})
     if (count, seed) in kept:
         return kept[count, seed]
@@ -50,7 +50,8 @@ def odd_states(problem: Problem, count: int, seed: int) -> Tensor:
 
 
 def _extremes(problem: Problem, states: Tensor, sign: float) -> Tensor:
-    """Where the columns are largest, or smallest for a ``sign`` of -1, that can be reached from ``states`` ``(K, C, d)``."""
+    """States ``(K C, d)`` reached uphill, or downhill for a ``sign`` of -1, from ``states`` ``(K, C, d)``, each in its own
+    column."""
     column = torch.arange(states.shape[1]).repeat(len(states)).unsqueeze(-1)
     own = lambda x: sign * _columns(problem, x).gather(1, column).squeeze(-1)
     x = states.flatten(0, 1)
@@ -62,7 +63,7 @@ def _extremes(problem: Problem, states: Tensor, sign: float) -> Tensor:
 
 
 def _columns(problem: Problem, x: Tensor) -> Tensor:
-    """`f`, `a`, `B` and the noise as columns ``(N, C)``; without those that are the same everywhere by definition."""
+    """`f`, `a`, `B` and the noise as columns ``(N, C)``, without functions that are not overridden."""
     columns = [problem.state_cost(x).unsqueeze(-1)]
     if not problem.driftless:
         columns.append(problem.drift(x))
@@ -74,7 +75,7 @@ def _columns(problem: Problem, x: Tensor) -> Tensor:
 
 
 def _highest(kept: tuple[Tensor, Tensor] | None, score: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-    """The `KEPT` highest scores of each column so far ``(K, C)``, and the rows of ``x`` that they are of."""
+    """The `KEPT` highest scores of each column so far, ``(K, C)``, and their states, ``(K, C, ..)``."""
     top, rows = score.topk(min(KEPT, len(score)), dim=0)
     states = x[rows]
     if kept is not None:

@@ -1,7 +1,7 @@
-"""Where trajectories start and bounds are evaluated: uniform states, and more of them where `mu0` or `f` is large.
+"""Starts of trajectories and states at which bounds are evaluated: uniform, and denser where `mu0` or `f` is large.
 
-Every point carries a weight, so that means estimate the same integrals whatever the points; where `mu0` is narrow hardly any
-uniform state carries its mass, and none of a few.
+Every point carries a weight, so that weighted means estimate the same integrals whatever the density. Where `mu0` is narrow,
+a few uniform states would all miss its mass.
 """
 
 from functools import partial
@@ -15,22 +15,23 @@ from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.simulator.simulator import Simulator
 
-# Parts that stay uniform: of starts, for mass that the search missed; and of the states that bounds are evaluated at, since
-# most of their integrands are large elsewhere too.
-UNIFORM_STARTS, UNIFORM_STATES = 0.125, 0.5
-# Part of the starts that is near spikes of `f`, which others meet by chance.
+# Part of the starts that stays uniform, for mass of `mu0` that the fit missed.
+UNIFORM_STARTS = 0.125
+# Part of the states for bounds that stays uniform, since most integrands are large elsewhere too.
+UNIFORM_STATES = 0.5
+# Part of the starts that is near spikes of `f`, which other starts meet only by chance.
 SPIKE_STARTS = 0.125
-# `f` is taken for broad, and adds no starts, where uniform states estimate its mean as well as this part of their number of
+# `f` counts as broad, and adds no starts, where uniform states estimate its mean as well as this part of their number of
 # ideal ones would.
 BROAD_COST = 0.05
-# Weighted starts drawn for each that is kept: more follow `mu0` closer.
+# Weighted starts drawn for each that is kept: more follow `mu0` more closely.
 CANDIDATES = 16
-# States at which a simulator is scanned, each of which may cost milliseconds; formulas are scanned at `SCANNED`.
-ASKED = 2**12
+# States at which a simulator is scanned, where each may cost milliseconds; other problems are scanned at `SCANNED`.
+SIMULATOR_SCANNED = 2**12
 
 
 def start_distribution(problem: Problem) -> Mixture:
-    """The density starts are drawn from: near `mu0` and spikes of `f`, and uniform where both are broad."""
+    """The density that starts are drawn from: dense near `mu0` and spikes of `f`, uniform where both are broad."""
     density, cost = fits(problem)
     if density.is_uniform:
         return cost.scaled(SPIKE_STARTS)
@@ -39,7 +40,7 @@ def start_distribution(problem: Problem) -> Mixture:
 
 
 def evaluation_distribution(problem: Problem) -> Mixture:
-    """The density states are drawn from at which bounds are evaluated; uniform where neither `mu0` nor `f` is narrow."""
+    """The density of the states at which bounds are evaluated; uniform where neither `mu0` nor `f` is narrow."""
     narrow = [d for d in fits(problem) if not d.is_uniform]
     parts = [d.scaled((1.0 - UNIFORM_STATES) / len(narrow)) for d in narrow]
     return Mixture.join([Mixture.uniform(problem.dim), *parts])
@@ -59,7 +60,7 @@ def initial_points(problem: Problem, count: int, replicate: int, seed: int, extr
 
 
 def drawn_starts(problem: Problem, count: int, seed: int) -> Tensor:
-    """``count`` starts ``(count, d)`` drawn from `mu0`, which all count the same: weighted ones, drawn again by weight."""
+    """``count`` starts ``(count, d)`` from `mu0`, all of the same weight: weighted starts, resampled by their weight."""
     x, weight = initial_points(problem, CANDIDATES * count, 0, seed)
     if not float(weight.sum()) > 0.0:
         return x[:count]
@@ -68,11 +69,13 @@ def drawn_starts(problem: Problem, count: int, seed: int) -> Tensor:
 
 
 def fits(problem: Problem) -> tuple[Mixture, Mixture]:
-    """The densities fitted to `mu0` and to `f`; found once for a problem."""
+    """The densities fitted to `mu0` and to `f`; computed once for a problem."""
     kept = vars(problem)
     if "_fits" not in kept:
         everywhere = getattr(problem.initial_density, "__func__", None) is Problem.initial_density
-        fit = partial(fitted_mixture, dim=problem.dim, scanned=ASKED if isinstance(problem, Simulator) else SCANNED)
+        fit = partial(
+            fitted_mixture, dim=problem.dim, scanned=SIMULATOR_SCANNED if isinstance(problem, Simulator) else SCANNED
+        )
         density = (
             Mixture.uniform(problem.dim) if everywhere else problem.initial_mixture or fit(problem.initial_density)
         )
