@@ -109,7 +109,7 @@ class Generator:
         return (self.uncontrolled(V) * mu + self.controlled(V, w)) / self.rho - V.value * mu
 
     def control_inflow(self, control_density: Field) -> tuple[Tensor, Tensor]:
-        """`w` ``(N, m)`` and `mu0 - div(B w) / rho` ``(N,)``: the mass that starts at a state and that control brings there."""
+        """`w` ``(N, m)`` and `mu0 - div(B w) / rho` ``(N,)``: the mass that starts at a state and that control brings."""
         _, div_B = self.data.require_divergences("the primal objective")
         w, flux = control_flux_divergence(control_density, self.data.x, self.data.B, div_B)
         return w, self.data.mu0 - flux / self.rho

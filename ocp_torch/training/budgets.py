@@ -72,9 +72,8 @@ NOISY_UNBOUNDED_BATCH = 1024  # or with recorded samples; a noisy unicycle's gap
 NOISY_UNBOUNDED_STEPS = {2: 600, 3: 800}
 # With noise otherwise: more in one dimension, where networks have more modes, fewer in two, where nothing has a kink.
 NOISY_STEPS = {1: 2000, 2: 1100}
-DENSITY_BATCH = (
-    256  # states for the density player of pd: larger batches serve the slack's supremum, which it does not see
-)
+# States for the density player of pd: larger batches serve the slack's supremum, which it does not see.
+DENSITY_BATCH = 256
 SAMPLER = "sobol"
 WORST_STATE_SAMPLER = "uniform"  # evenly spread states leave more steep spots, and the worst state is in one
 OCCUPATION_STATES = 144  # at which a certificate computes the occupation density

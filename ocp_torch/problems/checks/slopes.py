@@ -10,11 +10,19 @@ from ocp_torch.errors import ProblemError
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import value_and_gradient
 from ocp_torch.problems.checks.functions import Functions
-from ocp_torch.problems.checks.values import AGREE, COMPARED, DIFFERENCES, LEAST, SURE, WRONG
+from ocp_torch.problems.checks.values import (
+    AGREE,
+    COMPARED,
+    DIFFERENCES,
+    ERROR_OVER_SPREAD,
+    LEAST_ERROR,
+    RELATIVE_ERROR,
+)
 
-# Design of the states (see `functions.FIRST_DESIGN`), and the part of those where something changes that may be at odds: a
-# function may be asked right beside a kink. Where most states settle nothing, as of a rough one, nothing is said.
-SLOPE, FORGIVEN = 9, 0.25
+SLOPE_DESIGN = 9  # of the states (see `functions.FIRST_DESIGN`)
+# Part of the states where something changes that may be at odds, as a function may be asked right beside a kink. Where most
+# states settle nothing, as of a rough function, nothing is said.
+FORGIVEN = 0.25
 
 
 def require_slopes(functions: Functions) -> None:
@@ -22,7 +30,7 @@ def require_slopes(functions: Functions) -> None:
     climb to suprema by it. Steps, whose derivative is 0, are none of these."""
     if functions.simulator:  # whose own are differences
         return
-    x, draw = functions.exact_states(COMPARED, SLOPE), partial(torch.randn, generator=fixed_generator())
+    x, draw = functions.exact_states(COMPARED, SLOPE_DESIGN), partial(torch.randn, generator=fixed_generator())
     along = normalize(draw(x.shape, dtype=x.dtype))
     for name in functions.data:
         if name == functions.density:  # nothing differentiates a density
@@ -33,8 +41,8 @@ def require_slopes(functions: Functions) -> None:
         claimed = (value_and_gradient(scalar, x)[1] * along).sum(dim=-1)
         coarse, fine = (_change(scalar, x, step * along) / (2.0 * step) for step in DIFFERENCES)
         sizes, apart, off = torch.maximum(fine.abs(), claimed.abs()), (coarse - fine).abs(), (claimed - fine).abs()
-        settled, some = apart <= AGREE * sizes.max(), sizes > LEAST * sizes.max()
-        wrong = settled & some & (off > WRONG * sizes) & (off > SURE * apart)
+        settled, some = apart <= AGREE * sizes.max(), sizes > LEAST_ERROR * sizes.max()
+        wrong = settled & some & (off > RELATIVE_ERROR * sizes) & (off > ERROR_OVER_SPREAD * apart)
         if 2 * int(settled.sum()) > len(x) and int(wrong.sum()) > FORGIVEN * int((settled & some).sum()):
             at = int((off * wrong).argmax())
             raise ProblemError(
