@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from ocp_torch import Problem
+from ocp_torch.problems import Lipschitz
 
 TURN = 2.0 * math.pi
 
@@ -266,6 +267,12 @@ REFUSED = {
     "negative": (lambda: with_(state_cost=lambda self, x: 0.9 + torch.cos(TURN * x[:, 0])), "state_cost .* at least 0"),
     "negative in a dip": (lambda: with_(state_cost=lambda self, x: 1.0 - 1.5 * bump(0.03)(self, x)), "is -0.49"),
     "above its bound": (Bounded, "above its state_cost_bound = 1.5"),
+    "Lipschitz constants in a dict": (lambda: with_(lipschitz={"state_cost": 7.0}),
+                                      r"lipschitz of .*Mine is .*, but must be Lipschitz\(state_cost=.., drift=.., ..\)"),
+    "a Lipschitz constant in words": (lambda: with_(lipschitz=Lipschitz(drift="2")),
+                                      "drift in lipschitz of .*Mine is '2', but must be"),
+    "a Lipschitz constant below 0": (lambda: with_(lipschitz=Lipschitz(state_cost=-1.0)),
+                                     "state_cost in lipschitz of .*Mine is -1, but must be at least 0"),
     "mu0 negative": (lambda: with_(initial_density=lambda self, x: 1.0 + 1.5 * torch.cos(TURN * x[:, 0])),
                      "initial_density .* at least 0"),
     "mass 1.5": (lambda: with_(initial_density=lambda self, x: 1.5 * torch.ones_like(x[:, 0])), "integrates to 1.5"),
@@ -362,6 +369,7 @@ LEGAL = {
     "a step of a detached state": lambda: with_(state_cost=lambda self, x: step_of(x[:, 0].detach())),
     "f in steps of .001": lambda: with_(state_cost=lambda self, x: (1e3 * plain_cost(self, x)).round() / 1e3),
     "mu0 without a derivative": lambda: with_(initial_density=lambda self, x: 2.0 * step_of(x[:, 0])),
+    "Lipschitz constants": lambda: with_(lipschitz=Lipschitz(state_cost=7, drift=torch.tensor(2.0))),
     "limits and gains far apart": FarApart,
     "flat": lambda: with_(state_cost=lambda self, x: torch.zeros_like(x[:, 0])),
     "a hole": lambda: with_(state_cost=lambda self, x: 1.0 - bump(0.0025, 0.5)(self, x)),

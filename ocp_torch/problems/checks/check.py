@@ -28,6 +28,7 @@ from ocp_torch.problems.checks.sameness import (
 from ocp_torch.problems.checks.slopes import require_slopes
 from ocp_torch.problems.checks.values import require_divergences, require_finite, require_kept_noise, require_signs
 from ocp_torch.problems.control_limit import control_cost
+from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import MOST_COORDINATES, Problem, shipped
 from ocp_torch.problems.simulator.simulator import Simulator
@@ -139,8 +140,21 @@ def require_made(problem: Problem) -> None:
         bound = getattr(problem, name, None)
         infinite = name == "occupation_bound" and bound == math.inf
         if bound is not None and not infinite:
-            number = bound.item() if isinstance(bound, Tensor) and bound.ndim == 0 else bound
-            require_number(f"{name} of {named(problem)}", number)
+            require_number(f"{name} of {named(problem)}", _number(bound))
+    constants = Lipschitz() if problem.lipschitz is None else problem.lipschitz
+    if not isinstance(constants, Lipschitz):
+        raise ProblemError(
+            f"lipschitz of {named(problem)} is {shown(constants)}, but must be Lipschitz(state_cost=.., drift=.., ..) of "
+            "ocp_torch.problems, or None."
+        )
+    for name, constant in vars(constants).items():
+        if constant is not None:
+            require_number(f"{name} in lipschitz of {named(problem)}", _number(constant), at_least=0.0)
+
+
+def _number(given: object) -> object:
+    """What a user declares, which may be a tensor of one number."""
+    return given.item() if isinstance(given, Tensor) and given.ndim == 0 else given
 
 
 def require_spelling(problem: Problem) -> None:
