@@ -62,7 +62,7 @@ def test_what_is_thinned_out_is_right_in_the_mean(monkeypatch):
     policy = Held(problem, 0.1, lambda x: (2.0 * math.pi * x[:, :1]).sin().sign(), 2)
     run = lambda seed: Simulation(problem, policy, 64, 4, seed, tolerance=1e-3).run().perf
     thinned = [run(seed) for seed in range(6)]
-    monkeypatch.setattr(held, "FEWEST", 64)
+    monkeypatch.setattr(held, "FEWEST_FOLLOWED", 64)
     whole = run(0)
     assert abs(thinned[0].value - whole.value) < 4.0 * math.hypot(thinned[0].se, whole.se)
     mean = sum(perf.value for perf in thinned) / 6

@@ -460,7 +460,7 @@ def test_a_few_fast_trajectories_take_finer_steps_and_the_others_none(monkeypatc
     problem = Spinning()
     found, work = [], []
     for mostly in (0.9, 1.0):
-        monkeypatch.setattr("ocp_torch.certificate.simulated.steps.MOSTLY", mostly)
+        monkeypatch.setattr("ocp_torch.certificate.simulated.steps.TYPICAL_PART", mostly)
         problem.asked.clear()
         found.append(Simulation(problem, zero_policy(problem), 64, 8, 0, tolerance=1e-3).run().perf)
         work.append(sum(problem.asked))

@@ -16,22 +16,26 @@ from ocp_torch.maths.supremum import supremum
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.problem import Problem
 
-# The integral over the past is taken in pieces of so many discount times, until the last one adds next to nothing; what
-# has not settled after so many pieces is extrapolated. Pieces of 2.5 and .5 % leave out what pieces of 5 and 1 % do where it
-# decays slowly, and end sooner where it does not.
-PIECE, PIECES, SETTLED = 2.5, 16, 5e-3
-# Steps of a piece: in each no more than that part of a discount time passes, and no state moves farther than that part of a
-# turn, but so few and so many at least and at most; more are more exact and take longer.
-DISCOUNTED, MOVED, FEWEST_STEPS, MOST_STEPS = 0.25, 0.1, 10, 75
+# Length of a piece of the integral over the past, in discount times: shorter pieces end sooner where the past counts little.
+PIECE = 2.5
+MOST_PIECES = 16  # what has not settled by then is extrapolated
+SETTLED = 5e-3  # part of the integral that the last piece may add
+# Longest step of a piece in discount times, and in turns that a state moves; but the number of steps has limits.
+STEP_TIME = 0.25
+STEP_LENGTH = 0.1
+FEWEST_STEPS, MOST_STEPS = 10, 75
 # The logarithm at which the growth of a density is cut off, so that it stays a number: e^60 is unbounded to any check.
 LARGEST_GROWTH = 60.0
-# Evaluations of the closed loop at each state and time where there is noise, at first and from the highest, shared by the
-# paths and the `d + 1` differences on each; and paths at least. More show a density that is too large for M more surely.
-FEW_EVALUATIONS, EVALUATIONS, FEWEST_PATHS = 48, 192, 4
-# The highest of the states looked at are looked at again from close by, at one state for so many of all.
-TOP, NEARBY = 6, 3
+# With noise, evaluations of the closed loop at each state and time, shared by the paths and the `d + 1` differences on each.
+FEW_EVALUATIONS = 48
+# The same near the densest states: more show a density that is too large for M more surely.
+EVALUATIONS = 192
+FEWEST_PATHS = 4  # from each state, with noise
+DENSEST_STATES = 6  # of the first look, near which the density is computed again
+NEARBY_DIVISOR = 3  # of the number of all states, for the number of states near those
 # Ascents to the suprema of the a-priori bound, which is shown beside the density itself and decides nothing.
-ASCENTS, ASCENT_STEPS = 16, 20
+ASCENTS = 16
+ASCENT_STEPS = 20
 # Step of a difference quotient of the velocity: truncation is then about 1e-7 of its second derivatives, rounding 1e-9.
 DIFFERENCE = 1e-7
 
@@ -47,7 +51,7 @@ def backward_flow(problem: Problem, policy: Policy, together: bool = False) -> D
     It is evaluated on all cores ``together`` if ``problem`` and ``policy`` are pure functions.
 
     With noise, whose divergences must be known, `dy = (2 div D - g) dt + sigma dW`, the density grows by `div div D - div
-    g`, and `mu^u(x)` is the mean over paths (Feynman and Kac, for the adjoint equation written out).
+    g`, and `mu^u(x)` is the mean over paths (Feynman and Kac, for the adjoint equation).
     """
 
     loop, known = ClosedLoop(problem, policy), differentiable(problem, policy)
@@ -73,29 +77,29 @@ def backward_flow(problem: Problem, policy: Policy, together: bool = False) -> D
 
 
 def differentiable(problem: Problem, policy: Policy) -> bool:
-    """Whether the divergence of the closed loop is had without differences, and for less where `B` is the same everywhere."""
+    """Whether the divergence of the closed loop is known without differences; where `B` is constant it then costs less."""
     return isinstance(policy, ValuePolicy) and problem.gives_divergences
 
 
 def settled_occupation(
     problem: Problem, policy: Policy, x: Tensor, evaluations: int = EVALUATIONS, together: bool = False
 ) -> Tensor:
-    """`mu^u` ``(N,)`` along the `backward_flow`, as far back as it takes; infinite where the past adds ever more. With
+    """`mu^u` ``(N,)`` at ``x`` by the `backward_flow`, as far back as it takes; infinite where the past adds ever more. With
     noise the mean over as many paths as ``evaluations`` allow, less twice its standard error: a lower estimate, and finite.
 
-    Where the flow contracts nearly as fast as the discount forgets, the integral settles slowly, and geometrically: what
-    is left is extrapolated from the last pieces.
+    Where the flow contracts nearly as fast as the discount decays, the integral settles slowly and geometrically: the rest
+    is extrapolated from the last pieces.
     """
     rho, dynamics = problem.discount, backward_flow(problem, policy, together)
     horizon = PIECE / rho
     with torch.no_grad():
         speed = float(problem.velocity(x, policy(x)).norm(dim=-1).max())
-    wanted = math.ceil(horizon * max(rho / DISCOUNTED, speed / MOVED))
+    wanted = math.ceil(horizon * max(rho / STEP_TIME, speed / STEP_LENGTH))
     steps = int(min(MOST_STEPS, max(FEWEST_STEPS, wanted)))
     paths = max(FEWEST_PATHS, evaluations // (problem.dim + 1)) if problem.noisy else 1
     state = torch.cat([x, x.new_zeros(len(x), 1)], dim=-1).repeat_interleave(paths, dim=0)
     pieces, settled = list[Tensor](), False  # each along each path, (N, paths)
-    for k in range(PIECES):
+    for k in range(MOST_PIECES):
         if problem.noisy:
             piece, state = _noisy_piece(problem, dynamics, state, horizon, steps, k)
         else:
@@ -150,8 +154,8 @@ def estimated_sup_occupation(
     density = met(x, FEW_EVALUATIONS)
     if not bool(torch.isfinite(density).all()):
         return math.inf
-    top = x[density.topk(min(TOP, len(x))).indices]
-    count = states // NEARBY
+    top = x[density.topk(min(DENSEST_STATES, len(x))).indices]
+    count = states // NEARBY_DIVISOR
     around = top[torch.arange(count) % len(top)]
     steps = torch.randn(around.shape, dtype=x.dtype, generator=generator) / math.sqrt(problem.dim)
     sizes = 10.0 ** (-1.0 - 2.0 * torch.rand(count, 1, dtype=x.dtype, generator=generator))

@@ -1,8 +1,8 @@
 """What the steps of a simulation jump over: a wall in the drift or the controller, or a place without noise, so thin that no
 state of a path is in it. Halved steps jump over it as well, and agree; the true path stays there.
 
-Of a few paths random states between each step and the next are looked at. Where a coordinate moves steadily before and after,
-and there stands still or turns back, a path cannot pass.
+On a few paths, random states between each step and the next are checked. Where a coordinate moves steadily before and after,
+but stands still or turns back there, a path cannot pass.
 """
 
 import math
@@ -21,28 +21,31 @@ from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.blame import place
 from ocp_torch.problems.problem import Problem
 
-# Paths that are looked at, and states on each of their steps: where each of them crosses a wall once by a step of a fiftieth
-# of a turn, 20 of them show one a thousandth of a turn thick, two or three one a tenth of that.
-LOOKED_AT, ON_STEP = 64, 8
-# How many steps before and after must agree, to what part, as all velocities at both ends of the step must; and what part of
-# that is as good as standing still.
-AROUND, STEADY, STILL = 4, 0.5, 0.05
+CHECKED_PATHS = 64
+# States checked on each step: on steps of a fiftieth of a turn 20 of the paths show a wall a thousandth of a turn thick.
+STATES_ON_STEP = 8
+# Ends of steps before and after a step between which the motion must be steady.
+AROUND = 4
+# There the slowest speed of the coordinate is above this part of the fastest, and velocities change by less than this part.
+STEADY = 0.5
+# A speed of at most this part of the slowest around is as good as standing still.
+STILL = 0.05
 # A coordinate that moves less in a step, in turns, is at rest.
 AT_REST = 1e-5
 
 
 def jumped_over(loop: Loop, steps: Steps, state: Tensor, taken: Tensor, seed: int) -> str:
-    """What a few of the paths of ``loop`` from ``state`` ``(N, k)``, of so many steps ``taken`` ``(N,)``, jump over, in
-    words; empty where nothing is seen: where the velocity of a coordinate without noise turns back, and where noise ends."""
+    """What a few of the paths of ``loop`` from ``state`` ``(N, k)``, by ``taken`` ``(N,)`` steps, jump over, in words: where
+    the velocity of a coordinate without noise turns back, or noise ends; empty where nothing is seen."""
     problem = loop.problem
     generator = torch.Generator().manual_seed(derive_seed(seed, Branch.AUDIT, 1))
-    rows = torch.randperm(len(state), generator=generator)[:LOOKED_AT]
+    rows = torch.randperm(len(state), generator=generator)[:CHECKED_PATHS]
     spread = lambda states: loop.noise(states)[:, : problem.dim].norm(dim=-1)
     turns, ends = "the velocity is 0 or has the other sign", "there is no noise"
     speeds: dict[str, Callable[[Tensor], Tensor]] = {}
     if not problem.noisy:
         speeds[turns] = lambda states: loop(states)[0][:, : problem.dim]
-    elif problem.scan_factor:  # the package's own have no walls, and no such noise
+    elif problem.scan_factor:  # problems of the package have neither walls nor such noise
         if bool((spread(state[rows]) == 0.0).any()):
             speeds[turns] = lambda states: loop(states)[0][:, : problem.dim] * (spread(states) == 0.0)
         if type(problem).noise is not Problem.noise:
@@ -55,8 +58,8 @@ def jumped_over(loop: Loop, steps: Steps, state: Tensor, taken: Tensor, seed: in
 
 
 def _paths(loop: Loop, steps: Steps, state: Tensor, taken: Tensor, seed: int) -> Iterator[Tensor]:
-    """Those from ``state`` ``(n, k)``, for each number of steps that some have ``taken`` ``(n,)``; those of a control that is
-    held, of which there are many, for a discount time."""
+    """Paths ``(K + 1, n, k)`` from ``state`` ``(n, k)``, one batch for each number of steps ``taken`` ``(n,)``; with a held
+    control, whose steps are many, for a discount time only."""
     horizon, rho = steps.horizon, loop.problem.discount
     for count in map(int, taken.unique()):
         at = state[taken == count]
@@ -73,8 +76,8 @@ def _paths(loop: Loop, steps: Steps, state: Tensor, taken: Tensor, seed: int) ->
 
 @torch.no_grad()
 def stopped(speed: Callable[[Tensor], Tensor], path: Tensor) -> Tensor | None:
-    """A state ``(d,)`` between two of ``path`` ``(K + 1, n, k)``, whose first `d` columns move, where one of ``speed``
-    ``(N, k) -> (N, d)`` is 0 or has the other sign; `None` where there is none."""
+    """A state ``(d,)`` between two of ``path`` ``(K + 1, n, k)``, whose first `d` columns move, where a component of
+    ``speed`` ``(N, k) -> (N, d)`` is 0 or has the other sign; `None` where there is none."""
     each = lambda states: batched(speed, states.flatten(0, 1)).unflatten(0, states.shape[:2])
     here, generator = each(path), fixed_generator()
     dim = here.shape[-1]
@@ -84,7 +87,7 @@ def stopped(speed: Callable[[Tensor], Tensor], path: Tensor) -> Tensor | None:
     weakest, strongest = torch.minimum(sign * least, sign * most), torch.maximum(sign * least, sign * most)
     straight = here.diff(dim=0).norm(dim=-1, keepdim=True) < STEADY * here[:-1].norm(dim=-1, keepdim=True)
     steady = straight & (weakest > STEADY * strongest) & (moved.abs() > AT_REST)  # else no chord is near the path
-    for _ in range(ON_STEP if bool(steady.any()) else 0):
+    for _ in range(STATES_ON_STEP if bool(steady.any()) else 0):
         part = torch.rand(*moved.shape[:2], 1, dtype=path.dtype, generator=generator)
         between = path[:-1].clone()
         between[:, :, :dim] += part * moved

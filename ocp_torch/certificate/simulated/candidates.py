@@ -12,20 +12,22 @@ from ocp_torch.maths.jets import Field
 from ocp_torch.maths.runge_kutta import MAX_DOUBLINGS
 from ocp_torch.problems.problem import Problem
 
-# Doing nothing has no control variate; its performance is a yardstick, not a bound, and needs few trajectories. So does
-# a controller that another one clearly beats; but without noise so few in all as the second number take hardly longer than a
-# part of them (with noise the finest steps take longest: 2.2 of 5.3 s of a quick evaluation for the worse controller of a
-# pendulum). Their steps need not be as fine either: the third is by how many times, and the last how often they are halved at
-# most (four times as elsewhere took 3.5 minutes for a controller that trembled, and cost 40 % more than the best).
-BASELINE_PART, CHEAP, ROUGH, HALVED = 4, 256, 200.0, 1
-# Without noise a controller that holds its control is simulated from so many times as many starts: 512 in each of 8 sets took
-# 45 s for 36 on a pendulum with limited torque, and the standard error fell from .004 to .006 to .002 to .003.
+# Divisor of the trajectories of rough simulations: of doing nothing, whose performance is a yardstick and no bound, and of a
+# controller that another one clearly beats.
+BASELINE_PART = 4
+# Without noise so few trajectories in all take hardly longer than a part of them, and none is simulated roughly first.
+CHEAP = 256
+ROUGH_FACTOR = 200.0  # on the tolerance of rough simulations
+# Halvings of their steps at most: four, as elsewhere, took 3.5 minutes for a controller that trembled.
+ROUGH_DOUBLINGS = 1
+# Factor on the starts of a held control without noise: on a pendulum with limited torque the standard error fell from
+# .004 to .006 to .002 to .003, in 45 s instead of 36.
 MORE_HELD = 2
 
 
 class Candidate(NamedTuple):
-    """A controller to simulate, the control variate `V` of its simulation, and `E[V mu0]` per set; and, if the first two are
-    networks of this package, what these are in single precision (see `Fields.rounded`)."""
+    """A controller to simulate, the control variate `V` of its simulation, and `E[V mu0]` per set; ``rounded`` are controller
+    and `V` in single precision if they are networks of this package (see `Fields.rounded`)."""
 
     policy: Policy
     value: Field | None
@@ -42,11 +44,12 @@ def simulate_candidates(
     remembered: dict[str, Simulated] | None = None,
     chosen: str | None = None,
 ) -> tuple[dict[str, Simulated], Estimate]:
-    """Performance of each of ``candidates``, and of doing nothing. With ``best_only``, and where that saves time, only the
-    one that is best on a quarter of the trajectories gets all of them, and one that then still looks better; and the one
-    that is ``chosen`` already. Beside one that holds its control, and takes as long for a few trajectories, any worse one is
-    left at that: acting at every instant it trembles where the other jumps, and would take minutes on fine steps. What is
-    ``remembered`` is not simulated again."""
+    """Performance of each of ``candidates``, and of doing nothing; what is ``remembered`` is not simulated again.
+
+    With ``best_only``, where that saves time, candidates are simulated roughly first, on a quarter of the trajectories: the
+    one that is ``chosen`` already, the best of the others and any that may still be better get all of them. Beside one that
+    holds its control any that looks worse stays rough: acting at every instant it trembles where that one jumps, and would
+    take minutes on fine steps."""
 
     def simulate(candidate: Candidate, roughly: bool = False) -> Simulated:
         policy, value, initial, rounded = candidate
@@ -54,7 +57,7 @@ def simulate_candidates(
         if isinstance(policy, HeldPolicy) and not problem.noisy:
             effort *= MORE_HELD
         if roughly:
-            effort, tolerance, doublings = max(2, effort // BASELINE_PART), ROUGH * tolerance, HALVED
+            effort, tolerance, doublings = max(2, effort // BASELINE_PART), ROUGH_FACTOR * tolerance, ROUGH_DOUBLINGS
         sets, how = (settings.replicates, seed, value, initial), (settings.horizon, tolerance, rounded, doublings)
         return Simulation(problem, policy, effort, *sets, *how, settings.audited).run()
 
@@ -65,7 +68,7 @@ def simulate_candidates(
     found = dict(remembered or {})
     found |= {name: simulate(c, name in quickly) for name, c in candidates.items() if name not in found}
     best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
-    lowest = math.inf  # of those that were simulated at length
+    lowest = math.inf  # performance of those simulated on all trajectories
     for name in sorted(quickly, key=lambda name: found[name].perf.value if found[name].perf.finite else math.inf):
         perf = found[name].perf
         if not (perf.above if held else perf.interval(CONFIDENCE)[0]) > best and not perf.value >= lowest:

@@ -1,12 +1,12 @@
 r"""A controller whose control is held for a while, simulated as what it is.
 
-Its trajectories are as many smooth pieces as there are holds, and no step need be halved because a control jumps. They are
-many: to the end of the discount some `12 / (rho h)`, and choosing a control takes longer than moving under it. What is late
-counts little, so that of each set of starts ever fewer are followed: half as many after each discount time. The first points
-of a randomised Sobol sequence are spread as the whole set is, so that the sum of means is right in the mean.
+Trajectories are smooth within each hold, so that no step need be halved because a control jumps. But holds are many, some
+`12 / (rho h)` to the end of the discount, and choosing a control takes longer than moving under it. Late costs count little,
+so that of each set of starts ever fewer are followed: half as many after each discount time. The first points of a
+randomised Sobol sequence are spread as the whole set is, so that the sum of means stays unbiased.
 
-For any `V`, what a piece of length `T` costs less `V` at its start and plus `e^{-rho T} V` at its end, discounted and summed
-over all pieces, is the cost less `V(x_0)`: the better `V`, the less do these scatter, however `V` changes in between.
+For any `V`, the cost of a piece of length `T`, less `V` at its start and plus `e^{-rho T} V` at its end, discounted and
+summed over all pieces, is the cost less `V(x_0)`: the better `V`, the less this scatters, however `V` changes in between.
 """
 
 import math
@@ -28,11 +28,9 @@ from ocp_torch.maths.runge_kutta import (
     discounted_integral,
 )
 
-# So many trajectories of each set are followed to the end: what is left to them of the discount is a hundredth of the whole
-# where there were 256 of them.
-FEWEST = 8
-# Steps are halved again where that made the error smaller by this at least: where trajectories part at a jump of the
-# controller it does not, and what they differ by is a matter of chance.
+# Trajectories of each set at least that are followed to the end: of 256 so few are left for a hundredth of the discount.
+FEWEST_FOLLOWED = 8
+# Halving the steps goes on while it reduces the error to this part: where trajectories part at a jump it does not.
 SMALLER = 0.5
 
 
@@ -53,13 +51,13 @@ class Thinning:
 
     def kept(self, piece: int) -> int:
         """How many of each set go on with ``piece``."""
-        return max(min(FEWEST, self.count), self.count >> piece)
+        return max(min(FEWEST_FOLLOWED, self.count), self.count >> piece)
 
     def integrals(
         self, loop: HeldLoop, value: Field | None, state: Tensor, rows: Tensor, substeps: int, together: bool
     ) -> tuple[Tensor, Tensor]:
         """What ``rows`` ``(n,)`` of all trajectories, from ``state`` ``(n, d + m)``, contribute to the mean discounted cost,
-        or to what it is above ``value``, and their ends: a piece that is made by a part of a set counts the more."""
+        or to its excess over ``value``, and their ends; pieces that only a part of a set follows have more weight."""
         worth = (lambda at: 0.0) if value is None else (lambda at: value(at[:, : loop.problem.dim].remainder(1.0)))
         rho, switched, steps = loop.problem.discount, Switched(loop, loop.renewed, self.holds), self.holds * substeps
         duration, total, end = self.holds * loop.hold, torch.zeros_like(state[:, 0]), state.clone()
@@ -87,10 +85,10 @@ def held_integrals(
     generator: torch.Generator,
     together: bool,
 ) -> tuple[Tensor, Tensor, float]:
-    """Contributions to the mean by ``mass`` ``(N,)`` of the discounted cost up to the ``horizon`` at least, or of what it is
-    above ``value``, from ``state`` ``(N, d + m)``, ``replicates`` sets one after the other; end states; and a bound on the
-    error of that mean: by how much steps that are finer, and ``loop`` where ``quick`` rounds, change it on a random few.
-    Steps are halved until that is below ``tolerance`` or little beside the standard error, or does not get smaller."""
+    """Contributions to the mean by ``mass`` ``(N,)`` of the discounted cost up to the ``horizon`` at least, or of its excess
+    over ``value``, from ``state`` ``(N, d + m)``, ``replicates`` sets one after the other; end states; and a bound on the
+    error of that mean: the change on a random few by finer steps, and by ``loop`` where ``quick`` rounds. Steps are halved
+    until that is below ``tolerance`` or little beside the standard error, or does not get smaller."""
     thinning = Thinning.of(loop, len(mass) // replicates, horizon)
     picked = torch.randperm(len(mass), generator=generator)[:AUDITED]
     substeps, before = loop.substeps, math.inf

@@ -23,7 +23,7 @@ from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# `z - V` must shrink to that part of it when steps are halved; a sixteenth is expected of a method of order four.
+# A trajectory slides where halved steps leave more than this part of `z - V`; a method of order four leaves a sixteenth.
 SETTLING = 0.25
 
 
@@ -106,8 +106,7 @@ def loop_of(problem: Problem, policy: Policy, value: Field | None) -> Loop:
 
 
 class Sliding:
-    """Results of ``count`` trajectories, by `-Q_u`, or with `z - V` taken off where that stays above ``allowed`` however fine
-    the steps."""
+    """Results of ``count`` trajectories by `-Q_u`, less `z - V` where that stays above ``allowed`` however fine the steps."""
 
     def __init__(self, count: int, allowed: float) -> None:
         self.allowed = allowed

@@ -16,12 +16,11 @@ from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import fits
 
-# A part of the time above this is worth a warning; and how exact the part of one trajectory has to be, or as rough as costs.
-MUCH, TOLERANCE = 0.01, 2e-3
-# Fewer trajectories of a set leave an interval as wide as the part itself.
-FEWEST = 8
-# The control variate, a number: near to what the clock shows in the box, so that the weights of the starts add little noise.
-LEVEL = 1.05
+MUCH = 0.01  # part of the discounted time above which a warning is due
+TOLERANCE = 2e-3  # of that part for one trajectory, unless costs have a larger one
+FEWEST_TRAJECTORIES = 8  # of a set: fewer leave an interval as wide as the part itself
+# The control variate, a constant near the clock's rate in the box, so that the weights of the starts add little noise.
+VARIATE = 1.05
 
 
 class _Free(PowerCost):
@@ -33,7 +32,7 @@ class _Free(PowerCost):
 
 def _clock(problem: System) -> System:
     """``problem`` with a cost of 1 in the box and of 2 outside: a simulation of what it costs is one of where it is."""
-    fits(problem)  # found once for both: it starts where the problem does
+    fits(problem)  # computed once for both: the clock starts where the problem does
     clock = copy.copy(problem)
     clock.control_cost = _Free(problem.exponent)
     vars(clock)["state_cost"] = lambda x: torch.where(problem.outside(x), 2.0, 1.0).to(x)
@@ -44,15 +43,15 @@ def time_outside(problem: Problem, policy: Policy, settings: CertificateSettings
     """`E[rho int e^{-rho t} 1[x_t is outside the box] dt]` along the closed loop of ``policy``; `None` where there is no box
     or too little is simulated."""
     few = settings.trajectories // BASELINE_PART
-    if not isinstance(problem, System) or not problem.chart.boxed or few < FEWEST:
+    if not isinstance(problem, System) or not problem.chart.boxed or few < FEWEST_TRAJECTORIES:
         return None
     effort = few, settings.replicates, seed
     found = Simulation(
         _clock(problem),
         policy,
         *effort,
-        lambda x: torch.full_like(x[:, 0], LEVEL),
-        [LEVEL],
+        lambda x: torch.full_like(x[:, 0], VARIATE),
+        [VARIATE],
         settings.horizon,
         max(TOLERANCE, settings.tolerance),
     ).run()
@@ -60,7 +59,7 @@ def time_outside(problem: Problem, policy: Policy, settings: CertificateSettings
 
 
 def outside_note(problem: Problem, found: Estimate | None) -> list[str]:
-    """The warning that so much time is spent outside, if it is much, or may be."""
+    """The warning that more than `MUCH` of the time is, or may be, spent outside; empty if neither."""
     if found is None or not found.above > MUCH:
         return []
     assert isinstance(problem, System)

@@ -26,14 +26,14 @@ from ocp_torch.maths.runge_kutta import (
 )
 from ocp_torch.maths.seeds import Branch, derive_seed
 
-# How many times as many steps are taken, once, where others jump over a wall: one a hundredth of a turn thick is met then;
-# and how often these are halved at most, for steps that are as fine as elsewhere in the end.
-FINER, LEFT = 8, MAX_DOUBLINGS - 3
+# Factor on the steps where the usual ones jump over a wall: one a hundredth of a turn thick is then met.
+FINER = 8
+FINER_DOUBLINGS = MAX_DOUBLINGS - 3  # the finest are then as fine as elsewhere
 
 
 class Followed(NamedTuple):
-    """What ``results`` ``(N,)`` and ``ends`` ``(N, k)`` paths have, what finer steps add to the mean of each replicate, a
-    bound on the error of the mean, and what the steps jumped over, in words."""
+    """``results`` ``(N,)`` and ``ends`` ``(N, k)`` of paths; the ``refinement`` ``(replicates,)`` that finer steps add to the
+    mean of each replicate; a bound on the ``error`` of the mean; and the ``wall`` that steps jumped over, in words."""
 
     results: Tensor
     ends: Tensor
@@ -45,12 +45,12 @@ class Followed(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class Paths:
     """Paths of ``loop`` from ``state`` ``(N, k)``, ``replicates`` sets one after the other, each of which stands for some
-    ``mass`` ``(N,)``; they end at ``times`` ``(N,)`` of their own, or where the ``steps`` do.
+    ``mass`` ``(N,)``. A path ends at its own of ``times`` ``(N,)``, or where the ``steps`` do.
 
-    ``quick`` is the loop in single precision, or itself. Steps are halved until a trajectory changes by less than what is
+    ``quick`` is the loop in single precision, or ``loop`` itself. Steps are halved until a trajectory changes by less than
     ``allowed``, without noise ``doublings`` times at most. Paths are followed ``together`` on all cores where the loop is
-    pure. Where they are not ``audited``, ``rounding`` is what single precision is off by. The worth of states at both ends
-    of pieces is taken off by ``value`` where a control is held.
+    pure. ``rounding`` is the error of single precision, added where paths are not ``audited``. ``value`` is the control
+    variate at both ends of pieces where a control is held.
     """
 
     loop: Loop
@@ -69,7 +69,7 @@ class Paths:
     value: Field | None
 
     def followed(self) -> Followed:
-        """All of them to their ends."""
+        """Follow all paths to their ends."""
         if self.loop.problem.noisy:
             return self._with_noise()
         if isinstance(self.loop, HeldLoop) and isinstance(self.quick, HeldLoop):
@@ -78,22 +78,22 @@ class Paths:
 
     @cached_property
     def sliding(self) -> Sliding | None:
-        """Which of them slide, where the loop has a coordinate that shows it."""
+        """Which paths slide; `None` where the loop has no coordinate that shows it."""
         shown = isinstance(self.loop, FeedbackLoop) and self.loop.summed
         return Sliding(len(self.mass), self.allowed) if shown else None
 
     def means(self, results: Tensor) -> Tensor:
-        """Those of each replicate, for ``results`` ``(N,)``."""
+        """The means ``(replicates,)`` by mass of ``results`` ``(N,)``, one for each replicate."""
         return (self.mass * results).unflatten(0, (self.replicates, -1)).mean(dim=1)
 
     def rates(self, ends: Tensor) -> Tensor:
-        """Those of the loop at ``ends`` ``(N, k)``, as results are."""
+        """The rates of the loop at ``ends`` ``(N, k)``, corrected as results are where paths slide."""
         rates = self.loop(ends)[1]
         return rates if self.sliding is None else self.sliding.corrected(rates, torch.arange(len(rates)))
 
     @property
     def _no_refinement(self) -> Tensor:
-        """0 for each replicate: without noise results themselves are on the finest steps."""
+        """0 for each replicate: without noise the results themselves are on the finest steps."""
         return torch.zeros(self.replicates, dtype=self.mass.dtype)
 
     @property
@@ -105,7 +105,7 @@ class Paths:
         return torch.Generator().manual_seed(derive_seed(self.seed, Branch.AUDIT))
 
     def _wall(self, taken: Tensor | int) -> str:
-        """What steps jumped over of which so many were ``taken``."""
+        """What paths jumped over that have ``taken`` so many steps, in words."""
         taken = torch.as_tensor(taken).expand(len(self.mass))
         return jumped_over(self.quick, self.steps, self.state, taken, self.seed) if self.audited else ""
 
@@ -127,10 +127,10 @@ class Paths:
         return Followed(results, ends, self._no_refinement, error, self._wall(self.steps.count))
 
     def _smooth(self) -> Followed:
-        """On steps that are finer from the start where the usual ones jump over a wall."""
+        """Follow smooth trajectories; once more, on finer steps, where the usual ones jump over a wall."""
         followed = self._refined(self.steps.count, self.doublings)
         if followed.wall and self.doublings == MAX_DOUBLINGS:
-            followed = self._refined(FINER * self.steps.count, LEFT)
+            followed = self._refined(FINER * self.steps.count, FINER_DOUBLINGS)
         # Rounding alone must not look like a contradiction.
         return followed._replace(
             error=followed.error + (self.rounding if self._is_rounded and not self.audited else 0.0)
@@ -144,7 +144,7 @@ class Paths:
         return Followed(results, ends, self._no_refinement, off, self._wall(taken))
 
     def _integrated(self, by: Loop) -> Integrate:
-        """Results of some of the paths, with so many steps."""
+        """The integration of some of the paths of the loop ``by``, in a number of steps."""
         rho, steps, state, times = by.problem.discount, self.steps, self.state, self.times
 
         def some(rows: Tensor, count: int) -> tuple[Tensor, Tensor]:

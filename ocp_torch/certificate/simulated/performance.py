@@ -33,20 +33,21 @@ from ocp_torch.maths.runge_kutta import MAX_DOUBLINGS
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import initial_points
 
-# What is left of the discount when simulation stops, times the rate's supremum, relative to the answer: that part of the
-# tolerance, and so much at least and at most. At the tolerance of a quick evaluation, 5e-4, it is the least; only rough
-# simulations stop earlier. The answer is taken to be at least the last part of the mean state cost at the starts.
-TAIL_PART, SMALLEST_TAIL, LARGEST_TAIL, LEAST = 0.04, 2e-5, 0.02, 0.1
-# How far the rates of networks in single precision may be off at the starts in the mean, as a part of what the steps of a
-# trajectory may be off by: 2e-7 of the answer on the circle and on dubins, a twenty-fifth of this at the default tolerance.
-ROUNDED = 0.1
-# A `V` whose slack at the starts is, in the mean, more than that part of the running cost is no control variate: what it adds
-# to the simulation changes faster than what it takes off. From values of trajectories it was .7 on a pendubot and 2 on a
-# quadrotor, and asked for 15,000 steps where the cost asks for 800; .003 to .08 for `V` of `dual` and `pd`.
+# The truncated tail relative to the answer: the discount that is left times the rate's supremum.
+TAIL_PART = 0.04  # of the tolerance
+SMALLEST_TAIL = 2e-5  # whatever the tolerance: it rules up to 5e-4, that of a quick evaluation
+LARGEST_TAIL = 0.02
+LEAST_SIZE = 0.1  # of the answer, as a part of the mean state cost at the starts
+# Mean error of the rates of single-precision networks at the starts, at most, as a part of the error allowed to a path's
+# steps: on the circle and on dubins it is 2e-7 of the answer, a twenty-fifth of this at the default tolerance.
+ROUNDING_PART = 0.1
+# A `V` whose mean slack at the starts is above this part of the running cost is no control variate, as it changes faster than
+# the cost: a quadrotor's from values of trajectories, at 2, asked for 15,000 steps where the cost asks for 800.
 NO_VARIATE = 0.5
-# Where the first steps of all paths are more than that, as with a small discount, fewer paths are taken, but so many in each
-# set, and the cost itself along them: each is so long that it sees most of what others do. A quadrotor's are 1.6e6.
-MOST_STEPS, LEAST_PATHS = 2.0e6, 4
+# First steps of all paths at most: where a small discount asks for more, fewer paths are followed by the cost itself, each so
+# long that it sees most of what others do. A quadrotor's are 1.6e6.
+MOST_STEPS = 2.0e6
+FEWEST_PATHS = 4  # of each set even then
 # Head-room on the rate's supremum, met at starts and ends, for the states after the end.
 RATE_ROOM = 2.0
 
@@ -59,14 +60,14 @@ class Simulated:
     perf: Estimate
     largest_value: float | None
     end_states: Tensor
-    jumped_over: str = ""  # what the steps cannot have seen, where there is anything
-    unmet: float = 0.0  # what states far dearer than any that was met add, if one path comes to them
+    jumped_over: str = ""  # the wall that steps jump over, in words; empty where none was seen
+    unmet: float = 0.0  # what states far costlier than any that was met add, if one path comes to them
 
 
 class Start(NamedTuple):
-    """All paths at their starts ``x`` ``(N, d)``, one replicate after the other: the ``mass`` of `mu0` that each stands for
-    ``(N,)``, the ``times`` at which they end where these are random, the control variate there (``base``), the ``state`` of
-    the loop, its ``velocity`` and its ``rates``, ``(N,)`` or more columns of them."""
+    """All paths at their starts ``x`` ``(N, d)``, one replicate after the other: the ``mass`` ``(N,)`` of `mu0` that each
+    stands for, the ``times`` ``(N,)`` of their ends where these are random, the control variate ``base`` ``(N,)`` there, and
+    the ``state`` of the loop, its ``velocity`` ``(N, d)`` and its ``rates``, ``(N,)`` or more columns of them."""
 
     x: Tensor
     mass: Tensor
@@ -95,14 +96,13 @@ def starting_points(
 class Simulation:
     """Perf of ``policy`` from ``replicates`` independent sets of ``trajectories`` randomised Sobol starts, near `mu0`.
 
-    With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is added;
-    unless the slack is so large that the cost itself is simulated with less effort, or paths are so long that this is done
-    along fewer of them (`MOST_STEPS`). Steps are halved, without noise ``doublings`` times at most, until a trajectory
+    With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is added.
+    The cost itself is simulated where the slack is too large (`NO_VARIATE`), and along fewer paths where these are long
+    (`MOST_STEPS`). Steps are halved, without noise ``doublings`` times at most, until a trajectory
     changes by less than ``tolerance``, relative to the answer, or all of them by little beside the standard error.
-    ``rounded``, the controller and `V` in single precision, takes their place where it agrees well enough with them at the
-    starts; a few trajectories are exact, and what they differ by goes into the bias, unless, without noise, they are
-    not ``audited``. A `HeldPolicy` is simulated as one: its control changes only when it is renewed, always up to a
-    truncated ``horizon``.
+    ``rounded``, the controller and `V` in single precision, takes their place where both agree at the starts; a few
+    trajectories are exact, and their differences go into the bias, unless, without noise, they are not ``audited``. A
+    `HeldPolicy` renews its control as it is meant to, always up to a truncated ``horizon``.
     """
 
     problem: Problem
@@ -126,13 +126,13 @@ class Simulation:
         if not bool(torch.isfinite(self._start.velocity).all() and torch.isfinite(self._start.rate).all()):
             return Simulated(Estimate(math.nan, math.nan), math.nan, self._start.x)
         steps = self._steps
-        fewer = max(LEAST_PATHS, 2 ** int(math.log2(max(MOST_STEPS / (steps.count * self.replicates), 1.0))))
+        fewer = max(FEWEST_PATHS, 2 ** int(math.log2(max(MOST_STEPS / (steps.count * self.replicates), 1.0))))
         if fewer < self.trajectories and not self._held:
             return self._without_value(fewer).run()
         return self._judged(self._paths(steps))
 
     def _without_value(self, trajectories: int) -> "Simulation":
-        """The same by the cost itself, along so many ``trajectories`` of each set."""
+        """This simulation by the cost itself, along so many ``trajectories`` of each set."""
         rounded = None if self.rounded is None else (self.rounded[0], None)
         return replace(self, trajectories=trajectories, value=None, initial=None, rounded=rounded)
 
@@ -146,7 +146,7 @@ class Simulation:
 
     @property
     def _along(self) -> Field | None:
-        """The control variate of rates; that of a control that is held is of whole pieces."""
+        """The control variate of rates; `None` where a control is held, whose variate is of whole pieces."""
         return None if self._held else self.value
 
     @property
@@ -155,7 +155,7 @@ class Simulation:
 
     @cached_property
     def _start(self) -> "Start":
-        """Where all paths start."""
+        """All paths at their starts."""
         dim, at_random = self.problem.dim, self._ends_at_random
         points, mass = starting_points(
             self.problem, self.trajectories, self.replicates, self.seed, extra=int(at_random)
@@ -179,10 +179,10 @@ class Simulation:
 
     @cached_property
     def _size(self) -> float:
-        """That of the answer: by the slack's definition `V - Q_u = f + R(u) + grad V . g / rho`, also where `E[V mu0]` is far
-        off."""
+        """The size of the answer: the mean of `V - Q_u = f + R(u) + grad V . g / rho`, also where `E[V mu0]` is far off, and
+        at least `LEAST_SIZE` of the mean state cost."""
         start = self._start
-        least = LEAST * float((start.mass * self.problem.state_cost(start.x)).mean())
+        least = LEAST_SIZE * float((start.mass * self.problem.state_cost(start.x)).mean())
         return max(float((start.mass * (start.base + start.rate)).mean().abs()), least, 1e-12)
 
     @property
@@ -195,13 +195,13 @@ class Simulation:
         return Steps.of(self._loop, to_the_tail, start.velocity)
 
     def _paths(self, steps: Steps) -> Paths:
-        """In single precision, where that differs little from the exact rates at the starts."""
+        """The paths, in single precision where its rates at the starts differ little from the exact ones."""
         start, loop, allowed = self._start, self._loop, self.tolerance * self._size
         quick = loop if self.rounded is None else loop_of(self.problem, *self.rounded)
         off = float((quick(quick.renewed(start.state))[1] - start.rates).abs().mean())
         return Paths(
             loop,
-            quick if off <= ROUNDED * allowed else loop,
+            quick if off <= ROUNDING_PART * allowed else loop,
             steps,
             start.state,
             start.mass,
@@ -231,7 +231,7 @@ class Simulation:
             bias += math.exp(-problem.discount * paths.steps.horizon) * largest * float(start.mass.mean())
         bias += UNSEEN_ROOM * unseen_cost(problem, start.x, start.mass, self.seed)
         bias += largest_rate_of(loop_of(problem, self.policy, None)) if wall else 0.0
-        # Starts are spread evenly, and without noise their paths follow from them.
+        # Without noise evenly spread starts give evenly spread paths.
         chance = problem.noisy or self._ends_at_random
         met = float((start.mass * torch.maximum(start.rate.abs(), result.abs())).max())
         rare = unmet_cost(paths.quick, met, len(start.mass), self._size) if chance or self.audited else 0.0
@@ -242,7 +242,7 @@ class Simulation:
         perf = Estimate.of(totals, bias=bias)
         weighted = start.mass * result
         perf = widened(replace(perf, se=max(perf.se, stratum_error(weighted, replicates))), [weighted])
-        # One path with noise is off its mean, `V^u`; the largest of `N` by some `sqrt(2 log N)` standard deviations.
+        # With noise a path scatters about its mean `V^u`, the largest of `N` by some `sqrt(2 log N)` standard deviations.
         above = float(result.std()) * math.sqrt(2.0 * math.log(len(result))) if problem.noisy else 0.0
         highest = None if self._ends_at_random or self._held else float((start.base + result).max()) - above
         return Simulated(perf, highest, ended, wall, 0.0 if chance else rare)

@@ -1,4 +1,4 @@
-"""What the starts and paths of a simulation may have missed: dear states, and jumps of the cost between starts."""
+"""What the starts and paths of a simulation may have missed: costly states, and jumps of the cost between starts."""
 
 import math
 
@@ -13,22 +13,24 @@ from ocp_torch.maths.supremum import batched, supremum
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import initial_points
 
-# Simulation sets come after those of the bounds in the stream of evaluation points.
+# Number of the first simulation set in the stream of evaluation points: after those of the bounds.
 SIMULATION_REPLICATE = 1000
-# States to which the starts' mean cost is compared, how many standard errors apart the two must be, and by how many times
-# that the interval is widened: trajectories may stay where no start was.
-COMPARED, UNLIKELY, UNSEEN_ROOM = 2**15, 2.5, 2.0
-# States that cost so much more than all that was met count with what no path showed (`unmet`), where that makes this part of
-# the answer: with 2,048 paths where they cost 70 times the answer.
-MET, MATERIAL = 0.01, 0.1
-# Ascents to the largest rate there is: one that has none, as `r^-1.6`, is then larger than all that could matter.
+COMPARED = 2**15  # states to whose mean cost that of the starts is compared
+UNLIKELY = 2.5  # standard errors between the two means, if that is more than chance
+# Factor on their difference, by which the interval is widened: trajectories may stay where no start was.
+UNSEEN_ROOM = 2.0
+# The largest rate is unmet if all that paths showed is below this part of it,
+MET_PART = 0.01
+# and counts (`unmet`) if that adds this part of the answer: with 2,048 paths where it is 70 times the answer.
+MATERIAL = 0.1
+# Ascents to the largest rate: if it has no supremum, as `r^-1.6`, they find more than all that could matter.
 ASCENTS = 32
 
 
 @torch.no_grad()
 def unseen_cost(problem: Problem, x0: Tensor, mass: Tensor, seed: int) -> float:
-    """By how much `E[f mu0]` over the starts ``x0`` ``(N, d)`` and their ``mass`` differs from what many more states say,
-    where that is more than chance: a spike or a hole of `f` that no start has met, or that too few have."""
+    """The difference of `E[f mu0]` over the starts ``x0`` ``(N, d)`` with their ``mass`` from that over many more states,
+    where it is more than chance, else 0: a spike or a hole of `f` that no start has met, or that too few have."""
     if not problem.scan_factor:
         return 0.0
     x, weight = initial_points(problem, COMPARED, SIMULATION_REPLICATE - 1, seed)
@@ -40,27 +42,28 @@ def unseen_cost(problem: Problem, x0: Tensor, mass: Tensor, seed: int) -> float:
 
 @torch.no_grad()
 def largest_rate_of(loop: Loop, ascents: int = 0) -> float:
-    """The largest rate of ``loop``, whatever its sign, at evenly spread states, and on so many ``ascents`` from these."""
+    """The largest absolute rate of ``loop`` at evenly spread states, and on ``ascents`` from the highest of these."""
     x = scrambled_sobol(COMPARED, loop.problem.dim, 0, torch.float64)
     rate = lambda at: loop(loop.start(at))[1].reshape(len(at), -1)[:, 0].abs()
     return supremum(rate, x, ascents, differentiable=False).value if ascents else float(batched(rate, x).max())
 
 
 def unmet_cost(loop: Loop, met: float, draws: int, size: float) -> float:
-    """What states of a rate of cost far above ``met``, the largest that ``draws`` paths or random times showed, may add to
-    the mean, whose size is ``size``; 0 where that is little."""
+    """What states whose rate of cost is far above ``met``, the largest that ``draws`` paths or random times showed, may add
+    to the mean, whose size is ``size``; 0 where that is little."""
     if not loop.problem.scan_factor:
         return 0.0
     dearest = largest_rate_of(loop)
     added = unmet(dearest, draws)
-    return added if met < MET * dearest and added > MATERIAL * size else 0.0
+    return added if met < MET_PART * dearest and added > MATERIAL * size else 0.0
 
 
 def unmet_tail(paths: Paths, results: Tensor, size: float) -> float:
-    """What results larger than any of ``results`` ``(N,)`` of ``paths`` add to their mean, whose size is ``size``: by how the
-    largest fall off, but no more than results as large as the largest rate that is found do, `3 / N` of all paths. Kinks of
-    `V` leave errors that fall off slowly up to the largest slack: of a torus that was .1 % where the former alone was up to
-    .6 %."""
+    """What results larger than any of ``results`` ``(N,)`` of ``paths`` add to their mean, whose size is ``size``.
+
+    That is told by how the largest fall off (`beyond_largest`), but is at most what `3 / N` of all paths add if their results
+    are as large as the largest rate found: beside kinks of `V` errors fall off slowly only up to the largest slack (on a
+    torus .1 % instead of up to .6 %)."""
     beyond = beyond_largest(results, paths.mass, size)
     if not beyond > 0.0:
         return 0.0
