@@ -11,13 +11,14 @@ from ocp_torch.problems.constants import FROM_DENSITY, FROM_PROBLEM, Constants
 from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED, Need
 from ocp_torch.problems.problem import Problem, shipped
 
-# An estimated supremum may exceed a bound by so much, relative to it, before it contradicts it; and a simulated value by so
-# much before it contradicts C_V, since both carry numerical errors.
-TOLERANCE, ROUGH = 0.02, 1e-3
-# An M that somebody gave must be so much above the density observed. Trained with an M that is too small, a controller does
-# not exceed it: the dual keeps its density just below, and F_M is then above OPT.
+# Relative excess of an estimated supremum over a bound, up to which numerical errors explain it.
+TOLERANCE = 0.02
+# The same of a simulated value over C_V.
+VALUE_TOLERANCE = 1e-3
+# An M that is not declared must be this factor above the density observed: trained with an M that is too small the dual keeps
+# the density just below it, and F_M is then above OPT.
 CLEARANCE = 1.1
-# A sup mu* that a problem declares, but does not show to be exact, may be exceeded by an imperfect controller's density.
+# Factor by which an imperfect controller's density may exceed a sup mu* that a problem declares without showing it exact.
 DECLARED = 1.25
 
 
@@ -78,13 +79,13 @@ class Assumptions:
 
     @property
     def data_are_enclosed(self) -> Need:
-        """What a proof over cells takes the data to be between states."""
+        """What a proof over cells assumes of the data between states."""
         return Need(
             "data", self.basis.get("data", PROVED), "the data are within their enclosure or Lipschitz constants"
         )
 
     def with_value_bound(self, C_V: float) -> "Assumptions":
-        """With the `C_V` that the suprema found of `V` and its slack prove for the controller at hand."""
+        """These assumptions with the `C_V` that the suprema found of `V` and its slack prove for the controller at hand."""
         return replace(self, C_V=C_V, value_holds=True, control_holds=True, basis=self.basis | {"C_V": SEARCHED})
 
     def to_dict(self) -> dict:
@@ -97,7 +98,7 @@ class Assumptions:
 
 
 def found_by_search(what: str) -> Need:
-    """That the supremum ``what``, the largest value of sampled states and ascents, is the true one."""
+    """The need that the supremum ``what``, the largest value of sampled states and ascents, is the true one."""
     return Need(what, SEARCHED, f"{what} is what the search found")
 
 
@@ -108,7 +109,7 @@ def _number(value: float | None) -> str:
 def check_assumptions(
     problem: Problem, constants: Constants, posed: WellPosed, observed: Observed, uses: tuple[bool, bool]
 ) -> Assumptions:
-    """Hold what was ``observed`` against ``constants``: the assumptions, with a warning for each that fails.
+    """Compare what was ``observed`` with ``constants``: the assumptions, with a warning for each that fails.
 
     ``uses`` says whether the certificate has a lower side, which rests on `M`, and an upper one that rests on `C_V`.
     """
@@ -167,16 +168,16 @@ def check_assumptions(
 
 
 def value_holds(reached: float | None, constants: Constants) -> bool:
-    """Whether the value that a controller ``reached``, if one was looked for, does not exceed `C_V`."""
-    return reached is None or reached <= constants.C_V * (1.0 + ROUGH)
+    """Whether the largest value that a controller ``reached``, if it is known, does not exceed `C_V`."""
+    return reached is None or reached <= constants.C_V * (1.0 + VALUE_TOLERANCE)
 
 
 def occupation_holds(
     problem: Problem, constants: Constants, estimate: float | None, mass: float = 1.0
 ) -> tuple[bool, str]:
-    """Whether nothing speaks against `M >= sup mu*`, and what does. An `M` that was given must have been held against the
-    density under the controller, of which ``estimate`` is the supremum, unless the problem knows `mu*` exactly; a guess stays
-    one whatever it was held against. ``mass`` is the integral of `mu0`, and so of every occupation density."""
+    """Whether nothing contradicts `M >= sup mu*`, and what does. An `M` that was given must be compared with ``estimate``,
+    the supremum of the density under the controller, unless the problem knows `mu*` exactly; a guess stays one whatever it
+    was compared with. ``mass`` is the integral of `mu0`, and so of every occupation density."""
     true = problem.occupation_bound
     if true is not None and math.isinf(true):
         return False, "mu* is unbounded for this problem, so no M is large enough"

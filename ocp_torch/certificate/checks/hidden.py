@@ -15,9 +15,9 @@ from ocp_torch.certificate.estimate import t_factor
 from ocp_torch.maths.plane_waves import plane_waves
 
 TURN = 2.0 * math.pi
-# Groups of states whose scatter gives the standard error, at least; how rarely all tests together may err.
-GROUPS, LEVEL = 32, 1e-4
-# Differences below that part of the mean size of what is added up come from rounding and difference quotients.
+GROUPS = 32  # of states at least, whose scatter gives the standard error
+FALSE_ALARM = 1e-4  # probability that any of the tests errs
+# Differences below this part of the mean size of the terms come from rounding and difference quotients.
 MATERIAL = 1e-5
 
 
@@ -33,7 +33,8 @@ class Flux:
 
 @dataclass(frozen=True)
 class Hidden:
-    """A divergence that is not seen: its ``size``, as mass per discount time against one wave, and about where."""
+    """A divergence that is not seen: its ``size``, as mass per discount time against one wave, and a state ``x`` ``(d,)``
+    near it."""
 
     size: float
     x: Tensor
@@ -49,7 +50,7 @@ class Hidden:
 
 @torch.no_grad()
 def hidden_divergence(fluxes: list[Flux]) -> Hidden | None:
-    """What the sets of ``fluxes`` together do not see, if it is more than chance and rounding explain."""
+    """The divergence that the sets of ``fluxes`` together do not see; `None` where chance and rounding explain it."""
     waves = plane_waves(fluxes[0].x.shape[1])
     parts = max(1, math.ceil(GROUPS / len(fluxes)))
     # Consecutive points of a Sobol sequence are spread evenly, every other one of them is not.
@@ -64,7 +65,7 @@ def hidden_divergence(fluxes: list[Flux]) -> Hidden | None:
     sizes = torch.stack([s + m for s, m in zip(seen, moved, strict=True)]).mean(dim=0)
     tests = torch.cat([found.real, found.imag], dim=1)
     mean, error = tests.mean(dim=0), tests.std(dim=0) / math.sqrt(len(groups))
-    allowed = t_factor(1.0 - LEVEL / tests.shape[1], len(groups) - 1) * error + MATERIAL * sizes.repeat(2)
+    allowed = t_factor(1.0 - FALSE_ALARM / tests.shape[1], len(groups) - 1) * error + MATERIAL * sizes.repeat(2)
     excess = torch.where(allowed > 0.0, mean.abs() / allowed.clamp_min(1e-300), 0.0)
     if len(groups) < 2 or not float(excess.max()) > 1.0:
         return None

@@ -19,19 +19,22 @@ from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples, driven
 
-# Of each set of samples: states at which the control is looked at, and states that lines are drawn through in search of
-# jumps. More find rarer ones and take longer.
-CONTROLLED, CROSSED = 4096, 256
-SEGMENTS = 768
-# Lines of each length, half of them along an axis, the states on each, and how many of their pieces are followed by kind.
-LINES, LENGTHS, ON_LINE, FOLLOWED = 48, (1.0, 0.1, 0.01, 1e-3), 65, 64
-# Halvings, after which the longest segment is 3e-11 long: what still changes across it is no slope. After the first of them
-# those with the largest change go on.
-HALVINGS, FIRST_HALVINGS, KEPT = 34, 14, 384
+CONTROLLED = 4096  # states of each set at which the size of the control is computed
+CROSSED = 256  # states of each set through which lines are drawn in search of jumps
+SEGMENTS = 768  # random ones that are halved too
+LINES = 48  # of each length, half of them along an axis
+LENGTHS = (1.0, 0.1, 0.01, 1e-3)
+ON_LINE = 65  # states on a line
+FOLLOWED = 64  # pieces of the lines of a length that are halved, for each way to choose them
+# After the last halving the longest segment is 3e-11 long: what still changes across it is no slope.
+HALVINGS = 34
+FIRST_HALVINGS = 14  # after which only the segments with the largest changes go on
+REMAINING_SEGMENTS = 384
 # A change relative to the largest value met that counts as a jump; above the noise of a controller in float32.
 NOTICEABLE = 1e-5
-# A layer across which so much of the largest value changes within that length is to sampled states the same as a jump.
-LAYER, STEEP = 1e-4, 0.5
+# Sampled states see a layer of this width as a jump if this part of the largest value changes across it.
+LAYER = 1e-4
+LAYER_CHANGE = 0.5
 
 CONTROLLER, DRIFT, MATRIX, NOISE, LOOP = "controller", "drift", "control matrix", "noise", "closed loop"
 
@@ -76,16 +79,16 @@ def observe(
     jumps: bool = True,
     rounded: Policy | None = None,
 ) -> Observed:
-    """Look at the controller ``policy`` at the states of ``sets``, and where the trajectories of ``simulated`` end; its
-    occupation density is computed at so many ``occupation_states``, 0 for not at all, on all cores ``together`` if both are
-    pure functions; without ``jumps`` none are looked for. ``rounded`` is the policy in single precision, if there is one."""
+    """Check the controller ``policy`` at the states of ``sets``, and where the trajectories of ``simulated`` end. Its
+    occupation density is computed at so many ``occupation_states``, 0 for not at all, on all cores ``together`` if problem
+    and policy are pure functions. Jumps are sought if ``jumps``. ``rounded`` is the policy in single precision, if any."""
     with torch.no_grad():
         sup_control = max(float(policy(samples.x[:CONTROLLED]).norm(dim=-1).max()) for samples in sets)
     near = torch.cat([samples.x[:CROSSED] for samples in sets])
     occupation = a_priori = largest_value = None
     if simulated is not None:
         near, largest_value = torch.cat([near, simulated.end_states[:CONTROLLED]]), simulated.largest_value
-        # Where the problem says that mu* is unbounded there is no M to hold a largest density against.
+        # Where the problem declares mu* unbounded there is no M to compare a largest density with.
         # With noise the density is followed back in time by its divergences.
         followed = problem.gives_divergences or not problem.noisy
         if occupation_states and followed and problem.occupation_bound != math.inf:
@@ -107,7 +110,7 @@ def largest_jump(policy: Policy, dim: int, problem: Problem | None = None, near:
     """
 
     def parts(x: Tensor) -> dict[str, Tensor]:
-        """What may jump, each ``(N, k)``; the data come first, as what jumps in them jumps in the closed loop too."""
+        """What may jump, each ``(N, k)``; data come first, as a jump of theirs is one of the closed loop too."""
         if problem is None:
             return {CONTROLLER: policy(x)}
         a, B, _, _ = problem.vector_fields(x, divergences=False)
@@ -138,17 +141,18 @@ def largest_jump(policy: Policy, dim: int, problem: Problem | None = None, near:
         if float(narrow.max()) > steepest:
             steepest, steep_at = float(narrow.max()), left[int(narrow.argmax())].clone()
         if k == FIRST_HALVINGS:
-            top = change.topk(min(KEPT, len(change))).indices
+            top = change.topk(min(REMAINING_SEGMENTS, len(change))).indices
             left, right, value_left, value_right = (part[top] for part in (left, right, value_left, value_right))
     jump = _largest(parts, sizes, left, right, NOTICEABLE)
-    if jump.size > 0.0 or problem is None or steepest < STEEP:
+    if jump.size > 0.0 or problem is None or steepest < LAYER_CHANGE:
         return jump
     away = 0.5 * LAYER * normalize(torch.ones(1, dim, dtype=torch.float64))
-    return _largest(parts, sizes, steep_at - away, steep_at + away, 0.5 * STEEP, LAYER)
+    return _largest(parts, sizes, steep_at - away, steep_at + away, 0.5 * LAYER_CHANGE, LAYER)
 
 
 def _largest(parts, sizes: dict[str, float], left: Tensor, right: Tensor, least: float, width: float = 0.0) -> Jump:
-    """Of which of the ``parts`` the change from ``left`` to ``right`` is largest for its size, if above ``least`` of it."""
+    """The jump of the one of ``parts`` whose change from ``left`` to ``right`` is largest, relative to ``sizes``, and above
+    ``least``; a later part must change twice as much as those before."""
     best, relative, before = Jump(0.0, left[0].remainder(1.0)), least, parts(left)
     for name, after in parts(right).items():
         change = (after - before[name]).norm(dim=-1).nan_to_num(nan=0.0)

@@ -23,34 +23,38 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.starts import UNIFORM_STATES, evaluation_distribution
 
-# Below so many states behind the scatter a mean is carried by a few; smaller kurtoses than that say nothing.
-FEW, KURTOSIS = 30.0, 30.0
-# A mean of which the largest contributions fall off as the power of a number below `HEAVY` has no standard error, and below 1
-# it is none; the power is told from so many of `N`, the root of `N` if that is enough, and taken to be that at least. What is
-# left beyond is off by as much as the power is, and counts twice: of the mean of `|x|^-.8`, 8.5, up to .4 was missing with
-# six seeds, and .3 to 1.4 was added. The largest of them, that part, must fall off as slowly: errors of an arm's `V` did not,
-# and .35 % had been added to one simulation of three.
-HEAVY, LEAST_TAIL, SLOWEST, ROOM, UPPER = 2.0, 16, 1.05, 2.0, 4
-# What a few carry is let pass up to that part of the answer; and how often states are drawn anew.
-MATERIAL, ROUNDS = 1e-3, 3
+# States behind the scatter, below which a few carry the mean.
+FEW = 30.0
+# Kurtosis below which contributions are not examined.
+LEAST_KURTOSIS = 30.0
+# Contributions that fall off as a lower power have no variance; by one below 1 no mean.
+HEAVY = 2.0
+LEAST_TAIL = 16  # largest contributions that tell the power; it is told by the root of `N`, if that is enough
+LEAST_POWER = 1.05  # that is assumed
+# Factor on what is added, as that is off by as much as the power: of 8.5, the mean of `|x|^-.8`, up to .4 was missing.
+ROOM = 2.0
+# The largest fourth of them must fall off as slowly: errors of an arm's `V` did not, and .35 % had been added to one mean.
+LARGEST_DIVISOR = 4
+MATERIAL = 1e-3  # part of the answer below which what a few carry is ignored
+ROUNDS = 3  # in which states are drawn anew, at most
 
 
 def unmet(size: float, draws: int) -> float:
-    """What a contribution of that ``size`` adds at most to the mean of ``draws`` that showed none: the probability of what
-    they do not show is `3 / N` at most, 95 % sure (the rule of three)."""
+    """What a contribution of that ``size`` adds at most to the mean of ``draws`` that showed none: its probability is `3 / N`
+    at most, 95 % sure (the rule of three)."""
     return 3.0 / draws * size
 
 
 def rarity(contributions: Tensor, size: float) -> float:
-    """By how much the mean of ``contributions`` ``(N,)`` may be off because a few carry it; 0 where many do, or where what
-    they carry is small beside ``size``, the answer's."""
+    """The error that the mean of ``contributions`` ``(N,)`` may have because a few carry it; 0 where many do, or where what
+    they carry is small beside the answer's ``size``."""
     away = (contributions - contributions.mean()).double()
     square = float(away.square().mean())
     if not square > 0.0 or not math.isfinite(square):
         return 0.0
     kurtosis = float((away.square() / square).square().mean())
     behind = max(len(away) / kurtosis, 1.0)
-    if kurtosis < KURTOSIS or behind >= FEW:
+    if kurtosis < LEAST_KURTOSIS or behind >= FEW:
         return 0.0
     carried = float(away.abs().topk(int(FEW)).values.sum()) / len(away)
     return carried * (2.0 * math.sqrt(behind) + 3.0) / behind if carried > MATERIAL * abs(size) else 0.0
@@ -58,8 +62,8 @@ def rarity(contributions: Tensor, size: float) -> float:
 
 def beyond_largest(values: Tensor, weights: Tensor, size: float) -> float:
     """What values larger than any of ``values`` ``(N,)`` add to their mean by ``weights`` ``(N,)``, if the largest fall off
-    as a power so slow that they have no variance: all that were met then say little of those. 0 where they fall off faster,
-    as far as so few tell, or where that is small beside ``size``, the answer's.
+    by a power so low that there is no variance: the values met then say little of them. 0 where they fall off faster, as far
+    as the largest tell, or where that is small beside the answer's ``size``.
 
     The power is the estimate of Hill (1975).
     """
@@ -73,14 +77,14 @@ def beyond_largest(values: Tensor, weights: Tensor, size: float) -> float:
         return 0.0
     weight = weights[top.indices].double()
     mass = weight.cumsum(0)[:-1]
-    # Of a power these are independent and of one exponential distribution; a step is a single large one.
+    # For a power law these are independent with one exponential distribution; a step gives a single large one.
     spacings = -top.values.log().diff() * mass / weight[1:]
-    spread, upper = float(spacings.mean()), spacings[: count // UPPER]
-    # Less the standard error, and for the largest alone with it: errors that fall off slowly end at the largest slack.
+    spread, upper = float(spacings.mean()), spacings[: count // LARGEST_DIVISOR]
+    # All of them by a standard error less, the largest by one more: errors of `V` fall off slowly up to the largest slack.
     sure, perhaps = 1.0 - 1.0 / math.sqrt(count), 1.0 + 1.0 / math.sqrt(len(upper))
     if not min(sure * spread, float(spacings.median()) / math.log(2.0), perhaps * float(upper.mean())) * HEAVY > 1.0:
         return 0.0
-    power = max(1.0 / spread, SLOWEST)
+    power = max(1.0 / spread, LEAST_POWER)
     above = float(mass[-1]) / len(away) * least * power / (power - 1.0)
     more = ROOM * above * (largest / least) ** (1.0 - power)
     return more if more > MATERIAL * abs(size) else 0.0

@@ -16,16 +16,18 @@ from ocp_torch.problems.blame import place
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# States for periodicity and the seam, and at most so many coordinates of the latter.
-PROBES, MOST_SEAMS = 256, 32
-# Relative differences that rounding does not explain; half the width of the gap across which the seam is looked at.
-ROUNDING, SEAM_STEP, SEAM_JUMP = 1e-6, 1e-9, 1e-5
-# How far the sampled mass of mu0 may be from 1, beside its confidence interval at that level.
-MASS_TOLERANCE, MASS_LEVEL = 1e-4, 0.9999
-# What the states' masses must be worth, as a part of as many equal ones: below, a few states carry mu0 and no mass is known.
+PROBES = 256  # states at which the period is checked; a fourth of them at each seam
+MOST_SEAMS = 32  # coordinates whose seams are checked
+ROUNDING = 1e-6  # relative difference, a period apart, that rounding may explain
+SEAM_STEP = 1e-9  # half the width of the gap across which a seam is checked
+SEAM_JUMP = 1e-5  # relative difference across that gap that is no jump
+# How far the sampled mass of mu0 may be from 1, beside its confidence interval at `MASS_LEVEL`.
+MASS_TOLERANCE = 1e-4
+MASS_LEVEL = 0.9999
+# Effective part of the sampled states that carry mu0 (`effective_part`), below which its mass is not known.
 LEAST_WORTH = 0.02
-# How many of the lowest states a function is followed downhill from, in search of a negative value, and for how many steps.
-DESCENTS, DESCENT_STEPS = 16, 40
+DESCENTS = 16  # lowest states from which a negative value of a function is sought downhill
+DESCENT_STEPS = 40
 # The columns of samples, and the functions that give them.
 NAMES = {"f": "state_cost", "a": "drift", "B": "control_matrix", "mu0": "initial_density", "noise": "noise"}
 DIFFERENTIATED = {"a", "B", "noise"}  # by the bounds that take divergences
@@ -33,9 +35,9 @@ DIFFERENTIATED = {"a", "B", "noise"}  # by the bounds that take divergences
 
 @dataclass(frozen=True)
 class WellPosed:
-    """What was found: ``sound`` where the problem is one (no bound stands without), ``nonnegative`` where `f >= 0` (`J`
-    and `G` need it), ``smooth_seam`` where `a`, `B` and the noise do not jump from 1 to 0 (what takes their divergence needs
-    it)."""
+    """What was found: ``sound`` where the problem is well posed (every bound needs it), ``nonnegative`` where `f >= 0` (`J`
+    and `G` need it), ``smooth_seam`` where `a`, `B` and the noise do not jump from 1 to 0 (bounds that take their divergence
+    need it)."""
 
     sound: bool
     nonnegative: bool
@@ -48,9 +50,9 @@ class WellPosed:
 @torch.no_grad()
 def check_problem(problem: Problem, sets: list[Samples], odd: Callable[[], Tensor | None] = lambda: None) -> WellPosed:
     """Compare values a period apart, on both sides of the seam, and against 0 and 1; on ``sets`` and climbed from there, and
-    at the states ``odd()`` ``(K, d)``, which are asked for once all is known to be finite.
+    at the states ``odd()`` ``(K, d)``, which are computed once all is known to be finite.
 
-    Raises `InputError` where a function is not finite.
+    Raises `ProblemError` where a function is not finite.
     """
     for samples in sets:
         for name, column in _columns(samples).items():
@@ -99,8 +101,8 @@ def check_problem(problem: Problem, sets: list[Samples], odd: Callable[[], Tenso
 
 
 def _differences(problem: Problem, x: Tensor, y: Tensor, tolerance: float, sizes: dict[str, float]) -> dict[str, float]:
-    """The largest difference of each function between rows of ``x`` and ``y``, where it is above that part of its largest
-    value anywhere: at the seam a function that is odd is nearly 0."""
+    """The largest difference of each function between rows of ``x`` and ``y``, where it is above the part ``tolerance`` of
+    its largest value anywhere (``sizes``), as an odd function is nearly 0 at the seam."""
     here, there = (_columns(Samples.of(problem, z, divergences=False)) for z in (x, y))
     found = {}
     for name, left in here.items():
@@ -124,7 +126,7 @@ def _seams(problem: Problem, sizes: dict[str, float]) -> dict[str, float]:
 
 
 def _columns(samples: Samples) -> dict[str, Tensor]:
-    """What `NAMES` are of; of the noise `sigma sigma^T`, on which alone the law of a path depends."""
+    """The columns that `NAMES` lists; for the noise `sigma sigma^T`, on which alone the law of a path depends."""
     found = {name: getattr(samples, name) for name in NAMES}
     return {name: c @ c.mT if name == "noise" else c for name, c in found.items() if c is not None}
 

@@ -45,8 +45,8 @@ def backward_flow(problem: Problem, policy: Policy, together: bool = False) -> D
 
     Its discounted integral is `mu^u(x) = rho int e^{-rho t} mu0(y_t) exp(-int_0^t div g(y_s) ds) dt`, `y_0 = x`: the density
     of a flow changes by its divergence (the representation behind Proposition 8 of the paper). Valid for a Lipschitz loop.
-    Differences of `g`, all in one call, are cheaper than derivatives of a controller that is a derivative itself, unless that
-    knows its own and `B` is the same everywhere (`ValuePolicy.flux_divergence`).
+    Differences of `g`, all in one call, are cheaper than derivatives of a controller that is a derivative itself, unless the
+    controller knows its divergence and `B` is constant (`ValuePolicy.flux_divergence`).
 
     It is evaluated on all cores ``together`` if ``problem`` and ``policy`` are pure functions.
 
