@@ -1,8 +1,8 @@
 r"""A density that is constant on each of a partition of the torus into boxes, to sample from and to be fitted to scores.
 
-To estimate `int g` by `g(x) / p(x)` with `x` from `p` has the second moment `int g^2 / p`. On a partition into boxes `b` of
-volume `v_b` it is least for probabilities `P_b` proportional to `sqrt(v_b int_b g^2)`, and is then the square of their sum
-(Cauchy and Schwarz); every split of a box lowers that sum or leaves it. So boxes are split where it falls most.
+The estimate `g(x) / p(x)` of `int g`, with `x` from `p`, has the second moment `int g^2 / p`. On a partition into boxes `b`
+of volume `v_b` it is least for probabilities `P_b` proportional to `sqrt(v_b int_b g^2)`, and is then the square of their
+sum (Cauchy and Schwarz). Every split of a box lowers that sum or leaves it, so boxes are split where it falls most.
 """
 
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError
 
-# A box is split at a multiple of this part of its length; and not where fewer states than these would be left on a side
-# (their mean is what the density there rests on), or where that lowers the sum over all boxes by less than this part.
-PARTS, FEWEST, LEAST_GAIN = 8, 24, 1e-3
+PARTS_PER_EDGE = 8  # equal ones, between two of which a box may be split
+LEAST_STATES = 24  # on each side of a split: the density rests on their mean
+LEAST_GAIN = 1e-3  # part by which a split lowers the sum over all boxes
 
 
 @dataclass(frozen=True)
 class Boxes:
-    """A binary tree of `K` boxes, the torus `[0, 1)^d` first; one that is not split is a leaf, and its own child."""
+    """A binary tree of `K` boxes, the torus `[0, 1)^d` first; a box that is not split is a leaf, and its own child."""
 
     low: Tensor  # (K, d) corners, float64
     size: Tensor  # (K, d) edges, float64
@@ -41,7 +41,7 @@ class Boxes:
 
     @property
     def weight(self) -> Tensor:
-        """One over the mean density in each box, ``(K,)``."""
+        """The inverse of the mean density in each box, ``(K,)``."""
         return self.size.prod(dim=1) / self.probability
 
     def place(self, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -102,7 +102,7 @@ class Boxes:
 def fitted(x: Tensor, weight: Tensor, score: Tensor, uniform: float) -> Boxes:
     """Boxes for integrands of size about ``score`` ``(N,)`` at states ``x`` ``(N, d)`` of the given ``weight``.
 
-    Of the probability the part ``uniform`` is spread evenly, so that no weight is above ``1 / uniform``. Scores that are not
+    The part ``uniform`` of the probability is spread evenly, so that no weight is above ``1 / uniform``. Scores that are not
     finite count as 0.
     """
     square = np.nan_to_num((weight * score.square()).double().numpy(), nan=0.0, posinf=0.0, neginf=0.0)
@@ -123,7 +123,7 @@ def fitted(x: Tensor, weight: Tensor, score: Tensor, uniform: float) -> Boxes:
 
 
 def _grow(rows: list[list], x: np.ndarray, square: np.ndarray, low: np.ndarray, size: np.ndarray) -> int:
-    """Append to ``rows`` the box at ``low`` and then all its parts, with the sum of ``square`` in each; its number."""
+    """Append to ``rows`` the box at ``low``, then all its parts, with the sum of ``square`` in each. Returns its number."""
     own, cut = len(rows), _best_cut(x, square, low, size)
     rows.append([low, size, square.sum(), 0, (own, own)])
     if cut is not None:
@@ -140,16 +140,20 @@ def _grow(rows: list[list], x: np.ndarray, square: np.ndarray, low: np.ndarray, 
 def _best_cut(x: np.ndarray, square: np.ndarray, low: np.ndarray, size: np.ndarray) -> tuple[int, float] | None:
     """The axis and the part of the edge at which a cut lowers `sqrt(volume * square)` most; `None` where none is worth it."""
     n, dim = x.shape
-    if n < 2 * FEWEST:
+    if n < 2 * LEAST_STATES:
         return None
-    bins = np.clip(((x - low) / size * PARTS).astype(int), 0, PARTS - 1) + PARTS * np.arange(dim)
+    bins = np.clip(((x - low) / size * PARTS_PER_EDGE).astype(int), 0, PARTS_PER_EDGE - 1) + PARTS_PER_EDGE * np.arange(
+        dim
+    )
     within = lambda each: (
-        np.bincount(bins.ravel(), np.repeat(each, dim), dim * PARTS).reshape(dim, PARTS).cumsum(axis=1)
+        np.bincount(bins.ravel(), np.repeat(each, dim), dim * PARTS_PER_EDGE)
+        .reshape(dim, PARTS_PER_EDGE)
+        .cumsum(axis=1)
     )
     count, mass = within(np.ones(n))[:, :-1], within(square)[:, :-1]
-    part = np.arange(1, PARTS) / PARTS
+    part = np.arange(1, PARTS_PER_EDGE) / PARTS_PER_EDGE
     halves = np.sqrt(part * mass) + np.sqrt((1.0 - part) * (square.sum() - mass).clip(0.0))
     gain = np.sqrt(size.prod()) * (np.sqrt(square.sum()) - halves)
-    gain[(count < FEWEST) | (n - count < FEWEST)] = 0.0
+    gain[(count < LEAST_STATES) | (n - count < LEAST_STATES)] = 0.0
     axis, place = np.unravel_index(gain.argmax(), gain.shape)
     return (int(axis), float(part[place])) if gain[axis, place] > LEAST_GAIN else None

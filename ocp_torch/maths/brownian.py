@@ -1,9 +1,9 @@
 r"""The closed loop in time where there is noise: Euler-Maruyama steps, halved on the same Brownian paths, and extrapolated.
 
-Along one path halving a step changes a result by its square root; but the mean changes in proportion to the step (weak order
-1), so that twice the finer mean less the coarser one is of order 2 (Talay and Tubaro, 1990). As both are taken on the same
-paths, what they differ by shows little of the noise itself, and a few paths will do for it: each halving is made on half of
-the paths of the one before (multilevel Monte Carlo: Giles, 2008), and costs no more than it.
+The error along one path is of order 1/2 in the steps, but that of the mean of (weak) order 1, so that twice the mean on
+halved steps less the one before is of order 2 (Talay and Tubaro, 1990). On the same paths the difference of both has little
+variance, and few paths suffice for it: each halving is made on half of the paths of the one before (multilevel Monte Carlo:
+Giles, 2008), and costs no more than it.
 """
 
 import math
@@ -18,21 +18,20 @@ from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.runge_kutta import Dynamics, Switched
 from ocp_torch.maths.seeds import Branch, derive_seed
 
-# What a rate counts at a part of each of the horizons ``(N,)``.
+# Maps horizons ``(N,)``, and a time as a part of them, to the weights of the rates at that time.
 Weight = Callable[[Tensor, float], Tensor]
 
-# Paths whose increments are drawn together; and those that a core follows at a time: each halving has half as many as the one
-# before, and they are to be shared too.
-TOGETHER, PIECE = 512, 256
-# How often steps are halved at most; on how many paths of each replicate at least; and how often on these, as each halving
-# of them takes twice as long as the one before.
-MOST_HALVINGS, FEWEST_PATHS, ON_FEWEST = 5, 8, 2
-# How far means on steps and on halved steps may differ, as a part of the standard error, before they are halved again: a
-# quarter took one more halving on dubins, a sixth of its simulation, and the bias is in the interval whatever it is.
+DRAWN_TOGETHER = 512  # paths whose increments are drawn at once
+PATHS_PER_PIECE = 256  # that a core follows at a time: small, as each halving has half as many paths to share
+MOST_HALVINGS = 5  # of the steps
+FEWEST_PATHS = 8  # of each replicate
+HALVINGS_ON_FEWEST = 2  # at most: on a fixed number of paths each takes twice as long as the one before
+# Steps are halved again where the bias is above this part of the standard error (a quarter took dubins one more halving, a
+# sixth of its simulation); the interval contains the bias whatever it is.
 GOOD_PART = 0.5
-# What is left after the last halving, as a multiple of what that changed, where the drift jumps and means are of weak order
-# 1/2 only: `1 / (sqrt 2 - 1)`. Where it is smooth a third is left.
-LEFT = 1.0 / (math.sqrt(2.0) - 1.0)
+# What is left after the last halving, relative to what that changed, where the drift jumps and means are of weak order 1/2
+# only; where it is smooth a third is left.
+REMAINDER = 1.0 / (math.sqrt(2.0) - 1.0)
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class Grid:
         return torch.linspace(0.0, 1.0, self.steps + 1, dtype=self.horizon.dtype) ** self.grading
 
     def of(self, rows: Tensor) -> "Grid":
-        """That of the paths ``rows``."""
+        """The grid of the paths ``rows``."""
         return Grid(self.horizon[rows], self.steps, self.grading)
 
 
@@ -76,13 +75,13 @@ def increments(grid: Grid, motions: int, halvings: int, seed: int, rows: int) ->
 
 
 def discounted(rho: float) -> Weight:
-    """`rho e^{-rho t} dt`: what a rate counts up to the horizon."""
+    """The weight `rho e^{-rho t} dt`, up to the horizon."""
     return lambda horizon, part: horizon * rho * torch.exp(-rho * horizon * part)
 
 
 def at_random_times(rho: float) -> Weight:
-    """For horizons `T ~ Exp(rho)`: as for `rate_at`, each `s` in (0, 1] gives the discounted integral in the mean. They are
-    averaged over the last quarter, by a weight that is smooth at its ends."""
+    """The weight for horizons `T ~ Exp(rho)`: as for `rate_at`, each part `s` in (0, 1] of them gives the discounted integral
+    in the mean. The last quarter of `s` is averaged, by a weight that is smooth at its ends."""
     smooth = lambda part: 8.0 * math.sin(4.0 * math.pi * part) ** 2 if part > 0.75 else 0.0
     return lambda horizon, part: smooth(part) * part * torch.exp(rho * horizon * (1.0 - part))
 
@@ -95,8 +94,8 @@ def path_integral(
     d)``.
 
     ``noise`` gives `sigma` ``(N, d, k)``; ``moves`` ``(steps, N, k)`` are the increments. The rule is the trapezoidal one.
-    Where dynamics are `Switched` the rate is that after the jump: what is wrong with it is of the order that halved steps
-    and extrapolation take off.
+    Where dynamics are `Switched` the rate is the one after the jump, whose error is of the order that halved steps and
+    extrapolation remove.
     """
     x, total = x0, torch.zeros_like(grid.horizon)
     widths = torch.nn.functional.pad(grid.parts.diff(), (1, 1))
@@ -116,7 +115,7 @@ def path_of(dynamics: Dynamics, noise: Callable[[Tensor], Any], x0: Tensor, grid
 def _states(
     dynamics: Dynamics, noise: Callable[[Tensor], Any], x0: Tensor, grid: Grid, moves: Tensor
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """The states before the steps and after the last one, and their rates."""
+    """The states at all times of ``grid``, one after the other, and their rates."""
     x, widths = x0, grid.parts.diff()
     for k in range(grid.steps + 1):
         x = Switched.before(dynamics, k, grid.steps, x) if k < grid.steps else x
@@ -128,7 +127,7 @@ def _states(
 
 
 class Mean(NamedTuple):
-    """The mean of a path integral over the paths of each of some replicates."""
+    """The mean of a path integral over the paths of each replicate."""
 
     integrals: Tensor  # (N,) on the first steps
     refinement: Tensor  # (replicates,) what finer steps, extrapolated, add to the weighted mean of each replicate
@@ -154,13 +153,13 @@ def expectation(
     """The mean by ``weights`` ``(N,)`` of the `path_integral` from ``x0`` ``(N, d)``, ``replicates`` sets one after the
     other. Steps are halved until halving moves it by less than ``tolerance`` or little beside its standard error.
 
-    The bias is what the last halving moved the extrapolated mean by, with twice the standard error of that or `LEFT` times;
-    and, where ``dynamics`` round, by how much ``audit`` moves the mean over a few paths. Paths are followed ``together`` on
-    all cores if ``dynamics`` and ``noise`` are pure.
+    The bias is the change of the extrapolated mean by the last halving, with twice its standard error added or times
+    `REMAINDER`, whichever is larger; where ``dynamics`` round, the change by ``audit`` over a few paths is added. Paths are
+    followed ``together`` on all cores if ``dynamics`` and ``noise`` are pure.
     """
     motions = noise(x0[:1]).shape[-1]
     rows = torch.arange(len(x0)).unflatten(0, (replicates, -1))
-    chunks = rows.split(max(1, TOGETHER // replicates), dim=1)
+    chunks = rows.split(max(1, DRAWN_TOGETHER // replicates), dim=1)
 
     def followed(halvings: int, by: Dynamics = dynamics, thinned: int = 0) -> tuple[Tensor, Tensor]:
         """Integrals ``(replicates, n)`` along the first `n` paths of each replicate, and their ends."""
@@ -174,14 +173,14 @@ def expectation(
         at, fine = few.flatten(), Grid(grid.horizon, grid.steps * 2**halvings, grid.grading)
         drawn = torch.cat(moves, dim=2).flatten(1, 2)
         along = lambda n: path_integral(by, noise, x0[at[n]], fine.of(at[n]), drawn[:, n], weight)
-        integrals, end = in_pieces(along, torch.arange(len(at)), together, PIECE, long=True)
+        integrals, end = in_pieces(along, torch.arange(len(at)), together, PATHS_PER_PIECE, long=True)
         return integrals.view_as(few), end
 
     mass = weights.view_as(rows)
     thinnings = max(1, rows.shape[1] // FEWEST_PATHS).bit_length() - 1
     integrals, end = followed(0)
     mean, coarse, before, bias = (mass * integrals).mean(dim=1), integrals, torch.zeros(()), math.inf
-    for halvings in range(1, min(MOST_HALVINGS, thinnings + ON_FEWEST) + 1):
+    for halvings in range(1, min(MOST_HALVINGS, thinnings + HALVINGS_ON_FEWEST) + 1):
         fine, _ = followed(halvings)
         of = slice(fine.shape[1])
         change = mass[:, of] * (fine - coarse[:, of])
@@ -190,7 +189,7 @@ def expectation(
         if halvings > 1:
             moved = (2.0 * change - before[:, of]).flatten()
             size, error = abs(float(moved.mean())), float(moved.std()) / math.sqrt(len(moved))
-            bias = max(LEFT * size, size + 2.0 * error)
+            bias = max(REMAINDER * size, size + 2.0 * error)
             chance = float(extrapolated.std()) / math.sqrt(replicates) if replicates > 1 else 0.0
             if bias <= max(tolerance, GOOD_PART * chance):
                 break

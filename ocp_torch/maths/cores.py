@@ -25,21 +25,21 @@ CHUNK = 1024
 
 
 def cores() -> int:
-    """How many this process may use, beside others of its run on this machine."""
+    """The number of cores that this process may use, beside others of its run on this machine."""
     there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, there // here().busy)
 
 
 @cache
 def _helpers(count: int) -> ThreadPoolExecutor:
-    """``count`` threads that wait for pieces: new ones for each call would take a millisecond and a half to be of use."""
+    """``count`` threads that wait for pieces: to start new ones for each call would take a millisecond and a half."""
     return ThreadPoolExecutor(count, thread_name_prefix="ocp_torch pieces")
 
 
 def side_by_side(function: Callable[[T], S], pieces: Sequence[T], together: bool = True) -> list[S]:
     """``function`` of each of ``pieces``: ``together``, for which it must be pure, or one after the other.
 
-    Whoever asks takes pieces too, so that nobody waits for a thread that others keep busy.
+    The calling thread takes pieces too, so that it never waits for threads that other callers keep busy.
     """
     count = min(cores(), len(pieces)) - 1 if together else 0
     if count < 1:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-# They make a tensor of Python's numbers.
+# Functions that make a tensor of Python's numbers.
 MAKERS = {torch.tensor, torch.as_tensor, Tensor.new_tensor}
 
 
@@ -24,7 +24,7 @@ def decided(asked: Tensor) -> int:
 
 
 class Noted(TorchFunctionMode):
-    """Within it answers and constants are noted, in their order."""
+    """A context within which answers and constants are noted, in their order."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -43,7 +43,7 @@ class Noted(TorchFunctionMode):
 
 
 class Told(TorchFunctionMode):
-    """Within it answers and constants are those that were ``noted``; the ``questions`` are kept, to be checked."""
+    """A context within which answers and constants are those that were ``noted``; ``questions`` are kept, to be checked."""
 
     def __init__(self, noted: Noted) -> None:
         super().__init__()

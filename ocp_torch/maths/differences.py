@@ -5,10 +5,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-# Half the distance of the two states of a difference quotient, by what the function computes in: near the cube root of its
-# rounding, which balances what rounding and what curvature cost.
+# Half the distance of the two states of a difference quotient, by the function's precision: near the cube root of its
+# rounding, which balances the errors by rounding and by curvature.
 STEPS = {torch.float64: 1e-5, torch.float32: 2e-3}
-# The same for second derivatives of fourth order, which rounding spoils more: near the sixth root of it.
+# Steps of second derivatives of fourth order, to which rounding does more: near the sixth root of it.
 SECOND_STEPS = {torch.float64: 1e-3, torch.float32: 2e-2}
 
 

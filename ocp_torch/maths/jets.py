@@ -19,8 +19,8 @@ from ocp_torch.maths.cores import CHUNK, parted, side_by_side, spread
 
 Field = Callable[[Tensor], Tensor]
 
-# Of so many pieces and more other processes take some: the way there and back takes as long as one to four of them.
-MANY = 8
+# Pieces from which on other processes take some: the way there and back takes as long as one to four pieces.
+SHARED_FROM = 8
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Jet:
     curvature: Any = None
 
     def map(self, function: Callable[[Any], Any]) -> "Jet":
-        """``function`` of each part, for what acts on all alike: a choice of states, a multiple, the field as mere data."""
+        """``function`` of each part: for a choice of states, a multiple, a detached jet."""
         curvature = None if self.curvature is None else function(self.curvature)
         return Jet(function(self.value), function(self.gradient), curvature)
 
@@ -105,19 +105,19 @@ def _differentiable(x: Tensor) -> Tensor | None:
 
 
 def is_data(x: Tensor) -> bool:
-    """Whether nothing is differentiated in ``x``: neither by a graph, nor by a transform of `torch.func`."""
+    """Whether nothing is differentiated with respect to ``x``, neither by a graph nor by a transform of `torch.func`."""
     return not (torch.is_grad_enabled() and x.requires_grad) and _differentiable(x) is not None
 
 
 @torch.no_grad()
 def chunked_jet(field: Field, x: Tensor, sigma: Tensor | None = None, chunk: int = CHUNK) -> Jet:
-    """The jet of a scalar ``field`` at many states, without a graph; on all cores that of a network of this package, which is
-    known by its method ``jet`` to be a pure function."""
+    """The jet of a scalar ``field`` at many states, without a graph; on all cores where it is a network of this package,
+    known by its method ``jet``, which is a pure function."""
     sizes = parted(len(x), chunk)
     columns = [None] * len(sizes) if sigma is None else sigma.split(sizes)
     quiet = torch.no_grad()(lambda of: jet(field, *of))  # each thread decides for itself whether there are graphs
     pieces = list(zip(x.split(sizes), columns, strict=True))
-    shared = spread if len(pieces) >= MANY else side_by_side
+    shared = spread if len(pieces) >= SHARED_FROM else side_by_side
     return Jet.concatenate(shared(quiet, pieces, isinstance(field, nn.Module) and hasattr(field, "jet")))
 
 
@@ -154,8 +154,8 @@ def divergence(vector_field: Field, x: Tensor) -> Tensor:
 
 
 def column_divergences(columns: Tensor, at: Tensor) -> Tensor:
-    """The divergence of each of the ``columns`` ``(N, d, m)``, which were made of the states ``at`` ``(N, d)``; ``(N, m)``. A
-    reverse pass for each entry: where they do not vary, as they are not in the graph, there is none."""
+    """The divergence ``(N, m)`` of each of the ``columns`` ``(N, d, m)``, computed from the states ``at`` ``(N, d)``: by a
+    reverse pass for each entry, or none where they do not vary and so are not in the graph."""
     total = at.new_zeros(len(at), columns.shape[-1])
     if not columns.requires_grad:
         return total
@@ -172,7 +172,7 @@ def diffusion_divergences(noise: Callable[[Tensor], Any], x: Tensor) -> tuple[Te
     field ``noise``, `sigma`: ``(N, d) -> (N, d, k)``."""
 
     def row_divergence(y: Tensor) -> Tensor:
-        # Of sigma_ik sigma_jk / 2 by the product rule: d k reverse passes, where D itself would take d^2.
+        # The divergence of sigma_ik sigma_jk / 2 by the product rule: d k reverse passes, where D itself would take d^2.
         flat, jacobian = value_and_jacobian(lambda z: noise(z).flatten(1), y)
         sigma, slope = (
             flat.unflatten(1, (y.shape[1], -1)),

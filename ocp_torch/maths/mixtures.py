@@ -14,13 +14,10 @@ from ocp_torch.maths.sampling import evaluation_points
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import batched
 
-# A standard deviation at which a wrapped normal density is as good as uniform: it differs by 1.4 % at most.
-WIDEST = 0.5
-# Copies of a wrapped density on each side of the torus: at WIDEST the next is 7 standard deviations away. Below NARROW only
-# the nearest copy counts: the others are 8 standard deviations away.
-IMAGES, NARROW = 3, 0.06
-# States whose density is computed at once: all components of them fit the cache.
-CHUNK = 2**13
+WIDEST = 0.5  # standard deviation at which a wrapped normal density is as good as uniform, to 1.4 % at most
+IMAGES = 3  # copies of a wrapped density on each side of the torus: at WIDEST the next is 7 standard deviations away
+NARROW = 0.06  # standard deviation below which only the nearest copy counts: the others are 8 of it away
+CHUNK = 2**13  # states whose density is computed at once: all components of them fit the cache
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,7 @@ class Mixture:
         return len(self.shares) == 0
 
     def scaled(self, part: float) -> "Mixture":
-        """With ``part`` of the whole in the components, and the rest uniform."""
+        """The mixture with ``part`` of the whole in the components, and the rest uniform."""
         return self if self.is_uniform else Mixture(part * self.shares / self.shares.sum(), self.centres, self.widths)
 
     @staticmethod
@@ -77,8 +74,8 @@ class Mixture:
     def draw(self, count: int, replicate: int, seed: int, extra: int = 0) -> tuple[Tensor, Tensor]:
         """``count`` points ``(count, d + extra)``, ``extra`` coordinates uniform, and one over their density ``(count,)``.
 
-        Each component has a point set of its own, whose size is its share of ``count`` rounded up or down by chance. Uniform,
-        these are `evaluation_points`; else their order is random, and a part of them will do.
+        Each component has a point set of its own, whose size is its share of ``count`` rounded up or down by chance. The
+        uniform density has `evaluation_points`; others have points in random order, of which any part may be used.
         """
         if self.is_uniform:
             points = evaluation_points(count, self.dim + extra, replicate, seed)

@@ -6,7 +6,7 @@ from typing import Any
 
 import cloudpickle
 
-# What stands for the problem: it may hold what cannot be sent, and every process has one.
+# The name that stands for the problem, which every process has, and which may hold what cannot be sent.
 PROBLEM = "problem"
 
 

@@ -23,12 +23,12 @@ from ocp_torch.maths.packing import packed, unpacked
 T = TypeVar("T")
 S = TypeVar("S")
 
-# How long a process waits for the others in a step; and for the first one, which may be making a certificate.
-STEP, WORD = timedelta(minutes=15), timedelta(days=7)
-# How long one that has lost the others waits for the first to have saved, or to say that it left.
-LAST_WORD = timedelta(seconds=3)
-# Keys of the store that torchrun keeps: the first process needs the others no more; what failed in another one.
-LEFT, FAILED = "ocp_torch/left", "ocp_torch/failed"
+STEP_TIMEOUT = timedelta(minutes=15)  # for the other processes in a step
+FIRST_TIMEOUT = timedelta(days=7)  # for the first process, which may be making a certificate
+FAREWELL_TIMEOUT = timedelta(seconds=3)  # of a process that has lost the others, for the first to say that it left
+# Keys of the store that torchrun keeps.
+LEFT_KEY = "ocp_torch/left"  # the first process needs the others no more
+FAILED_KEY = "ocp_torch/failed"  # what failed in another process
 
 
 class LostError(InputError):
@@ -40,13 +40,13 @@ class Left(BaseException):
 
 
 class Alone:
-    """The only process."""
+    """A run's only process."""
 
     first, size, share = True, 1, slice(None)
     busy = 1  # processes of the run that compute on this machine now
 
     def use(self, device: torch.device, problem: object = None) -> None:
-        """Take the means of what is on ``device``, of a run of ``problem``, which every process has."""
+        """Prepare for means of what is on ``device``, in a run of ``problem``, which every process has."""
 
     def require_shares(self, name: str, count: int) -> None:
         """Raise `InputError` where ``count``, which ``name`` was given as, cannot be shared equally."""
@@ -60,16 +60,16 @@ class Alone:
         return list(tensors)
 
     def agree(self, flags: Sequence[bool]) -> list[bool]:
-        """Which of ``flags`` any process has raised, in time for the last `mean`: that is the same everywhere."""
+        """Which of ``flags`` any process has raised before the last `mean`: the same answer in all processes."""
         return list(flags)
 
     def from_first(self, work: Callable[[], T], told: Callable[[T], Any] = lambda found: found) -> Any:
-        """What ``work``, which only the first process does, gives there; the others get what ``told`` makes of it, and do
-        until then what it may `spread`."""
+        """The result of ``work``, which only the first process does; the others get what ``told`` makes of that, and until
+        then do what is `spread`."""
         return work()
 
     def spread(self, work: Callable[[Sequence[T]], list[S]], pieces: Sequence[T]) -> list[S]:
-        """What the pure function ``work`` makes of each of ``pieces``, which the processes that wait for this one share."""
+        """The results of the pure function ``work`` for each of ``pieces``, shared with processes that wait for this one."""
         return work(pieces)
 
     def gathered(self, value: T) -> list[T]:
@@ -77,19 +77,20 @@ class Alone:
         return [value]
 
     def alike(self, work: Callable[[], T]) -> T:
-        """What ``work`` gives here, once all have done it; where it fails in any, it fails in the first, and all others have
-        `Left`."""
+        """The result of ``work`` here, once all processes have done it; where it fails in any, the first one raises that
+        error, and the others raise `Left`."""
         return work()
 
     def fail(self, sentence: str) -> None:
         """Have the first process raise `ProblemError` with ``sentence``."""
 
     def leave(self) -> None:
-        """Part for good: what the others still wait for ends."""
+        """Part from the other processes for good, and end their waiting."""
 
 
 class Ranks(Alone):
-    """One of several. To join, and a collective, raise `LostError` where others are lost, and `Left` where the first left."""
+    """One of several processes. Joining, and each collective, raise `LostError` where others are lost, and `Left` where the
+    first one left."""
 
     def __init__(self, store: Any, rank: int, size: int) -> None:
         self.first, self.size, self.share = rank == 0, size, slice(rank, None, size)
@@ -101,8 +102,8 @@ class Ranks(Alone):
 
     def _join(self) -> None:
         store = dist.PrefixStore("ocp_torch", self._store)
-        dist.init_process_group("gloo", store=store, rank=self.share.start, world_size=self.size, timeout=WORD)
-        self._steps = dist.new_group(backend="gloo", timeout=STEP)
+        dist.init_process_group("gloo", store=store, rank=self.share.start, world_size=self.size, timeout=FIRST_TIMEOUT)
+        self._steps = dist.new_group(backend="gloo", timeout=STEP_TIMEOUT)
         dist.barrier(self._steps)  # who leaves before the others are connected makes Gloo print so
 
     @property
@@ -118,10 +119,10 @@ class Ranks(Alone):
             raise InputError(
                 f"torchrun started {here} processes on a machine with {has} GPU(s); start as many, or use cpu."
             )
-        self._steps = dist.new_group(backend="nccl", timeout=STEP)
+        self._steps = dist.new_group(backend="nccl", timeout=STEP_TIMEOUT)
 
     def mean(self, tensors: Sequence[Tensor]) -> list[Tensor]:
-        """One sum of one vector, which also carries the flags."""
+        """The means, by one sum of one vector, which also carries the flags."""
         said = tensors[0].new_tensor(self._said, dtype=tensors[0].dtype)
         flat = torch.cat([*(t.detach().flatten() for t in tensors), said])
         self._together(lambda: dist.all_reduce(flat, group=self._steps))
@@ -148,7 +149,7 @@ class Ranks(Alone):
         return found
 
     def spread(self, work: Callable[[Sequence[T]], list[S]], pieces: Sequence[T]) -> list[S]:
-        """Pieces at which a process fails are done again by the first, which then says what is wrong; and so are all, where
+        """The first process does again the pieces at which another one fails, and then says what is wrong; it does all where
         they cannot be sent."""
         if not self._waited_for or len(pieces) < 2 or threading.current_thread() is not threading.main_thread():
             return work(pieces)
@@ -197,13 +198,13 @@ class Ranks(Alone):
         return made[0]
 
     def fail(self, sentence: str) -> None:
-        self._store.set(FAILED, sentence)
+        self._store.set(FAILED_KEY, sentence)
         self._close()
 
     def leave(self) -> None:
         if self.first:
             with suppress(RuntimeError):  # torchrun itself is gone
-                self._store.set(LEFT, "")
+                self._store.set(LEFT_KEY, "")
         self._close()
 
     def _together(self, collective: Callable[[], object]) -> None:
@@ -214,13 +215,13 @@ class Ranks(Alone):
         raise self._lost()
 
     def _lost(self) -> BaseException:
-        """What became of the others, as far as the store tells."""
+        """The error that says what became of the other processes, as far as the store tells."""
         try:
             if not self.first:
-                self._store.wait([LEFT], LAST_WORD)
+                self._store.wait([LEFT_KEY], FAREWELL_TIMEOUT)
                 return Left()
-            if self._store.check([FAILED]):
-                return ProblemError(self._store.get(FAILED).decode())
+            if self._store.check([FAILED_KEY]):
+                return ProblemError(self._store.get(FAILED_KEY).decode())
         except RuntimeError:  # it is not so, or torchrun itself is gone
             pass
         return LostError(f"{'another' if self.first else 'the first'} process of this run died.")
@@ -233,7 +234,7 @@ class Ranks(Alone):
 
 @cache
 def joined() -> Alone:
-    """This process among those that torchrun started with it; each has a GPU of its own, where there are enough. Raises as
+    """This process among those that torchrun started with it, each with a GPU of its own where there are enough. Raises as
     `Ranks` does."""
     if "TORCHELASTIC_RUN_ID" not in os.environ or int(os.environ.get("WORLD_SIZE", "1")) < 2:
         return Alone()
@@ -243,5 +244,5 @@ def joined() -> Alone:
 
 
 def here() -> Alone:
-    """The same, without joining: who only loads a controller in a distributed program of one's own is alone."""
+    """This process as `joined` gave it, else `Alone`: a distributed program that only loads a controller does not join."""
     return joined() if joined.cache_info().currsize else Alone()

@@ -21,15 +21,11 @@ log = logging.getLogger(__name__)
 Columns = Sequence[Tensor | None]
 Function = Callable[..., Columns]
 
-# Calls before a function is captured: what it makes once is then there, and what it asks and makes has been noted.
-CALLS_FIRST = 2
-# Captures after which a function whose course keeps changing is called as it is.
-MOST_CAPTURES = 3
-# Replays from one that is held against a call to the next: a call takes about five times as long as a replay.
-CHECKED = 200
-# What they may differ by, relative to the largest entry: in float32 sums in another order differ by less. On an H200 steps
-# that were replayed and called were the same to the bit.
-ROUNDING = 1e-5
+CALLS_BEFORE_CAPTURE = 2  # in which a function makes what it makes once, and its decisions and constants are noted
+MOST_CAPTURES = 3  # after which a function whose course keeps changing is called as it is
+CHECK_EVERY = 200  # replays after which one is compared with a call, which takes about five times as long
+# Their largest difference, relative to the largest entry: in float32 sums in another order differ by less.
+TOLERANCE = 1e-5
 
 
 CHANGED = (
@@ -49,15 +45,15 @@ class Called:
         return list(function(*inputs))
 
     def number(self, value: float, like: Tensor) -> Any:
-        """``value``, which changes from call to call, as an input."""
+        """``value``, which changes from call to call, as an input of a function."""
         return value
 
     def fresh(self) -> "Called":
-        """Another of its kind."""
+        """A new one of this kind."""
         return self
 
     def forget(self) -> None:
-        """Let go of what was captured, as what it reads has been replaced."""
+        """Drop all captures, since what they read has been replaced."""
 
 
 class Replays(Called):
@@ -85,12 +81,12 @@ class Replays(Called):
 
 
 def replays_on(device: torch.device) -> Called:
-    """What there is for ``device``: graphs are of GPUs."""
+    """`Replays` where ``device`` is a GPU, which alone has graphs; else `Called`."""
     return Replays() if device.type == "cuda" else Called()
 
 
 class _Replayed:
-    """One function of inputs of one form."""
+    """The calls, captures and replays of a function with inputs of one form."""
 
     def __init__(self, key: Hashable, recorder: Any) -> None:
         self.key, self.recorder = key, recorder
@@ -102,7 +98,7 @@ class _Replayed:
         if self.replay is None:
             if self.captures >= MOST_CAPTURES:
                 return list(function(*inputs))
-            if self.calls <= CALLS_FIRST or not self._captured(function, inputs):
+            if self.calls <= CALLS_BEFORE_CAPTURE or not self._captured(function, inputs):
                 return self._called(function, inputs)
         _place(self.inputs, inputs)
         assert self.replay is not None
@@ -111,11 +107,11 @@ class _Replayed:
             self.replay = None  # it took another course; nothing was changed by that, as it is pure
             return self._called(function, inputs)
         self.replays += 1
-        if pure and self.replays % CHECKED == 1:
+        if pure and self.replays % CHECK_EVERY == 1:
             called = self._called(function, inputs)
             if not _alike(found, called):
                 if self.replays > 1:
-                    log.warning(CHANGED, CHECKED)
+                    log.warning(CHANGED, CHECK_EVERY)
                 self._refuse("a replay does not give what a call does")
                 return called
         return found
@@ -156,7 +152,7 @@ class CudaRecorder:
         self._stream: torch.cuda.Stream | None = None
 
     def call(self, function: Callable[[], list[Tensor | None]]) -> list[Tensor | None]:
-        """``function()``, on a stream of its own, as captures are: libraries then have made what they keep for each."""
+        """``function()`` on the stream of the captures, for which libraries then have made what they keep."""
         self._stream = self._stream or torch.cuda.Stream()
         self._stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(self._stream):
@@ -165,9 +161,9 @@ class CudaRecorder:
         return found
 
     def capture(self, function: Callable[[], list[Tensor | None]]) -> Callable[[], list[Tensor | None]]:
-        """What does all of ``function`` again, and leaves what it finds in the same tensors."""
+        """A function that does all of ``function`` again, and leaves what it finds in the same tensors."""
         graph = torch.cuda.CUDAGraph()
-        # What other threads ask of the device meanwhile is none of this graph.
+        # What other threads ask of the device meanwhile does not belong to this graph.
         with torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"):
             kept = function()
 
@@ -187,10 +183,10 @@ def _place(kept: Columns, given: Columns) -> None:
 
 
 def _alike(left: Columns, right: Columns) -> bool:
-    """Whether they agree but for rounding, in what is not finite as well."""
+    """Whether ``left`` and ``right`` agree up to rounding, and in where they are not finite."""
     for one, other in zip(left, right, strict=True):
         if one is not None and other is not None and other.numel():
             size = float(other.double().abs().nan_to_num(0.0, 0.0, 0.0).max())
-            if not torch.allclose(one.double(), other.double(), rtol=0.0, atol=ROUNDING * size, equal_nan=True):
+            if not torch.allclose(one.double(), other.double(), rtol=0.0, atol=TOLERANCE * size, equal_nan=True):
                 return False
     return True

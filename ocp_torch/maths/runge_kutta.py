@@ -17,23 +17,22 @@ Dynamics = Callable[[Tensor], tuple[Tensor, Tensor]]
 # Maps rows of the batch and a number of steps to a result per trajectory (n,) and their end states (n, d).
 Integrate = Callable[[Tensor, int], tuple[Tensor, Tensor]]
 
-# How often steps are halved at most, and the slowest decay of the changes that is extrapolated.
-MAX_DOUBLINGS = 4
-SLOWEST = 0.8
-# The mean change, as a part of the tolerance for one trajectory or of the answer's standard error, at which nothing needs
-# to be refined; never more than the tolerance itself, as the standard error of a few trajectories means little.
+MAX_DOUBLINGS = 4  # of the number of steps
+SLOWEST_DECAY = 0.8  # of the changes by halvings, for the extrapolation of what is left
+# Nothing is refined where the mean change is below this part of the tolerance, or of the answer's standard error, and below
+# the tolerance itself, as the standard error of a few trajectories means little.
 GOOD_PART = 0.1
-# Halving ends too where those that would be halved make less than that part of the mean change: one trajectory of 2,048 on
-# the circle was halved up to 480 steps, half of a simulation's time, and the error was 5.5e-7 for 5.8e-7.
-RELEVANT = 0.2
-# The trajectories looked at again, blindly, with steps at least so many times finer than at first.
-AUDITED, AUDIT_FACTOR = 64, 4
+# Halving also ends where trajectories still to be halved make less than this part of the mean change: else one of 2,048 on
+# the circle took half of the time, for an error of 5.5e-7 in place of 5.8e-7.
+RELEVANT_PART = 0.2
+AUDITED = 64  # random trajectories that are integrated again
+AUDIT_FACTOR = 4  # with steps so many times finer than at first
 
 
 @dataclass(frozen=True)
 class Switched:
-    """``dynamics`` whose states jump ``count`` times, at 0 and then evenly, to what ``renewed`` gives: those of a control
-    that is held in between."""
+    """``dynamics`` whose states jump ``count`` times, at time 0 and then evenly, to what ``renewed`` gives, as where a
+    control is held in between."""
 
     dynamics: Dynamics
     renewed: Callable[[Tensor], Tensor]
@@ -159,13 +158,13 @@ def refined(
 ) -> Refined:
     r"""Results of all trajectories, and a bound on the error of their mean by ``weights`` ``(N,)``.
 
-    While the mean change is above ``tolerance``, or a tenth of it and of the ``standard_error`` of the results, those that
-    still change by more than ``tolerance`` on halving the step are halved again, ``doublings`` times at most, and while they
-    make a part of the mean that matters: those that cross a jump or a kink of the controller, or slide along one. The error
+    While the mean change is above ``tolerance``, or a tenth of it and of the ``standard_error`` of the results, trajectories
+    that still change by more than ``tolerance`` on halving the step are halved again, ``doublings`` times at most, and while
+    they make a part of the mean that matters: these cross a jump or a kink of the controller, or slide along one. The error
     has three parts: the last change of each trajectory; what its slow decay leaves to come (`r/(1-r)` of it, at ratio `r`: a
     jump makes the order 1, not 4); and, because a trajectory may agree with itself by missing a feature twice, what a random
-    few of all of them, ``audited``, change on far finer steps. Where ``integrate`` rounds these few are all integrated by
-    ``audit``, which does not, on steps that are no coarser.
+    few of all, ``audited``, change on far finer steps. Where ``integrate`` rounds, ``audit``, which does not, integrates all
+    of these few on steps that are no coarser.
     """
     everything = torch.arange(len(weights))
     coarse, _ = integrate(everything, steps // 2)
@@ -177,14 +176,14 @@ def refined(
         good = min(tolerance, GOOD_PART * max(tolerance, standard_error(result)))
         changed = weights * change * factor
         mean = float(changed.mean())
-        if mean <= good or float(changed[active].sum()) <= RELEVANT * len(weights) * mean:
+        if mean <= good or float(changed[active].sum()) <= RELEVANT_PART * len(weights) * mean:
             break
         steps *= 2
         finer, end[active] = integrate(active, steps)
         taken[active] = steps
         before = float((weights[active] * change[active]).sum())
         change[active], result[active] = (finer - result[active]).abs(), finer
-        ratio = min(float((weights[active] * change[active]).sum()) / max(before, 1e-300), SLOWEST)
+        ratio = min(float((weights[active] * change[active]).sum()) / max(before, 1e-300), SLOWEST_DECAY)
         factor[active] = max(1.0, ratio / (1.0 - ratio))
     seen = float((weights * change * factor).mean())
     if not audited:

@@ -1,5 +1,5 @@
-"""Where training states come from: uniform, scrambled Sobol points, or those placed where they count; and the evaluation
-points that never meet them.
+"""Training states: uniform ones, scrambled Sobol points, or Sobol points placed where they count; and evaluation points,
+which never meet them.
 
 The same seed gives the same states on every device: points are made on the CPU, or of the same whole numbers elsewhere.
 """
@@ -15,15 +15,11 @@ from ocp_torch.maths.boxes import Boxes, fitted
 from ocp_torch.maths.seeds import Branch, derive_seed
 
 CPU = torch.device("cpu")
-# Points of one scrambling. Then another begins: a sequence ends, and resuming must draw again all points of the block so far.
+# Points of one scrambling, after which another begins: a sequence ends, and resuming draws all points of the block again.
 SOBOL_BLOCK = 2**18
-# Points drawn at once at least: a draw of few costs as much.
-DRAWN = 4096
-# Numbers from which on a GPU makes them itself: a core takes 3 ms for so many, and 78 for 65,536 points in 64 dimensions,
-# where a whole draw, with the problem's data there, takes 12 on an H200.
-MANY = 2**18
-# Seeds that a Sobol engine takes are below this.
-ENGINE_SEEDS = 2**31
+LEAST_DRAWN = 4096  # points drawn at once: a draw of fewer costs as much
+ON_GPU_FROM = 2**18  # coordinates from which on a GPU makes the points itself: a core takes 3 ms for so many
+ENGINE_SEEDS = 2**31  # the seeds that a Sobol engine takes are below this
 
 
 def scrambled_sobol(count: int, dim: int, seed: int, dtype: torch.dtype, skip: int = 0) -> Tensor:
@@ -79,7 +75,7 @@ class SobolSampler:
 
     def draw(self, count: int, device: torch.device = CPU) -> Tensor:
         """The next ``count`` states, ``(count, d)``, on ``device``."""
-        there, pieces = device.type != "cpu" and count * self.dim >= MANY, []
+        there, pieces = device.type != "cpu" and count * self.dim >= ON_GPU_FROM, []
         while count > 0:
             block, position = divmod(self.count, SOBOL_BLOCK)
             taken = min(count, SOBOL_BLOCK - position)
@@ -96,7 +92,7 @@ class SobolSampler:
             self._engine = self._scrambled(block)
         stop = position + count
         while len(self._buffer) < stop:
-            fresh = self._engine.draw(max(stop - len(self._buffer), DRAWN), dtype=torch.float64)
+            fresh = self._engine.draw(max(stop - len(self._buffer), LEAST_DRAWN), dtype=torch.float64)
             self._buffer = torch.cat([self._buffer, fresh.to(self.dtype).remainder(1.0)])
         return self._buffer[position:stop]
 
@@ -151,7 +147,7 @@ class ImportanceSampler:
         return self.draw_weighted(count)[0]
 
     def draw_weighted(self, count: int) -> tuple[Tensor, Tensor]:
-        """They, and one over the density of each, ``(count,)``."""
+        """The next ``count`` states, ``(count, d)``, and one over the density of each, ``(count,)``."""
         self.drawn += 1
         return self._rounded(self.boxes.place(self.points.draw(count)))
 
@@ -161,12 +157,12 @@ class ImportanceSampler:
         return self.drawn > 0 and self.drawn % self.every == 0
 
     def pool(self) -> tuple[Tensor, Tensor]:
-        """States to score, and their weights."""
+        """States to score ``(size, d)``, and their weights ``(size,)``."""
         u = torch.rand(self.size, self.dim, dtype=torch.float64, generator=self.generator)
         return self._rounded(self.boxes.place(u))
 
     def learn(self, x: Tensor, weight: Tensor, score: Tensor) -> None:
-        """From now on draw by the density that suits ``score`` ``(N,)`` at the states ``x`` of a `pool`."""
+        """Change the density to one that suits ``score`` ``(N,)`` at the states ``x`` of a `pool`."""
         self.boxes = fitted(x.cpu(), weight.cpu(), score.cpu(), self.uniform)
 
     def _rounded(self, placed: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
@@ -182,7 +178,7 @@ class ImportanceSampler:
         }
 
     def load_state_dict(self, state: dict) -> None:
-        """The way back from `state_dict`. Raises `InputError` where the boxes are no density."""
+        """Restore what `state_dict` gave. Raises `InputError` where the boxes are no density."""
         self.points.load_state_dict(state)
         self.drawn = require_integer("drawn of the checkpoint", state["drawn"], 0, maximum=2**62)
         self.generator.set_state(state["generator"])

@@ -1,4 +1,4 @@
-"""Where every random number comes from: a tree of seeds, grown from the one seed of a run.
+"""The source of every random number: a tree of seeds, grown from the one seed of a run.
 
 `Branch` lists all branches, one for each purpose. Numbers drawn on different branches are independent, so that drawing more
 of one kind changes no other, and no set of states is used twice without that being meant.
@@ -57,13 +57,13 @@ def derive_seed(seed: int, branch: Branch, *path: int) -> int:
 
 
 def fixed_generator(number: int = 0) -> torch.Generator:
-    """A generator that begins in the same place in every run: for probes and designs that shall not vary with its seed."""
+    """A generator that is the same in every run: for probes and designs that must not vary with the run's seed."""
     return torch.Generator().manual_seed(number)
 
 
 @contextlib.contextmanager
 def generators_kept() -> Iterator[None]:
-    """The process's own generators afterwards are as they were: of PyTorch, NumPy and Python."""
+    """A context after which the process's own generators, of PyTorch, NumPy and Python, are as they were before."""
     states = np.random.get_state(), random.getstate()  # noqa: NPY002
     # Where nobody has used a GPU yet it has no generator to keep.
     used = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()

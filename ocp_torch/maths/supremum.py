@@ -9,29 +9,26 @@ from torch import Tensor
 
 from ocp_torch.maths.seeds import fixed_generator
 
-# The first step of an ascent, and the factors by which steps grow on success and shrink on failure. One of each together
-# shrinks them: an ascent that has come near a maximum goes on in smaller steps.
-FIRST_STEP, GROWTH, SHRINKAGE = 1e-2, 1.5, 0.4
-# Ascents whose steps are all below this, in turns, have arrived: in one dimension after 30 of 60 to 100 steps, in two after
-# 40 to 90. The maximum is then the same to 15 digits where the function is smooth, to 9 or more for slacks beside kinks.
-ARRIVED = 1e-7
-# How far an ascent is thought to go where starts are chosen by their slope: as far as points are apart, and this at most; and
-# how long its first step is. Slacks of a unicycle and of a pendulum with limited torque had peaks .09 and .30 % of the bound
-# above all that ascents from the largest of 131,072 values showed: from most places that lead there the slack is below its
-# median. Ascents of 24 steps from 2,048 of 32,768 states found them with 8 of 8 seeds each, from random ones with 2 and 1;
-# with a reach of 3e-3 with 1 and 8, of 3e-2 with 8 and 3. Six oscillators of kuramoto had one of 1 %: .7 % or more of it were
-# found with 4 of 8 seeds by a reach of 1e-2, with 6 by 3e-2.
-REACH, SHORT_STEP = 3e-2, 3e-3
-# Parts of the starts that each stage of these ascents goes on from, and its steps: as sure as 24 steps from all of them, in
-# two thirds of the time.
+FIRST_STEP = 1e-2  # of an ascent, in turns
+STEP_GROWTH = 1.5  # of a step on success
+STEP_SHRINKAGE = 0.4  # of a step on failure: by more than it grows, so that steps near a maximum become smaller
+# Ascents have arrived when all steps are below this, in turns: a maximum is then the same to 15 digits where the function is
+# smooth, to 9 or more for slacks beside kinks.
+ARRIVED_STEP = 1e-7
+# How far ascents are expected to go where starts are chosen by value and slope: as far as points are apart, and this at most.
+# With 8 of 8 seeds they found a peak of a unicycle's slack that ascents from the largest values missed (.09 % of the bound).
+REACH = 3e-2
+REACH_STEP = 3e-3  # the first step of such ascents
+# Part of the starts from which each stage of such ascents goes on, and its steps: as sure as 24 steps from all starts, in two
+# thirds of the time.
 STAGES = ((1.0, 8), (0.25, 16))
-# How often `minimiser` narrows its interval by the golden section: 4e-6 of it is left.
-NARROWINGS, GOLDEN = 26, 0.5 * (math.sqrt(5.0) - 1.0)
+GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
+NARROWINGS = 26  # of the interval of `minimiser` by the golden section: 4e-6 of it is left
 
 
 @dataclass(frozen=True)
 class Extremum:
-    """A supremum as it was found: an estimate from below of the true one, with what was done to find it."""
+    """A supremum that was searched for: an estimate from below of the true one, with the effort of the search."""
 
     value: float
     x: Tensor  # (d,) where it is attained
@@ -77,9 +74,8 @@ def climb(
     start_step: float = FIRST_STEP,
     differentiable: bool = True,
 ) -> tuple[Tensor, Tensor]:
-    """Where local ascents from ``x`` ``(N, d)``, with values ``best`` ``(N,)``, end, and the values there, after so many
-    ``steps`` or once all have arrived; they stop at the first NaN that any of them meets, which is then the value of its
-    row."""
+    """The ends of local ascents from ``x`` ``(N, d)``, with values ``best`` ``(N,)``, and the values there, after ``steps``
+    steps or once all have arrived. All stop at the first NaN that one of them meets, which is then the value of its row."""
     step = torch.full_like(best, start_step)
     generator = fixed_generator()
     slope = value_and_gradient(function, x)[1] if differentiable and steps else torch.zeros_like(x)
@@ -98,15 +94,15 @@ def climb(
         if odd.any():
             break
         slope = torch.where(better.unsqueeze(-1), ahead, slope)
-        step = torch.where(better, GROWTH * step, SHRINKAGE * step)
-        if differentiable and float(step.max()) < ARRIVED:
+        step = torch.where(better, STEP_GROWTH * step, STEP_SHRINKAGE * step)
+        if differentiable and float(step.max()) < ARRIVED_STEP:
             break
     return x, best
 
 
 def extremes(function: Callable[[Tensor], Tensor], x: Tensor, met: Tensor, count: int, steps: int) -> Tensor:
-    """Where so many ``steps`` of descents of ``function`` end, and of ascents, ``(K, d)``, from the ``count`` states of ``x``
-    ``(N, d)`` with the smallest and from those with the largest of its values ``met`` ``(N,)`` there."""
+    """The ends ``(K, d)`` of descents of ``function``, of ``steps`` steps, from the ``count`` states of ``x`` ``(N, d)`` with
+    the smallest of its values ``met`` ``(N,)``, and of ascents from as many with the largest."""
     count = min(count, len(met))
     start = torch.cat([(-met).topk(count).indices, met.topk(count).indices])
     sign = torch.ones_like(met[start])
@@ -119,8 +115,8 @@ def extremes(function: Callable[[Tensor], Tensor], x: Tensor, met: Tensor, count
 def peaks_in_reach(
     function: Callable[[Tensor], Tensor], points: Tensor, starts: int, above: float = -math.inf
 ) -> tuple[Tensor, Tensor]:
-    """Where ascents of ``function`` end, ``(K, d)``, and the values there, from at most so many ``starts``: those ``points``
-    ``(N, d)`` with the largest `f + reach |grad f|`, which to first order is what is within reach, if it is ``above`` that.
+    """The ends of ascents of ``function``, ``(K, d)``, and the values there, from at most so many ``starts``: the ``points``
+    ``(N, d)`` with the largest `f + reach |grad f|`, to first order the largest value within reach, if it exceeds ``above``.
 
     Ascents from the largest values miss narrow peaks that stand where ``function`` is low.
     """
@@ -131,7 +127,7 @@ def peaks_in_reach(
         return x[:0], values[:0]
     for part, steps in STAGES:
         best = promising.topk(math.ceil(part * starts)).indices
-        climbed = lambda at, met, steps=steps: climb(function, at, met, steps, SHORT_STEP)
+        climbed = lambda at, met, steps=steps: climb(function, at, met, steps, REACH_STEP)
         x, values = in_parts(climbed, x[best], values[best])
         promising = values
     return x.remainder(1.0), values
@@ -146,7 +142,7 @@ def in_parts(
 
 
 def value_and_gradient(function: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, Tensor]:
-    """``function`` and its gradient at each row of ``x``; that is 0 where it is one of constants, piece by piece."""
+    """``function`` and its gradient at each row of ``x``; the gradient is 0 where the function is piecewise constant."""
     with torch.enable_grad():
         x = x.detach().requires_grad_(True)
         value = function(x)
@@ -157,7 +153,7 @@ def value_and_gradient(function: Callable[[Tensor], Tensor], x: Tensor) -> tuple
 
 
 def minimiser(function: Callable[[float], float], low: float, high: float) -> float:
-    """Where a convex ``function`` is smallest in ``[low, high]``, to `4e-6` of its length."""
+    """The minimiser of a convex ``function`` in ``[low, high]``, to `4e-6` of the interval's length."""
     left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
     at_left, at_right = function(left), function(right)
     for _ in range(NARROWINGS):

@@ -7,7 +7,7 @@ from ocp_torch.fields import PeriodicMLP, SobolevField, mlp
 from ocp_torch.fields.activations import ACTIVATIONS
 from ocp_torch.fields.forward_sweep import Along
 from ocp_torch.maths import cores
-from ocp_torch.maths.batch_jet import PIECE, batch_jet
+from ocp_torch.maths.batch_jet import PIECE_STATES, batch_jet
 from ocp_torch.maths.jets import chunked_jet, curvature, jet, reverse_jet
 
 # Columns of noise: none but one, fewer than coordinates, as many, more.
@@ -172,7 +172,7 @@ def test_a_jet_of_many_states_is_that_of_its_parts_and_scales_as_a_whole():
 
 @pytest.mark.parametrize("along", ["the coordinates", "columns"])
 def test_a_large_batch_is_differentiated_in_pieces_to_the_same_on_any_number_of_cores(monkeypatch, along):
-    network, (x, sigma) = made(3, 6), drawn(3, 3, count=2 * PIECE + 76)
+    network, (x, sigma) = made(3, 6), drawn(3, 3, count=2 * PIECE_STATES + 76)
     if along == "the coordinates":
         sigma = torch.diag_embed(sigma.diagonal(dim1=1, dim2=2))
     sizes = []
@@ -182,7 +182,7 @@ def test_a_large_batch_is_differentiated_in_pieces_to_the_same_on_any_number_of_
     for count in (1, 2):
         monkeypatch.setattr(cores, "cores", lambda count=count: count)
         found.append(torch.autograd.grad(loss(batch_jet(network, x, sigma)), weights))
-        assert sorted(sizes) == [76, PIECE, PIECE]
+        assert sorted(sizes) == [76, PIECE_STATES, PIECE_STATES]
         sizes.clear()
     whole = torch.autograd.grad(loss(jet(network, x, sigma)), weights)
     for one, two, other in zip(*found, whole, strict=True):

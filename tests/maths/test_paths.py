@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from ocp_torch.maths.brownian import TOGETHER, Grid, at_random_times, discounted, expectation, path_integral
+from ocp_torch.maths.brownian import DRAWN_TOGETHER, Grid, at_random_times, discounted, expectation, path_integral
 
 RHO = 2.0
 
@@ -20,7 +20,7 @@ def test_at_random_times_a_constant_rate_counts_once_in_the_mean():
 
 
 def test_groups_of_paths_from_one_start_are_independent():
-    count = 2 * TOGETHER
+    count = 2 * DRAWN_TOGETHER
     x0, weights = torch.zeros(count, 1, dtype=torch.float64), torch.ones(count, dtype=torch.float64)
     grid = Grid(torch.ones(count, dtype=torch.float64), 4, 1.0)
     noise = lambda x: torch.ones(len(x), 1, 1, dtype=x.dtype)
@@ -28,8 +28,8 @@ def test_groups_of_paths_from_one_start_are_independent():
     run = lambda seed: expectation(dynamics, noise, x0, weights, 1, grid, discounted(RHO), 1.0, seed)
     result, _, end, *_ = run(0)
     for values in (result, end[:, 0]):
-        first, second = values[:TOGETHER], values[TOGETHER:]
-        assert abs(float(torch.corrcoef(torch.stack([first, second]))[0, 1])) < 5.0 / math.sqrt(TOGETHER)
+        first, second = values[:DRAWN_TOGETHER], values[DRAWN_TOGETHER:]
+        assert abs(float(torch.corrcoef(torch.stack([first, second]))[0, 1])) < 5.0 / math.sqrt(DRAWN_TOGETHER)
     assert float(end.square().mean()) == pytest.approx(1.0, rel=0.2)
     assert not torch.equal(run(1).end, end)
 

@@ -120,7 +120,7 @@ def test_an_impure_function_runs_once_a_call(device):
 
 def test_what_changes_later_for_another_reason_is_noticed_and_said(monkeypatch, caplog):
     """A problem whose parameters somebody sets, or a loss that reads a clock."""
-    monkeypatch.setattr(replays, "CHECKED", 5)
+    monkeypatch.setattr(replays, "CHECK_EVERY", 5)
     replay, factor = Replays(Rerun()), [2.0]
     scaled = lambda x: [x * torch.tensor(factor[0])]
     once = lambda: float(replay("scaled", scaled, [torch.ones(())])[0])

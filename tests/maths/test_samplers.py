@@ -121,7 +121,7 @@ def test_points_made_on_a_device_are_those_of_the_engine(dtype, device):
 
 def test_a_device_draws_the_same_states_however_many(device, monkeypatch):
     monkeypatch.setattr(samplers, "SOBOL_BLOCK", 64)
-    monkeypatch.setattr(samplers, "MANY", 60)
+    monkeypatch.setattr(samplers, "ON_GPU_FROM", 60)
     here, there = (SobolSampler(2, 1, torch.float32) for _ in range(2))
     for count in (10, 50, 130, 3):
         assert torch.equal(there.draw(count, device).cpu(), here.draw(count))
