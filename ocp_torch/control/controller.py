@@ -22,17 +22,16 @@ from ocp_torch.problems import Problem
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.physical.system import System
 
-# The schema of its file, raised when an older version could not read what is written.
-SCHEMA = 3
-# What the file holds of a controller just as it is.
-PLAIN = ("model", "occupation", "kind", "certificate", "config")
-# Controls are given as what the states are.
+SCHEMA = 3  # of a controller's file, raised when an older version could not read what is written
+# Attributes of a controller that the file holds as they are.
+SAVED_AS_IS = ("model", "occupation", "kind", "certificate", "config")
+# Controls are returned in the type of the states.
 States = TypeVar("States", Tensor, np.ndarray)
 
 
 @dataclass(repr=False)
 class Controller:
-    """`u(x)` with all it came from.
+    """The controls `u(x)` of a run, with all that they came from.
 
     ``kind`` says which policy `u` is: ``value`` (from `V` alone), ``density`` (`w / mu`), ``minimised`` (`w / mu` with the
     `mu` of Lemma 2 in place of the trained one), ``trajectories`` (best for a whole step, from the `V` of the warm start) or
@@ -89,7 +88,7 @@ class Controller:
         return self._policy.pace.step if isinstance(self._policy, HeldPolicy) else None
 
     def held(self, x: States, step: float) -> States:
-        """Controls ``(N, m)`` at states ``(N, d)`` that are best where each is held for ``step`` units of time, from the `V`.
+        """Controls ``(N, m)`` at states ``(N, d)`` that are best, by `V`, where each is held for ``step`` units of time.
 
         Raises `InputError` as a call does, for a ``step`` that is no time, and where the controller holds no `V`."""
         others = {TRAJECTORIES: self._exact.trajectory_value, BOUNDING: self._exact.subsolution}
@@ -126,12 +125,12 @@ class Controller:
             "dtype": str(next(self.fields.parameters()).dtype).removeprefix("torch."),
             "fields": list(self.fields.networks),
             "bounds": asdict(self.constants),
-            **{name: getattr(self, name) for name in PLAIN},
+            **{name: getattr(self, name) for name in SAVED_AS_IS},
         }
         save_tensors(Path(path), dict(self.fields.state_dict()), metadata)
 
     def export(self, out: str | Path, format: str | None = None, coordinates: str | None = None) -> list[Path]:
-        """Write it to ``out`` for where there is no PyTorch, and return the files: the control ``(m,)``, the value `V` and
+        """Write functions that need no PyTorch to ``out``, and return the files: the control ``(m,)``, the value `V` and
         its gradient ``(d,)`` at a state ``(d,)``, with certificate, units and configuration inside, as JSON.
 
         ``format`` is `onnx` (a model of a batch of states, float32), `c` (a header and a C99 source, float or double) or

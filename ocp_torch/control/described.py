@@ -16,15 +16,14 @@ def problem_name(problem: Problem) -> str:
 
 
 def plain_parameters(parameters: dict) -> dict:
-    """Those of a problem's ``parameters`` that JSON can hold. Others only a user's own problem has, which is handed in on
-    loading."""
+    """The ``parameters`` of a problem that JSON can hold. Only a user's own problem, given on loading, may have others."""
     listed = {k: list(v) if isinstance(v, tuple) else v for k, v in parameters.items()}
     return {k: v for k, v in listed.items() if isinstance(v, bool | int | float | str | list | type(None))}
 
 
 def described(problem: Problem) -> dict:
     """What a file says of ``problem``: its name, the arguments that make it again, and its units where it has some."""
-    # Those of a data set are its file's, which a saved controller does without.
+    # The units of a data set are in its file, which a saved controller does without.
     units = problem.measures if isinstance(problem, System) else None
     parameters = plain_parameters(problem.parameters)
     return {"name": problem_name(problem), "parameters": parameters, **(units.plain if units else {})}

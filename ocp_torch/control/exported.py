@@ -1,4 +1,4 @@
-"""What is exported of a controller: `u`, `V` and `grad V` as functions of a batch of states, on the torus or in units."""
+"""The functions of a controller that are exported: `u`, `V` and `grad V` at a batch of states, on the torus or in units."""
 
 import copy
 from collections.abc import Callable
@@ -20,8 +20,7 @@ from ocp_torch.problems.physical.system import System
 
 VALUE, GRADIENT = "value", "gradient"
 TORUS, PHYSICAL = "torus", "physical"
-# States: a function is traced on the first, and what was traced is held against it at the others.
-EXAMPLES = 16
+EXAMPLE_STATES = 16  # a function is traced on the first, and compared at the others with what was traced
 
 Outputs = dict[str, Tensor]
 
@@ -40,13 +39,13 @@ def coordinates_of(problem: Problem, asked: str | None) -> str:
 
 
 def example_states(problem: Problem, coordinates: str) -> Tensor:
-    """States ``(K, d)`` in ``coordinates``, always the same."""
-    x = torch.rand(EXAMPLES, problem.dim, dtype=torch.float64, generator=fixed_generator())
+    """Random states ``(K, d)`` in ``coordinates``, the same in every call."""
+    x = torch.rand(EXAMPLE_STATES, problem.dim, dtype=torch.float64, generator=fixed_generator())
     return problem.from_torus(x) if coordinates == PHYSICAL and isinstance(problem, System) else x
 
 
 def about(problem: Problem, coordinates: str) -> str:
-    """What a file holds, in a line."""
+    """One line on the contents of an exported file."""
     places = f"states on the torus, {problem.dim} coordinates in turns"
     if coordinates == PHYSICAL and problem.measures is not None:
         places = problem.measures.text

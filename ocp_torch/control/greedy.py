@@ -15,23 +15,22 @@ from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.generator import pull_back
 from ocp_torch.problems.problem import Problem
 
-# Newton's steps to the part of the control that is kept, where the exponent is not 2 and it has no closed form: four leave
-# less than a millionth of its cost.
-NEWTON = 4
+# Newton steps for the part of the control that is kept, which has no closed form unless the exponent is 2: four leave less
+# than a millionth of its cost.
+NEWTON_STEPS = 4
 
 
 class HeldPolicy:
-    r"""The `u` that minimises `R(u) + V(x_h(u)) / (rho h)`, `x_h` a step of ``pace`` later, among a few.
+    r"""The candidate `u` of least `R(u) + V(x_h(u)) / (rho h)`, with `x_h` the state a step of ``pace`` later.
 
-    The direction is the greedy control `u_0` where `x` drifts to without control. Along `s u_0`, `0 <= s <= 1`, the end of
-    the step moves from there to `x_h(u_0)`, on a straight line for a short step, and the slope of `V` along it is taken to
-    change evenly: so `s` follows from the two gradients at its ends, exactly for a quadratic `V`. Several controls may be
-    worth different parts of `u_0` (tilting a quadrotor bends `V` more than lifting it: with one part for all its cost was
-    0.61, and 0.55 so, on one seed): for `q = 2` what is best where slopes change evenly along each of them is compared with
-    it. Where controls have a limit, the farthest ones along that direction, either way, are too: where `V` has ridges
-    `s u_0` may be far from best (a pendulum in Gymnasium lost 8 to 300 % of the return by it alone, 1.7 to 5 % so; halves
-    and quarters of the limit beside them gained nothing). So is no control wherever anything is compared. Where the best one
-    changes the control jumps.
+    * `s u_0`, `0 <= s <= 1`, where `u_0` is the greedy control at the state that `x` drifts to without control. With `s` the
+      end of the step moves from there to `x_h(u_0)`, on a straight line for a short step, and the slope of `V` along it is
+      taken to change linearly: so `s` follows from the gradients at both ends, exactly for a quadratic `V`.
+    * For several controls and `q = 2`: the minimiser where slopes change linearly along each control, since `V` may curve
+      differently along them (a quadrotor's cost was 0.61 without, and 0.55 with it).
+    * With a limit: the farthest controls along `u_0` and against it, since `s u_0` may be far from best where `V` has ridges
+      (Pendulum-v1 lost 8 to 300 % of the return without, 1.7 to 5 % with them).
+    * No control, where there is any candidate but the first. The control jumps where the best candidate changes.
     """
 
     def __init__(self, problem: Problem, value: Field, pace: Pace) -> None:
@@ -42,7 +41,7 @@ class HeldPolicy:
         return self.step(x)[0]
 
     def step(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Controls at states ``(N, d)``, and how far these move under them ``(N, d)``, where that was compared."""
+        """Controls ``(N, m)`` at states ``(N, d)``, and where candidates were compared the moves ``(N, d)`` under them."""
         problem, cost, a_step = self.problem, self.problem.control_cost, self.problem.discount * self.pace.step
         drifted = self.pace.drift(problem, x)
         before = jet(self.value, x + drifted)
@@ -75,8 +74,8 @@ class HeldPolicy:
         return best, way
 
     def _apart(self, x: Tensor, u: Tensor, part: Tensor, drifted: Tensor, before: Jet) -> Tensor:
-        """Where the quadratic function with the slopes of `V` at no control, ``before``, and at as much as ``u`` of each
-        control alone is least, ``(N, m)``; ``part`` where that function has no minimum."""
+        """The minimiser ``(N, m)`` for the quadratic function with the slopes of `V` at no control, ``before``, and at each
+        control alone of the size of ``u``; ``part`` where that function has no minimum."""
         a_step, size = self.problem.discount * self.pace.step, u.norm(dim=-1, keepdim=True)
         size = torch.where(size > 0.0, size, 1.0)
         along, changes = list[Tensor](), list[Tensor]()
@@ -96,13 +95,13 @@ class HeldPolicy:
         return torch.where(bends_up.unsqueeze(-1), found, part)
 
     def _price(self, u: Tensor) -> Tensor:
-        """`R(u)` of controls within the limit, where rounding is no infinite cost."""
+        """`R(u)` of controls within the limit, without the infinite cost of those that rounding puts beyond it."""
         return PowerCost(self.problem.control_cost.q).cost(u)
 
 
 def solved(matrix: list[list[Tensor]], right: list[Tensor]) -> tuple[list[Tensor], Tensor]:
-    """The solutions of `N` symmetric systems, whose entries are ``(N,)``, and where the matrix is positive definite: others
-    mean nothing. By elimination, in operations that controllers can be exported with."""
+    """The solutions of `N` symmetric systems, whose entries are ``(N,)``, and where the matrix is positive definite: other
+    solutions mean nothing. By elimination, in operations that can be exported."""
     rows, m = [[*row, b] for row, b in zip(matrix, right, strict=True)], len(right)
     definite = torch.ones_like(right[0], dtype=torch.bool)
     for i in range(m):
@@ -116,7 +115,7 @@ def solved(matrix: list[list[Tensor]], right: list[Tensor]) -> tuple[list[Tensor
 
 
 def farthest(cost: PowerCost, u: Tensor) -> Tensor:
-    """How far the limit of ``cost`` lets controls go in the direction of each of ``u`` ``(N, m)``; 0 where that is 0."""
+    """The largest controls within the limit of ``cost`` in the direction of each of ``u`` ``(N, m)``; 0 where that is 0."""
     size = u.norm(dim=-1, keepdim=True)
     return cost.within(2.0 * cost.reach * u / torch.where(size > 0.0, size, 1.0), 1.0)
 
@@ -134,11 +133,11 @@ def kept(q: float, cost: Tensor, start: Tensor, end: Tensor) -> Tensor:
     price, bend, fall = (torch.where(inside, part, 1.0) for part in (price, bend, -start))
     if q == 2.0:
         return torch.where(inside, fall / (price + bend), outside)
-    # In t = s^{q - 1} the derivative is convex, and Newton's method comes down to its zero from above.
+    # In t = s^{q - 1} the derivative is convex, and Newton's method descends to its zero from above.
     power = 1.0 / (q - 1.0)
     tiny = torch.finfo(start.dtype).tiny
     t = torch.minimum(fall / price.clamp_min(tiny), (fall / bend.clamp_min(tiny)) ** (q - 1.0)).clamp_max(1.0)
-    for _ in range(NEWTON):
+    for _ in range(NEWTON_STEPS):
         bent = bend * t ** (power - 1.0)
         t = t - (price * t + bent * t - fall) / (price + power * bent)
     return torch.where(inside, t.clamp(0.0, 1.0) ** power, outside)

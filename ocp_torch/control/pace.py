@@ -1,4 +1,4 @@
-"""How fast a problem moves: for how long a control is held, whatever the unit of time."""
+"""The pace of a problem: how long a control is held, whatever the unit of time."""
 
 import math
 from collections.abc import Callable
@@ -13,18 +13,20 @@ from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems import Problem
 from ocp_torch.problems.starts import drawn_starts
 
-# A step is at most this part of `1 / rho`, and in it half of all states move by no more than this part of a turn: the control
-# is held that long. With a quarter of the way a pendubot took 160 s to a cost that it now has after 50.
-DISCOUNTED, MOVED = 0.04, 0.08
-# Nor longer than this part of the time in which the system answers, at nine starts in ten: `1 / |lambda|` of the largest
-# eigenvalue of its linearisation. With 0.3 a limited pendulum lost at upright what it had won, from round to round; with 0.17
-# a cart-pole, with 0.2 a pendubot and with 0.26 an acrobot stood.
-ANSWERED = 0.2
-# A Runge-Kutta step is at most this part of the time in which neighbours part `e`-fold, at nine states in ten (the error is
-# then 0.4 % of that, `e` less its Taylor polynomial; the certificate takes finer steps where that shows); so many at most.
-PARTED, NEARLY_ALL, MOST_SUBSTEPS = 1.0, 0.9, 8
-# States, and starts, at which that is looked at, and how far apart neighbours are, in turns.
-PROBED, STARTS, APART = 2**11, 2**8, 1e-3
+# A control is held for the shortest of three times.
+LARGEST_TIME_PART = 0.04  # of `1 / rho`
+LARGEST_MOVE = 0.08  # in turns, by half of all states: with a quarter of it a pendubot took 160 s in place of 50
+# Part of the response time `1 / |lambda|`, by the largest eigenvalue of the linearisation, at nine starts in ten: with 0.3 a
+# limited pendulum lost at upright, from round to round, what it had won.
+RESPONSE_PART = 0.2
+# A Runge-Kutta step is at most this part of the time in which neighbours part `e`-fold, at nine states in ten: its error is
+# then 0.4 % of that, `e` less its Taylor polynomial (the certificate takes finer steps where that shows).
+DIVERGENCE_PART = 1.0
+QUANTILE = 0.9  # the nine in ten
+MOST_SUBSTEPS = 8
+PROBED_STATES = 2**11
+PROBED_STARTS = 2**8
+OFFSET = 1e-3  # of neighbours, in turns
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Pace:
 
     @classmethod
     def of(cls, problem: Problem) -> "Pace":
-        """That of ``problem``, measured when it is first asked for: that takes thousands of evaluations."""
+        """The pace of ``problem``, measured by thousands of evaluations when it is first asked for."""
         if problem not in _found:
             _found[problem] = cls._measured(problem)
         return _found[problem]
@@ -44,31 +46,33 @@ class Pace:
     @classmethod
     @torch.no_grad()
     def _measured(cls, problem: Problem) -> "Pace":
-        """Under controls of its typical size, and within its limits, at states spread over the torus and at starts."""
+        """The pace under controls of typical size within the limits, at states spread over the torus and at starts."""
         generator = fixed_generator()
-        draw = lambda n, by=torch.randn: by(PROBED, n, dtype=torch.float64, generator=generator)
+        draw = lambda n, by=torch.randn: by(PROBED_STATES, n, dtype=torch.float64, generator=generator)
         x = draw(problem.dim, torch.rand)
         away, u = (torch.nn.functional.normalize(draw(n), dim=-1) for n in (problem.dim, problem.control_dim))
         u = problem.control_cost.within(typical_sizes(problem)[1] * u, torch.ones_like(x[:, 0]))
         velocity = problem.velocity(x, u)
-        parting = (problem.velocity(x + APART * away, u) - velocity).norm(dim=-1) / APART
-        speed, rate = float(velocity.norm(dim=-1).median()), float(parting.quantile(NEARLY_ALL))
-        answers = _largest_eigenvalues(problem, drawn_starts(problem, STARTS, 0), u[:STARTS]).quantile(NEARLY_ALL)
-        most = MOVED / max(speed, 1e-300), ANSWERED / max(float(answers), 1e-300)
-        step = min(DISCOUNTED / problem.discount, *most)
-        return cls(step, min(max(1, math.ceil(step * rate / PARTED)), MOST_SUBSTEPS))
+        parting = (problem.velocity(x + OFFSET * away, u) - velocity).norm(dim=-1) / OFFSET
+        speed, rate = float(velocity.norm(dim=-1).median()), float(parting.quantile(QUANTILE))
+        answers = _largest_eigenvalues(problem, drawn_starts(problem, PROBED_STARTS, 0), u[:PROBED_STARTS]).quantile(
+            QUANTILE
+        )
+        most = LARGEST_MOVE / max(speed, 1e-300), RESPONSE_PART / max(float(answers), 1e-300)
+        step = min(LARGEST_TIME_PART / problem.discount, *most)
+        return cls(step, min(max(1, math.ceil(step * rate / DIVERGENCE_PART)), MOST_SUBSTEPS))
 
     def with_step(self, step: float) -> "Pace":
         """Steps of another length, in substeps as short as these."""
         return Pace(step, min(math.ceil(self.substeps * max(1.0, step / self.step)), MOST_SUBSTEPS))
 
     def move(self, problem: Problem, x: Tensor, u: Tensor) -> Tensor:
-        """How far states ``(N, d)`` move in a step under held controls ``u`` ``(N, m)``, without noise: moves, not states,
-        as the difference of two moves has more digits."""
+        """The moves of states ``(N, d)`` in a step under held controls ``u`` ``(N, m)``, without noise: not their ends, since
+        the difference of two moves has more digits."""
         return self._moved(x, lambda y: problem.velocity(y, u))
 
     def drift(self, problem: Problem, x: Tensor) -> Tensor:
-        """The same without control."""
+        """The moves of states ``(N, d)`` in a step without control."""
         return torch.zeros_like(x) if problem.driftless else self._moved(x, problem.drift)
 
     def _moved(self, x: Tensor, velocity: Callable[[Tensor], Tensor]) -> Tensor:
@@ -84,10 +88,10 @@ class Pace:
 
 
 def _largest_eigenvalues(problem: Problem, x: Tensor, u: Tensor) -> Tensor:
-    """The largest modulus ``(N,)`` of the eigenvalues of the linearisation at states ``(N, d)`` under controls ``(N, m)``:
-    the same in whatever units coordinates are."""
-    moved = lambda e: problem.velocity(x + APART * e, u) - problem.velocity(x - APART * e, u)
-    columns = [moved(e) / (2.0 * APART) for e in torch.eye(problem.dim, dtype=x.dtype)]
+    """The largest modulus ``(N,)`` of the eigenvalues of the linearisation at states ``(N, d)`` under controls ``(N, m)``,
+    which does not depend on the units of coordinates."""
+    moved = lambda e: problem.velocity(x + OFFSET * e, u) - problem.velocity(x - OFFSET * e, u)
+    columns = [moved(e) / (2.0 * OFFSET) for e in torch.eye(problem.dim, dtype=x.dtype)]
     return torch.linalg.eigvals(torch.stack(columns, dim=-1)).abs().amax(dim=-1)
 
 

@@ -18,16 +18,16 @@ from ocp_torch.problems.generator import Generator, pull_back
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# The controllers of trained fields: from `V`; from `w / mu`; from the `V` of a warm start, which the values of trajectories
-# under held controls were fitted to; from `V` trained on for the lower bound; and from `w` and the `mu` of Lemma 2 where
-# training takes another: `G` bounds its cost.
-VALUE, DENSITY, TRAJECTORIES, MINIMISED = "value", "density", "trajectories", "minimised"
-BOUNDING = SUBSOLUTION
+# The controllers of trained fields.
+VALUE = "value"  # from `V`
+DENSITY = "density"  # from `w / mu`
+TRAJECTORIES = "trajectories"  # from the `V` of a warm start, for controls that are held
+MINIMISED = "minimised"  # from `w` and the `mu` of Lemma 2 where training takes another: `G` bounds its cost
+BOUNDING = SUBSOLUTION  # from `V` trained on for the lower bound
 
-# A density above it counts as infinite, in single precision too.
-LARGEST = 1e30
+LARGEST_DENSITY = 1e30  # a density above it counts as infinite, in single precision too
 
-# Multiples of it are spread evenly, and no grid or symmetric state has them as coordinates.
+# The multiples of this number are spread evenly, and no grid or symmetric state has them as coordinates.
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 # A policy maps states (N, d) to controls (N, m); a density maps them to (N,).
@@ -55,8 +55,8 @@ class ValuePolicy:
     def flux_divergence(self, x: Tensor, B: Tensor, div_B: Tensor) -> tuple[Tensor, Tensor]:
         r"""The control ``(N, m)`` and `div(B u)` ``(N,)`` at states ``(N, d)``, as data.
 
-        Where `B` does not vary that is `(div B) . u - tr(B J B^T hess V) / rho` with the derivative `J` of `grad
-        R*`: one sweep along the columns of `B J^{1/2}` in place of a reverse pass for each control."""
+        Where `B` does not vary the divergence is `(div B) . u - tr(B J B^T hess V) / rho` with the derivative `J` of
+        `grad R*`: one sweep along the columns of `B J^{1/2}` in place of a reverse pass for each control."""
         if not is_even(self.problem, B):
             return jets.control_flux_divergence(self, x, B, div_B)
         V, rho = jets.jet(self.value, x), self.problem.discount
@@ -66,26 +66,26 @@ class ValuePolicy:
 
 
 def is_even(problem: Problem, B: Tensor) -> bool:
-    """Whether the control matrices ``B`` ``(N, d, m)`` of ``problem`` are the same at all of `N` states, and as at one that
-    is like no other: then they do not vary around these states either."""
+    """Whether the control matrices ``B`` ``(N, d, m)`` of ``problem`` are the same at all of `N` states and at a generic one,
+    so that they do not vary around these states either."""
     generic = (GOLDEN * torch.arange(1, problem.dim + 1, dtype=B.dtype, device=B.device)).remainder(1.0)
     return bool((B == problem.control_matrix(generic.unsqueeze(0))).all())
 
 
 def admissible_density(kind: str | None, problem: Problem, fields: Fields, constants: Constants) -> Field:
-    """`w` of trained fields, within what a limit on the control allows: `mu` of Lemma 2 leaves room for any `w` already."""
+    """`w` of trained fields, within what a limit on the control allows: the `mu` of Lemma 2 allows any `w` already."""
     if kind == CLOSED:
         return fields.control_density
     return problem.control_cost.admissible(fields.control_density, occupation_density(kind, problem, fields, constants))
 
 
 def density_policy(control_density: Field, occupation: Density, cost: PowerCost) -> Policy:
-    """`u = w / mu`, within the limit of ``cost``; 0 where `mu` is 0 (nobody is there) or infinite (mass stands still), and
+    """`u = w / mu`, within the limit of ``cost``; 0 where `mu` is 0 (no mass is there) or infinite (mass stands still), and
     NaN where a state is."""
 
     def policy(x: Tensor) -> Tensor:
         mu = occupation(x)
-        idle = (mu <= 0) | (mu > LARGEST)
+        idle = (mu <= 0) | (mu > LARGEST_DENSITY)
         mu = torch.where(idle, 1.0, mu)
         return torch.where(idle.unsqueeze(-1), 0.0, cost.within(control_density(x), mu) / mu.unsqueeze(-1))
 

@@ -85,7 +85,7 @@ class RecedingHorizon:
         return controls[0]
 
     def _first_plan(self, x: np.ndarray) -> np.ndarray:
-        """The trajectory of the controller that came with ``terminal``; without one that of no control."""
+        """The trajectory of the controller that came with ``terminal``; without one, the trajectory without control."""
         controlled = self._terminal is not None and "control" in self._terminal.name_out()
         states, controls = [], []
         for _ in range(self.steps):
@@ -97,7 +97,7 @@ class RecedingHorizon:
         return np.concatenate([*states, *controls])
 
     def _advanced(self) -> Any:
-        """State and control to the state one step later and the mean of the running cost on the way."""
+        """The `casadi.Function` from state and control to the state one step later and the mean running cost on the way."""
         problem, casadi = self.problem, self.casadi
         data = model(problem)
         x, u = casadi.MX.sym("x", problem.dim), casadi.MX.sym("u", problem.control_dim)
@@ -119,7 +119,7 @@ class RecedingHorizon:
 
 def model(problem: Problem) -> Any:
     """`f` ``(1,)``, `a` ``(d,)`` and `B` ``(m d,)``, column by column, of ``problem`` at a state of the torus, as a
-    `casadi.Function`. Raises `InputError` where they cannot be traced."""
+    `casadi.Function`. Raises `InputError` where these functions cannot be traced."""
 
     @torch.no_grad()
     def data(x: Tensor) -> dict[str, Tensor]:

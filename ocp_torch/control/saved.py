@@ -1,11 +1,11 @@
-"""Controllers from their files, of which nothing is run and nothing is believed that they do not hold."""
+"""Controllers from their files, of which no code is run and whose contents are checked."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
-from ocp_torch.control.controller import PLAIN, SCHEMA, Controller
+from ocp_torch.control.controller import SAVED_AS_IS, SCHEMA, Controller
 from ocp_torch.control.described import problem_name, require_same
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE
 from ocp_torch.errors import InputError, notes
@@ -18,16 +18,14 @@ from ocp_torch.problems.checks.check import check_once
 from ocp_torch.problems.commands import ForeignProblem, current_name, current_section, made_by, naming
 from ocp_torch.problems.constants import Constants
 
-# What a run calls the file of its controller.
-FILE_NAME = "controller.safetensors"
+FILE_NAME = "controller.safetensors"  # of a run's controller
 # The networks that a file may hold.
 FIELDS = (VALUE, CONTROL_DENSITY, LOG_OCCUPATION, TRAJECTORY_VALUE, SUBSOLUTION)
-# The states that come with a subsolution, as many as the file has.
-WORST = f"networks.{SUBSOLUTION}.worst"
+WORST = f"networks.{SUBSOLUTION}.worst"  # the states that come with a subsolution, as many as the file has
 
 
 def controller_file(path: Path) -> Path:
-    """The file of the controller that ``path`` names: itself, that of a run's folder, or of the newest run in a folder."""
+    """The file of the controller that ``path`` names: itself, or that of a run's folder, or of the newest run in a folder."""
     if kind(path) != FOLDER or kind(path / FILE_NAME) is not None:
         return path / FILE_NAME if kind(path) == FOLDER else path
     inside = [file for file in path.glob(f"*/{FILE_NAME}") if kind(file) == FILE]
@@ -35,8 +33,8 @@ def controller_file(path: Path) -> Path:
 
 
 def load_controller(path: str | Path, problem: Problem | None = None, device: str = "cpu") -> Controller:
-    """Load a controller saved by a run, by its file, its run's folder, or a folder of runs, of which it is the newest; no
-    code in the file is run.
+    """Load a controller saved by a run, by its file, its run's folder, or a folder of runs (that of the newest run); no code
+    in the file is run.
 
     A controller of one of the package's problems rebuilds it from its parameters; one of a user's own problem needs that
     ``problem``, made with the same arguments. Raises `InputError` when the file is missing, damaged, of a newer schema, or
@@ -74,7 +72,7 @@ def _rebuilt(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
     fields.load_state_dict(tensors)
     fields = fields.to(device).requires_grad_(False)
     constants = Constants(**{**metadata["bounds"], "warnings": notes(metadata["bounds"]["warnings"])})
-    return Controller(problem, fields, constants, **{name: metadata[name] for name in PLAIN})
+    return Controller(problem, fields, constants, **{name: metadata[name] for name in SAVED_AS_IS})
 
 
 def _problem_of(path: Path, metadata: dict, problem: Problem | None) -> Problem:
@@ -124,7 +122,7 @@ def _require_weights(path: Path, tensors: dict, dtype: object) -> None:
 
 
 def _section(saved: dict, config: dict) -> dict:
-    """The problem of a run as its configuration names it, or as its parameters do where that is of something else."""
+    """The problem of a run as its configuration has it, or its parameters where the configuration is of another problem."""
     section = current_section(config.get("problem"))
     target = str(section.get("_target_")) if isinstance(section, dict) else ""
     name = str(current_name(saved["name"], config.get("problem")))
@@ -133,7 +131,7 @@ def _section(saved: dict, config: dict) -> dict:
 
 
 def _require_run(path: Path, certificate: object, config: object) -> None:
-    """What `evaluate` reads of the run is made of groups of fields."""
+    """Raise `InputError` unless what `evaluate` reads of the run is made of groups of fields."""
     below = lambda group, name: group.get(name) or {} if isinstance(group, dict) else None
     effort = below(config, "certificate")
     if not all(isinstance(g, dict) for g in (certificate, effort, below(effort, "stage"), below(config, "trainer"))):

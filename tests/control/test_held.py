@@ -7,7 +7,7 @@ import torch
 
 from ocp_torch.certificate.checks.observed import largest_jump
 from ocp_torch.control.greedy import HeldPolicy, farthest, kept, solved
-from ocp_torch.control.pace import ANSWERED, Pace
+from ocp_torch.control.pace import RESPONSE_PART, Pace
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields import PeriodicMLP
 from ocp_torch.fields.fields import typical_sizes
@@ -176,4 +176,4 @@ def test_a_control_is_held_for_a_fifth_of_the_time_in_which_a_system_answers(pro
     pushed = lambda u: lambda z: problem.velocity(z.unsqueeze(0), z.new_full((1, 1), u))[0]
     found = [torch.func.jacrev(pushed(size * (-1.0) ** i))(y) for i, y in enumerate(x)]
     fastest = torch.linalg.eigvals(torch.stack(found)).abs().amax(dim=-1)
-    assert Pace.of(problem).step * float(fastest.quantile(0.9)) == pytest.approx(ANSWERED, rel=0.25)
+    assert Pace.of(problem).step * float(fastest.quantile(0.9)) == pytest.approx(RESPONSE_PART, rel=0.25)
