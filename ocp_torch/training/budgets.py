@@ -31,24 +31,17 @@ class Budget:
 
 # Gauss-Newton steps are tried just after missed waves of V were sought for the first or the second time: they then find a
 # smooth V to 1e-5 of the cost in 7 to 18 steps (1 to 32 dimensions), and a dozen show that there is none beside kinks.
-AFTER_FIRST_WAVES = WAVE_SEARCH_STEPS[0] + 1
-AFTER_SECOND_WAVES = WAVE_SEARCH_STEPS[1] + 1
+FIRST_WAVES = WAVE_SEARCH_STEPS[0] + 1
+SECOND_WAVES = WAVE_SEARCH_STEPS[1] + 1
 # Two dimensions: beside kinks steps count more than states (a torus has a gap of .046 % or less after 1,600 steps of 384, of
 # up to .064 % after 1,100 of 512). Eight: at a rate of 1e-2 one run of twelve lost what it had learnt (F_M ended .044 % below
 # OPT, at 5e-3 .0014 %). More: in 16 a density fitted at 1e-2 stays flat (mean residual .12), at 5e-3 it does not (.05).
 BUDGETS = (
-    Budget(1, steps=1050, batch=256, good_gap=0.005, stage_steps=150, newton_steps=40, newton_after=AFTER_FIRST_WAVES),
-    Budget(2, steps=1600, batch=384, good_gap=0.003, stage_steps=200, newton_steps=40, newton_after=AFTER_SECOND_WAVES),
-    Budget(4, steps=1000, batch=384, good_gap=0.005, stage_steps=300, newton_steps=40, newton_after=AFTER_FIRST_WAVES),
+    Budget(1, steps=1050, batch=256, good_gap=0.005, stage_steps=150, newton_steps=40, newton_after=FIRST_WAVES),
+    Budget(2, steps=1600, batch=384, good_gap=0.003, stage_steps=200, newton_steps=40, newton_after=SECOND_WAVES),
+    Budget(4, steps=1000, batch=384, good_gap=0.005, stage_steps=300, newton_steps=40, newton_after=FIRST_WAVES),
     Budget(
-        8,
-        steps=1000,
-        batch=512,
-        good_gap=0.01,
-        stage_steps=300,
-        newton_steps=40,
-        newton_after=AFTER_FIRST_WAVES,
-        lr=5e-3,
+        8, steps=1000, batch=512, good_gap=0.01, stage_steps=300, newton_steps=40, newton_after=FIRST_WAVES, lr=5e-3
     ),
     Budget(
         math.inf,
@@ -57,7 +50,7 @@ BUDGETS = (
         good_gap=0.02,
         stage_steps=400,
         newton_steps=40,
-        newton_after=AFTER_SECOND_WAVES,
+        newton_after=SECOND_WAVES,
         stage_lr=5e-3,
     ),
 )
@@ -72,8 +65,7 @@ NOISY_UNBOUNDED_BATCH = 1024  # or with recorded samples; a noisy unicycle's gap
 NOISY_UNBOUNDED_STEPS = {2: 600, 3: 800}
 # With noise otherwise: more in one dimension, where networks have more modes, fewer in two, where nothing has a kink.
 NOISY_STEPS = {1: 2000, 2: 1100}
-# States for the density player of pd: larger batches serve the slack's supremum, which it does not see.
-DENSITY_BATCH = 256
+DENSITY_BATCH = 256  # states for the density player of pd: more serve the supremum of a slack that it does not see
 SAMPLER = "sobol"
 WORST_STATE_SAMPLER = "uniform"  # evenly spread states leave more steep spots, and the worst state is in one
 OCCUPATION_STATES = 144  # at which a certificate computes the occupation density

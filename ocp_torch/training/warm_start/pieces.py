@@ -22,14 +22,11 @@ from ocp_torch.training.warm_start.targets import Targets
 # Parts of the pieces by where they start; the others start as `mu0` says.
 UNIFORM_PART = 0.125  # uniformly
 CONTINUED_PART = 0.5  # where earlier pieces ended
-# About a state of rest, if any: without these a pendubot leaned by 22 degrees for ever (not tuned).
-RESTING_PART = 0.125
-# Values of the quadratic `V` at starts about a state of rest, in units of `V`, from next to nothing to a standard deviation
-# of the cost (not tuned).
+RESTING_PART = 0.125  # about a state of rest, if any: without these a pendubot leaned by 22 degrees for ever; not tuned
+# The quadratic `V`, in its unit, at starts about a state of rest: up to a standard deviation of the cost (not tuned).
 RISES = (0.1, 100.0)
-# Curvature of the quadratic `V` along directions in which it is as good as flat, as a part of its largest.
-LEAST_CURVATURE = 1e-6
-TINY = 1e-300  # least curvature where all are 0
+LEAST_CURVATURE = 1e-6  # of the quadratic `V`, as a part of its largest, where it is as good as flat
+TINY = 1e-300  # the least curvature where all are 0
 LARGEST_OFFSET = 0.25  # of such a start in each coordinate, in turns
 STARTS_PER_PIECE = 8  # states of `mu0`, for each piece, in the pool that pieces draw their starts from
 
