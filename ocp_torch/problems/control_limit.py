@@ -82,7 +82,7 @@ class ConstrainedCost(PowerCost):
         return torch.where(least > occupation_bound * (1.0 + _room(w)), math.inf, found)
 
     def _at_limit(self, w: Tensor) -> Tensor:
-        """`mu R(w / mu)` at the least `mu`, ``(N,)``; scaled by the largest entry of `w`, so that squares do not underflow."""
+        """`mu R(w / mu)` at the least `mu`, ``(N,)``; `w` is scaled by its largest entry, lest squares underflow."""
         size = w.detach().abs().amax(dim=-1)
         size = torch.where(size > 0.0, size, 1.0)
         w = w / size.unsqueeze(-1)

@@ -27,17 +27,17 @@ from ocp_torch.problems.exact.trigonometric import (
 from ocp_torch.problems.problem import Problem, VectorFields
 from ocp_torch.problems.samples import driven
 
-# States searched for the extrema of u* and f, and the ascents from the best of them with their steps: the truth claimed is as
-# exact as these extrema.
+# States searched for the extrema of u* and f: the truth claimed is as exact as these extrema.
 SEARCH_POINTS = 2**14
-ASCENTS, ASCENT_STEPS = 64, 100
+ASCENTS = 64  # from the best of these states
+ASCENT_STEPS = 100  # of each
 
-# Functions that one evaluation gives, where they are those of the class.
+# Methods that share one evaluation, unless a subclass overrides one of them.
 TOGETHER = ("state_cost", "drift", "control_matrix", "drift_divergence", "control_divergence")
 
 
 class Parts(NamedTuple):
-    """What cost, drift and divergences at the same states have in common."""
+    """Intermediate results that cost, drift and divergences at the same states share."""
 
     B: Tensor  # (N, d, m)
     V: Tensor  # (N,) V0
@@ -160,7 +160,7 @@ class Manufactured(Problem):
         return -torch.einsum("ndm,nd->nm", B, slope) / self.discount
 
     def _at(self, x: Tensor) -> Parts:
-        """What costs and drifts at ``x`` are made of."""
+        """The intermediate results at states ``x`` ``(N, d)``."""
         B, (V, slope), (density, thinning) = self.B(x), self.V0.with_gradient(x), self.mu.with_gradient(x)
         pull = self._pull_back(B, slope)
         flux, sigma = self.discount * self.phi.gradient(x) + self.stream(x), self.noise(x)
@@ -200,7 +200,7 @@ class Manufactured(Problem):
 
     def cost_and_fields(self, x: Tensor, divergences: bool = True) -> tuple[Tensor, VectorFields]:
         if any(getattr(getattr(self, name), "__func__", None) is not getattr(Manufactured, name) for name in TOGETHER):
-            return self.state_cost(x), super().vector_fields(x, divergences)  # somebody has put another in its place
+            return self.state_cost(x), super().vector_fields(x, divergences)  # a subclass overrides one of them
         parts = self._at(x)
         known = (self._drift_divergence(x, parts), self.control_divergence(x)) if divergences else (None, None)
         return self._cost(x, parts), (self._drift(parts), parts.B, *known)

@@ -11,7 +11,7 @@ from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.problem import Problem
 
 SHEARS = ("none", "chain", "random")
-# rho and d k that differ by less, relative to rho, are taken to be equal: where they are, the formula of mu* is 0 / 0.
+# rho and d k that differ by less, relative to rho, count as equal: the formula of mu* is then 0 / 0.
 CRITICAL = 1e-9
 
 

@@ -9,10 +9,9 @@ from torch import Tensor
 from ocp_torch.problems.placed import Placed
 
 TURN = 2.0 * math.pi
-# How far an entry of a matrix goes up and down, relative to its mean: below 1, so that none changes its sign.
+# Amplitude of an entry of a matrix, relative to its mean: below 1, so that no entry changes its sign.
 DEPTH = 0.3
-# How far the random part of the mean goes from the identity, in standard deviations, before it is divided by sqrt(d): small
-# enough that the columns stay apart.
+# Standard deviation of the random part of the mean matrix, times sqrt(d): small enough that the columns stay independent.
 MIX = 0.25
 # Cosines of a vector field taken at once, 2 MiB in float64: 32 MiB took 1.6 to 2.7 times as long.
 MOST_COSINES = 2**18
@@ -90,7 +89,7 @@ class TrigonometricPolynomial(Placed):
 
 
 class TrigonometricField(Placed):
-    """A vector field of polynomials ``components``, of equally many terms each."""
+    """A vector field whose ``components`` are polynomials of equally many terms."""
 
     def __init__(self, components: list[TrigonometricPolynomial]) -> None:
         self.components = components
@@ -176,7 +175,7 @@ class WavyMatrix(Placed):
         return (self._at(x).unsqueeze(-1) == torch.arange(len(self.mean), device=x.device)).to(x)
 
     def divergence(self, x: Tensor) -> Tensor:
-        """Of each column, ``(N, m)``: entry `(i, k)` counts where it varies with coordinate `i`."""
+        """The divergence of each column, ``(N, m)``: entry `(i, k)` counts where it varies with coordinate `i`."""
         rows = torch.arange(len(self.mean), device=x.device).unsqueeze(-1)
         return (self.slopes(x) * (self._at(x) == rows)).sum(dim=1)
 

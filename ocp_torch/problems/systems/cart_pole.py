@@ -111,7 +111,7 @@ class CartPole(System):
         return np.array([position, pole, velocity, spin])
 
     def action(self, control: np.ndarray) -> np.ndarray:
-        """To the side the force is on: it is 10 N there, either way."""
+        """The number of the side that the force pushes to: the environment knows 10 N either way."""
         return np.array(control[0] > 0.0, dtype=np.int64)
 
     def joints(self, s: Tensor) -> Tensor:
@@ -121,7 +121,7 @@ class CartPole(System):
         return torch.stack([torch.stack([position, torch.zeros_like(position)], dim=-1), tip], dim=1)
 
     def energy(self, s: Tensor) -> Tensor:
-        """Kinetic and potential energy ``(N,)`` in J, the latter 0 with the pole upright."""
+        """Kinetic plus potential energy ``(N,)`` in J, the latter 0 with the pole upright."""
         _, pole, velocity, spin = s.unbind(-1)
         lever = self.pole_mass * self.half_length
         kinetic = 0.5 * (self.cart_mass + self.pole_mass) * velocity.square() + lever * pole.cos() * velocity * spin

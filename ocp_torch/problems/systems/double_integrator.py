@@ -14,7 +14,7 @@ from ocp_torch.problems.physical.start import EDGE
 from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.systems.linear_quadratic import LinearQuadratic
 
-# Nodes of Gauss and Legendre that are exact for a square times the edge of a start, a polynomial of degree 5.
+# Gauss-Legendre nodes: exact for a square times the edge of a start, a polynomial of degree 5.
 NODES = 4
 
 

@@ -14,8 +14,10 @@ from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.systems.rest import bound_at_rest
 
 HANGING = (math.pi, 0.0, 0.0, 0.0)
-# Where a run may start: within so much of hanging at rest (rad and rad/s); or at any angles, up to a part of the top speeds.
-HANGING_SPREAD, ANYWHERE = (0.5, 0.5, 1.0, 1.0), 0.3
+# Spread of the starts around hanging at rest, in rad and rad/s.
+HANGING_SPREAD = (0.5, 0.5, 1.0, 1.0)
+# Starts anywhere have any angles, and speeds up to this part of ``max_speeds``.
+ANYWHERE = 0.3
 STARTS = ("anywhere", "hanging")
 
 
@@ -110,7 +112,7 @@ class DoublePendulum(System):
         return self._total + 2.0 * bend, self._outer + bend, torch.full_like(bend, self._outer)
 
     def energy(self, s: Tensor) -> Tensor:
-        """Kinetic and potential energy in J, ``(N,)``; the latter is 0 with both links level."""
+        """Kinetic plus potential energy in J, ``(N,)``; the latter is 0 with both links level."""
         (m11, m12, m22), (w1, w2) = self.mass_matrix(s), s[:, 2:].unbind(-1)
         kinetic = 0.5 * (m11 * w1.square() + 2.0 * m12 * w1 * w2 + m22 * w2.square())
         return kinetic + self._weights[0] * s[:, 0].cos() + self._weights[1] * (s[:, 0] + s[:, 1]).cos()
@@ -149,12 +151,12 @@ class Acrobot(DoublePendulum):
     gymnasium = "Acrobot-v1"
 
     def observed(self, observation: np.ndarray) -> np.ndarray:
-        """Angles there are from hanging."""
+        """The physical state ``(4,)`` of an observation, whose angles are from hanging."""
         c1, s1, c2, s2, w1, w2 = observation
         return np.array([np.arctan2(-s1, -c1), np.arctan2(s2, c2), w1, w2])
 
     def action(self, control: np.ndarray) -> np.ndarray:
-        """The nearest of the torques -1, 0 and 1 N m there are."""
+        """The number of the nearest of the environment's torques, -1, 0 and 1 N m."""
         return np.array(np.rint(control[0]).clip(-1.0, 1.0) + 1.0, dtype=np.int64)
 
 

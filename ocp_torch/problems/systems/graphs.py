@@ -1,4 +1,4 @@
-"""Who acts on whom: adjacency matrices by name, by seed, from a list of rows or from a file."""
+"""Adjacency matrices of coupled oscillators: by name, by seed, from a list of rows or from a file."""
 
 import warnings
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ GRAPHS = ("complete", "ring", "random")
 SUFFIXES = (".npy", ".txt")
 # Characters of a number in a text file, on average, at most.
 LONGEST_NUMBER = 64
-# Bytes of a matrix that is read even where it is larger than it should be, so that its shape can be told.
+# A file of up to so many bytes is read even if it is larger than it should be, so that an error can state its shape.
 LEAST_ROOM = 2**20
 
 
@@ -63,7 +63,7 @@ def _read(name: str, path: Path, count: int) -> np.ndarray:
             return read_npy(path, max(8 * count**2, LEAST_ROOM))
         text = read_text(path, LONGEST_NUMBER * count**2)
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # that there is nothing in it
+            warnings.simplefilter("error")  # NumPy only warns of an empty file
             return np.loadtxt(text.splitlines(), ndmin=2)
     except InputError as error:
         raise InputError(f"{name} cannot be read: {error}") from None

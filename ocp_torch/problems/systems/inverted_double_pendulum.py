@@ -14,8 +14,8 @@ from ocp_torch.problems.systems.rest import bound_at_rest
 
 # The force in N of the environment's action 1: `gear` of its motor.
 GEAR = 500.0
-# How far to either side it starts unless told otherwise. In Gymnasium it starts within 0.1 m, each joint within 0.1 rad (the
-# upper tilt is the sum of two), at normal rates of deviation 0.1.
+# Default ranges of the start, to either side of rest. Gymnasium starts within 0.1 m, each joint within 0.1 rad (the upper
+# tilt is the sum of two), at normal rates of deviation 0.1.
 STARTS = {"position": 0.2, "lower tilt": 0.15, "upper tilt": 0.3, "velocity": 0.3, "lower spin": 0.3, "upper spin": 0.5}
 
 
@@ -108,7 +108,7 @@ class InvertedDoublePendulum(System):
         _, t1, t2, v, w1, w2 = s.unbind(-1)
         (h1, h2), (j1, j2, k), mass = self._levers, self._turning, sum(self.masses)
         b1, b2, j12, bend = h1 * t1.cos(), h2 * t2.cos(), k * (t1 - t2).cos(), k * (t1 - t2).sin()
-        # What is left of the mass matrix when the cart's row is eliminated.
+        # The mass matrix after elimination of the cart's row.
         n11, n12, n22 = j1 - b1.square() / mass, j12 - b1 * b2 / mass, j2 - b2.square() / mass
         det = n11 * n22 - n12.square()
 
@@ -131,7 +131,7 @@ class InvertedDoublePendulum(System):
         return self.force_noise * self.dynamics(s)[1] if self.force_noise else None
 
     def observed(self, observation: np.ndarray) -> np.ndarray:
-        """The last of what is shown is the force of the stops."""
+        """The physical state ``(6,)`` of an observation, without its last entry, the force of the stops."""
         p, s1, s2, c1, c2, v, w1, w2, _ = observation
         first = np.arctan2(s1, c1)
         return np.array([p, first, first + np.arctan2(s2, c2), v, w1, w1 + w2])
@@ -146,7 +146,7 @@ class InvertedDoublePendulum(System):
         return torch.cat([cart, cart + poles.cumsum(dim=1)], dim=1)
 
     def energy(self, s: Tensor) -> Tensor:
-        """Kinetic and potential energy ``(N,)`` in J, the latter 0 with both poles upright."""
+        """Kinetic plus potential energy ``(N,)`` in J, the latter 0 with both poles upright."""
         _, t1, t2, v, w1, w2 = s.unbind(-1)
         (h1, h2), (j1, j2, k) = self._levers, self._turning
         squares = 0.5 * (sum(self.masses) * v.square() + j1 * w1.square() + j2 * w2.square())

@@ -75,7 +75,7 @@ class Kuramoto(Oscillators):
             frequencies = (self.spread * (drawn - drawn.mean())).tolist()
         self.run_at(frequencies, n, coupling)
         self._adjacency = adjacency("problem.graph", graph, n, self.probability, self.seed)
-        # Rows, not a file's name: what is saved with a controller must not depend on another file.
+        # Rows, not a file's name: a saved controller must not depend on another file.
         self.graph = graph if graph in GRAPHS else self._adjacency.tolist()
         coordinates = torch.eye(n, dtype=torch.float64)
         if self.relative:
@@ -85,7 +85,7 @@ class Kuramoto(Oscillators):
         self.occupation_bound = None if self.noisy else math.inf
 
     def phases(self, s: Tensor) -> Tensor:
-        """In relative coordinates the last one is 0."""
+        """All phases, ``(N, n)``; in relative coordinates the last one is 0."""
         return torch.cat([s, torch.zeros_like(s[:, :1])], dim=-1) if self.relative else s
 
     def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -97,13 +97,13 @@ class Kuramoto(Oscillators):
         return a, self._like(s, "B", self._B).expand(len(s), -1, -1)
 
     def divergences(self, s: Tensor) -> tuple[Tensor, Tensor]:
-        """`-(coupling / n) sum_ij A_ij cos(theta_j - theta_i)`, also of the relative phases, and 0."""
+        """`div a = -(coupling / n) sum_ij A_ij cos(theta_j - theta_i)`, also for relative phases, and `div B = 0`."""
         (cosine, sine), A = self.circular(s), self._like(s, "A", self._adjacency)
         together = (cosine * (cosine @ A.T) + sine * (sine @ A.T)).sum(dim=-1)
         return -self.coupling / self.oscillators * together, s.new_zeros(len(s), self.control_dim)
 
     def to_torus(self, s: Tensor) -> Tensor:
-        """In relative coordinates all `n` phases will do too: the last one is taken off."""
+        """`System.to_torus`; with relative coordinates also of all `n` phases, from which the last one is then taken off."""
         return super().to_torus(s[:, :-1] - s[:, -1:] if s.shape[1] > self.dim else s)
 
 

@@ -8,8 +8,10 @@ from torch import Tensor
 
 from ocp_torch.problems.systems.rest import optimal_contraction, riccati
 
-# Paths are followed in steps of this part of the time in which the fastest rate turns a state over, and so many at most.
-STEP, MOST_STEPS = 2.0**-8, 2**14
+# Step along a path, as a part of 1 over the norm of the closed loop's matrix.
+STEP = 2.0**-8
+# Steps of a path, at most.
+MOST_STEPS = 2**14
 
 
 @dataclass(frozen=True)
@@ -49,17 +51,17 @@ class LinearQuadratic:
         return optimal_contraction(self.A, self.B, self.Q, self.rho)
 
     def stays(self, half: Tensor, box: Tensor, limit: float = torch.inf) -> bool:
-        """Whether without noise every path from a state with `|s_i| <= half_i` stays within ``box`` (both ``(d,)``) and
-        `|v| <= limit`. Paths from between the corners stay between theirs, as these sets are convex; and once all corners are
-        back in the rectangle it starts again."""
-        closed = (self.A - self.B @ self.B.T @ self.P) * box / box.unsqueeze(-1)  # of states in units of the box
+        """Whether without noise every path from the rectangle `|s_i| <= half_i` stays within ``box`` (both ``(d,)``) and
+        `|v| <= limit`. Paths of the corners decide, as all sets are convex; once all corners are back in the rectangle, the
+        argument repeats."""
+        closed = (self.A - self.B @ self.B.T @ self.P) * box / box.unsqueeze(-1)  # the closed loop in units of the box
         gain = (self.B.T @ self.P) * box
         rates = [float(torch.linalg.matrix_norm(M, torch.inf)) for M in (closed, gain)]
         flow = torch.linalg.matrix_exp(closed * (STEP / rates[0])).T
         signs = [torch.tensor([-1.0, 1.0], dtype=torch.float64)] * len(half)
         s = torch.cartesian_prod(*signs).reshape(-1, len(half)) * (half / box)
         for _ in range(MOST_STEPS):
-            # Between two looks no coordinate moves by more than this.
+            # Between two steps no coordinate moves by more than this.
             moved = 2.0 * STEP * float(s.abs().max())
             control = float((s @ gain.T).norm(dim=-1).max()) + moved * rates[1] * len(gain) ** 0.5
             if float(s.abs().max()) + moved > 1.0 or control > limit:

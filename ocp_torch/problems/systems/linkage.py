@@ -1,4 +1,4 @@
-r"""What arms of turning joints share, in the plane and in space: a tip that is to reach a target, past round obstacles."""
+r"""The base class of arms of turning joints, in the plane and in space: a tip is to reach a target, past round obstacles."""
 
 import math
 from abc import abstractmethod
@@ -38,7 +38,7 @@ class Linkage(Reaching):
         control_limit: Limit,
         noise: float | Sequence[float],
     ) -> None:
-        """A joint strays by ``joint_noise`` in a second, in rad/sqrt(s): one for each joint, or one for all."""
+        """``joint_noise`` is in rad/sqrt(s), one for each joint or one for all; ``speed`` in turns per second."""
         self.speed, self.joint_noise = require_number("problem.speed", speed, above=0.0), joint_noise
         angles = [Angle(f"joint {i + 1}") for i in range(joints)]
         rates = [f"rate {i + 1} [rad/s]" for i in range(joints)]
@@ -48,10 +48,10 @@ class Linkage(Reaching):
         self.disturb(torch.tensor(each, dtype=torch.float64).diag())
 
     def stretch(self, length: float, shoulder: list[float]) -> None:
-        """Note that the tip stays within ``length`` metres of the ``shoulder``, the first joint's place."""
+        """Set the reach: the tip stays within ``length`` metres of the ``shoulder``, the first joint's place."""
         self.length, self.shoulder = length, shoulder
         self.bound_cost((math.hypot(*shoulder) + length + math.hypot(*self.target)) ** 2)
-        # Where a joint strays the flow does not gather on a point.
+        # With noise the flow does not gather on a point.
         self.occupation_bound = None if self.noisy else math.inf
 
     @abstractmethod

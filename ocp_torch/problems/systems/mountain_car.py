@@ -74,7 +74,7 @@ class MountainCar(System):
         self.occupation_bound = None if self.noisy else math.inf
 
     def underway(self, s: Tensor) -> Tensor:
-        """How much of motion and cost is left at physical states, ``(N,)``: 1 before the goal, 0 from ``high`` on."""
+        """The factor of motion and cost at physical states, ``(N,)``: 1 before the goal, 0 from ``high`` on."""
         return smooth_step((s[:, 0] - self.goal) / (self.high - self.goal))
 
     def cost(self, s: Tensor) -> Tensor:
@@ -93,7 +93,7 @@ class MountainCar(System):
         return self.force_noise * self.dynamics(s)[1] if self.force_noise else None
 
     def energy(self, s: Tensor) -> Tensor:
-        """Kinetic and potential energy ``(N,)``, which the force alone changes."""
+        """Kinetic plus potential energy ``(N,)``, which only the force changes."""
         return 0.5 * s[:, 1] ** 2 + self.gravity / HILLS * (HILLS * s[:, 0]).sin()
 
     def observed(self, observation: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-r"""What phase oscillators share: Kuramoto's order parameter, and goals and costs of synchrony made of it."""
+r"""The base class of phase oscillators: Kuramoto's order parameter, and goals and costs of synchrony made of it."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,9 @@ from ocp_torch.errors import require_choice, require_number, require_numbers
 from ocp_torch.problems.constant_noise import one_or_each
 from ocp_torch.problems.physical.system import System
 
-SYNCHRONISE, DESYNCHRONISE, ENTRAIN = "synchronise", "desynchronise", "entrain"
+SYNCHRONISE = "synchronise"
+DESYNCHRONISE = "desynchronise"
+ENTRAIN = "entrain"
 
 
 class Oscillators(System):
@@ -18,19 +20,19 @@ class Oscillators(System):
     goals: tuple[str, ...] = (SYNCHRONISE, DESYNCHRONISE)
 
     def aim(self, goal: str, weight: float) -> None:
-        """Note the ``goal``, and the cost ``weight`` where it is missed altogether."""
+        """Set the ``goal``, and the ``weight`` of the cost, its largest value."""
         self.goal = require_choice("problem.goal", goal, self.goals)
         self.weight = self.state_cost_bound = require_number("problem.weight", weight, above=0.0)
 
     def run_at(self, frequencies: list[float], count: int, coupling: float) -> None:
-        """Note the ``count`` frequencies and the coupling, all in rad/s."""
+        """Set the ``count`` frequencies and the coupling, all in rad/s."""
         self.frequencies = require_numbers("problem.frequencies", frequencies, count)
         self.coupling = require_number("problem.coupling", coupling)
         self._omega = torch.tensor(self.frequencies, dtype=torch.float64)
 
     def shake(self, phase_noise: float | Sequence[float], coordinates: Tensor) -> None:
-        """Note how far a phase strays in a second, ``phase_noise`` in rad/sqrt(s): one for each of the phases, or one for
-        all. ``coordinates`` ``(d, n)`` makes states of phases."""
+        """Set the ``phase_noise``, in rad/sqrt(s): one for each of the phases, or one for all. The matrix ``coordinates``
+        ``(d, n)`` takes phases to states."""
         each = one_or_each("problem.phase_noise", phase_noise, coordinates.shape[1])
         self.phase_noise = phase_noise
         self.disturb(coordinates * torch.tensor(each, dtype=torch.float64))

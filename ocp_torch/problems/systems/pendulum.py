@@ -106,7 +106,7 @@ class Pendulum(System):
         return self._scale * (tilt + SPEED_COST * self._square(s[:, 1]))
 
     def state_cost(self, x: Tensor) -> Tensor:
-        """The cost goes on beyond ``max_speed``, where it is level at the seam already."""
+        """`cost` also beyond ``max_speed``, without a failure cost: it is level at the seam already."""
         return self.cost(self.from_torus(x))
 
     def dynamics(self, s: Tensor) -> tuple[Tensor, Tensor]:

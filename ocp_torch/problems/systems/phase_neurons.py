@@ -67,6 +67,6 @@ class PhaseNeurons(Oscillators):
         return self._like(s, "omega", self._omega) + self.coupling * pulled, Z.unsqueeze(-1)
 
     def divergences(self, s: Tensor) -> tuple[Tensor, Tensor]:
-        """`-coupling (n r^2 - 1)`, as each neuron's own term is no coupling, and the sum of `Z'`."""
+        """`div a = -coupling (n r^2 - 1)`, where -1 takes out each neuron's own term, and `div B`, the sum of `Z'`."""
         slope = s.sin() if self.response == TYPE_1 else -s.cos()
         return self.coupling * (1.0 - self.neurons * self.square_order(s)), slope.sum(dim=-1, keepdim=True)

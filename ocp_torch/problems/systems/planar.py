@@ -1,4 +1,4 @@
-r"""What vehicles in the plane share: position and heading, a target, round obstacles, and walls where there are any."""
+r"""The base class of vehicles in the plane: position and heading, a target, round obstacles, and walls on request."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from ocp_torch.problems.physical.coordinates import Angle, Coordinate, Interval
 from ocp_torch.problems.physical.units import TURN
 from ocp_torch.problems.systems.reaching import Reaching, bump
 
-# Part of a room it starts in: with less room than this no vehicle that cannot stop can turn away from a wall.
+# Starts are in this part of a room, along each axis: a vehicle that cannot stop needs room to turn away from a wall.
 INNER = 0.7
 
 
@@ -44,8 +44,8 @@ class PlanarVehicle(Reaching):
         position_noise: float,
         noise: float | Sequence[float],
     ) -> None:
-        """``controls`` are the last of speed and turn rate, in units of ``speed`` m/s and ``turn_rate`` turns/s. It strays by
-        ``heading_noise`` in rad/sqrt(s), and by ``position_noise`` in m/sqrt(s) along each axis. Call `pursue` before."""
+        """``controls`` are speed and turn rate or the latter alone, in units of ``speed`` m/s and ``turn_rate`` turns/s.
+        ``heading_noise`` is in rad/sqrt(s), ``position_noise`` in m/sqrt(s) along each axis. Call `pursue` before."""
         self.size = require_number("problem.size", size, above=0.0)
         self.speed = require_number("problem.speed", speed, above=0.0)
         self.turn_rate = require_number("problem.turn_rate", turn_rate, above=0.0)
@@ -75,7 +75,7 @@ class PlanarVehicle(Reaching):
         return torch.stack([s[:, 2].cos(), s[:, 2].sin()], dim=-1)
 
     def moves(self, s: Tensor) -> Tensor:
-        """What a speed of 1 m/s and a turn rate of 1 rad/s do to the state, ``(N, 3, 2)``."""
+        """The velocities of the state at a speed of 1 m/s and at a turn rate of 1 rad/s, as columns ``(N, 3, 2)``."""
         cos, sin, still = s[:, 2].cos(), s[:, 2].sin(), torch.zeros_like(s[:, 2])
         return torch.stack([cos, still, sin, still, still, still + 1.0], dim=-1).unflatten(1, (3, 2))
 

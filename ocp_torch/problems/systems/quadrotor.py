@@ -11,8 +11,10 @@ from ocp_torch.problems.physical.coordinates import Interval
 from ocp_torch.problems.systems.reaching import Reaching, bump
 from ocp_torch.problems.systems.rest import bound_at_rest
 
-# It starts in the inner part of the room, and slower and more level than the box allows.
-INNER, SLOW = 0.7, 0.3
+# Starts are in this part of the room, along each axis,
+INNER = 0.7
+# and in this part of the box's pitch and speeds.
+SLOW = 0.3
 LIMITS = [1.0, 1.0]  # N
 
 
@@ -90,11 +92,11 @@ class Quadrotor(Reaching):
 
     @property
     def _goal(self) -> Tensor:
-        """Hovering at the target."""
+        """The state of hovering at the target."""
         return torch.tensor([*self.target, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 
     def _smooth(self, s: Tensor) -> Tensor:
-        """The cost without obstacles."""
+        """The cost without obstacles, ``(N,)``."""
         way = (s[:, :2] - self._like(s, "target", self._target)).square().sum(dim=-1)
         tilt = 4.0 * (0.5 * s[:, 2]).sin().square()
         speed = s[:, 3:5].square().sum(dim=-1) + (self.arm * s[:, 5]).square()

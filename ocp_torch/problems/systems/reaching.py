@@ -1,4 +1,4 @@
-"""What arms and vehicles share: a target to come near to, and round obstacles to keep off."""
+"""The base class of arms, vehicles and quadrotors: a target to come near to, and round obstacles to keep off."""
 
 import math
 from abc import ABC, abstractmethod
@@ -23,8 +23,8 @@ class Reaching(System, ABC):
         target_weight: float,
         obstacle_weight: float,
     ) -> None:
-        """Note a ``target`` of ``space`` coordinates, 2 or 3, ``obstacles`` of as many and a radius, felt ``clearance`` from
-        their surface, and what both cost. Raises `InputError` for wrong ones."""
+        """Set a ``target`` of ``space`` coordinates, 2 or 3, ``obstacles`` of as many and a radius, felt ``clearance`` from
+        their surface, and the weights of both in the cost. Raises `InputError` for wrong ones."""
         self.target = require_numbers("problem.target", target, space)
         if isinstance(obstacles, str) or not isinstance(obstacles, Sequence):
             form = f"[{', '.join('xyz'[:space])}, radius]"
@@ -39,7 +39,7 @@ class Reaching(System, ABC):
         self._balls = torch.tensor(self.obstacles, dtype=torch.float64).reshape(-1, space + 1)
 
     def bound_cost(self, farthest: float) -> None:
-        """Note that the square distance from the target is at most ``farthest`` square metres."""
+        """Set the bound of the cost, as the square distance from the target is at most ``farthest`` square metres."""
         most = self.target_weight * farthest + self.obstacle_weight * len(self.obstacles)
         self.state_cost_bound = max(most, self.failure_cost or 0.0)
 
@@ -52,7 +52,7 @@ class Reaching(System, ABC):
         """Metres from parts of the body to the surface of each of the ``balls``, ``(N, ...)``; negative inside."""
 
     def distance(self, x: Tensor) -> Tensor:
-        """From the target, in metres, ``(N,)``."""
+        """The distance from the target, in metres, ``(N,)``."""
         return self.to_target(x).norm(dim=-1)
 
     def gap(self, x: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ocp_torch.problems.physical.system import System
 
-# A contraction this close to rho, relative to it, counts as one that reaches it, so that rounding decides nothing.
+# A contraction rate within this part of rho counts as rho, so that rounding decides nothing.
 ROUNDING = 1e-9
 
 

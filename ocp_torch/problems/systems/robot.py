@@ -13,10 +13,12 @@ from ocp_torch.problems.control_limit import Limit
 from ocp_torch.problems.problem import MOST_COORDINATES
 from ocp_torch.problems.systems.linkage import Linkage
 
-TURNING, STIFF = ("revolute", "continuous"), "fixed"
-# Text of a description in bytes; meshes lie in files of their own, and are not read.
+# Types of joints in a URDF file that this model knows.
+TURNING = ("revolute", "continuous")
+STIFF = "fixed"
+# Bytes of a URDF file, at most; meshes lie in files of their own, and are not read.
 LARGEST_URDF = 2**24
-# Without a file, an elbow arm of the usual build: where each joint sits against the one before, in metres, and its axis.
+# The elbow arm without a file: the place of each joint against the one before, in metres, and its axis.
 ELBOW = [
     [1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, y, 0.0, 0.0, 1.0, z, *axis]
     for (x, y, z), axis in (
@@ -85,7 +87,7 @@ class RobotArm(Linkage):
         self.stretch(float(steps[1:].norm(dim=-1).sum()), steps[0].tolist())
 
     def _frames(self, s: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """What `joints` gives, and the frame that each joint turns in, `n` times ``(N, 3, 3)``."""
+        """The result of `joints`, and the frame that each joint turns in, `n` times ``(N, 3, 3)``."""
         angle = s[..., None, None]
         eye = torch.eye(3, dtype=s.dtype, device=s.device)
         fixed, K = self._like(s, "fixed", self._fixed), self._like(s, "turners", self._turners)
@@ -111,7 +113,8 @@ class RobotArm(Linkage):
 
 
 def read_chain(path: str | Path, tip: str | None) -> list[list[float]]:
-    """From the base of a URDF file's robot to the link ``tip``: a row for each turning joint, and one for the tip.
+    """The kinematics from the base of a URDF file's robot to the link ``tip``: a row for each turning joint, and one for
+    the tip.
 
     A row is the transform from the joint before, as the 12 numbers of its upper rows, and the axis of the joint (zeros
     for the tip). Without a ``tip``, the link behind the most turning joints, the farthest of them. Limits of joints are left

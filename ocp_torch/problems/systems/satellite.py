@@ -11,8 +11,9 @@ from ocp_torch.problems.physical.coordinates import Interval
 from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.systems.rest import bound_at_rest
 
-# The part of the box that it starts in: of the attitudes (half a turn about one axis is 1), and of the rates.
-ATTITUDES, RATES = 0.6, 0.3
+# Starts are in these parts of the box, along each axis: of the attitudes (half a turn about one axis is 1), and of the rates.
+ATTITUDES = 0.6
+RATES = 0.3
 LIMITS = [20.0, 20.0, 20.0]  # N m
 
 
@@ -29,8 +30,8 @@ class Satellite(System):
 
     Cost `8 |sigma|^2 / (1 + |sigma|^2) = 4 (1 - cos(phi / 2))`, about `phi^2 / 2`, `+ rate_cost |omega|^2
     + torque_cost |u|^2 / 2`. ``inertia`` in kg m^2 and the limit are those of Wie, Weiss and Arapostathis (*Quaternion
-    feedback regulator for spacecraft eigenaxis rotations*, 1989). It starts in the inner part of the box, so that turns to
-    be made are up to 170 degrees; ``torque_noise`` in N m sqrt(s) enters as each torque does. Raises `InputError` for wrong
+    feedback regulator for spacecraft eigenaxis rotations*, 1989). Starts are in the inner part of the box, up to 170 degrees
+    from the wanted attitude; ``torque_noise`` in N m sqrt(s) enters as each torque does. Raises `InputError` for wrong
     arguments.
     """
 
@@ -70,7 +71,7 @@ class Satellite(System):
         self.occupation_bound = bound_at_rest(self, [0.0] * 6)
 
     def angle(self, s: Tensor) -> Tensor:
-        """The pointing error in rad, the shorter way round, ``(N,)``."""
+        """The pointing error in rad, the shorter way round, ``(N,)``, at physical states ``(N, d)``."""
         size = s[:, :3].norm(dim=-1)
         return 4.0 * torch.atan(torch.minimum(size, 1.0 / size))
 
