@@ -1,4 +1,4 @@
-"""How rigid bodies look: carts with a pole, two links that swing, quadrotors in their room, satellites that turn."""
+"""Drawings of rigid bodies: carts with poles, double pendulums, quadrotors in their room, satellites."""
 
 from typing import Any
 
@@ -12,12 +12,12 @@ from ocp_torch.problems.systems.satellite import Satellite
 from ocp_torch.runs.metrics.measures import Path
 from ocp_torch.runs.pictures.strokes import draw_obstacles, tracks
 
-# Earlier poses that stay visible.
+# Earlier poses that stay visible, spread over the whole path.
 GHOSTS = 12
 
 
 def draw_double_pendulum(problem: DoublePendulum, axes: Any, path: Path, k: int) -> None:
-    """One trajectory: poses from light to dark, and the way of the tip; with noise the poses are those of the mean."""
+    """One trajectory: poses from light to dark, and the path of the tip; with noise poses of the mean, and all tips' paths."""
     reach = 1.08 * sum(problem.lengths)
     *others, (mean, _) = tracks(path, k)
     poses = problem.joints(problem.from_torus(mean))
@@ -32,8 +32,8 @@ def draw_double_pendulum(problem: DoublePendulum, axes: Any, path: Path, k: int)
 
 
 def draw_cart(problem: CartPole | InvertedDoublePendulum, axes: Any, path: Path, k: int) -> None:
-    """One trajectory: cart and poles from light to dark, and the way of the tip; the ends of the track dotted. With noise the
-    poses are those of the mean, and the way of each tip is drawn."""
+    """One trajectory: cart and poles from light to dark, and the path of the tip; the ends of the track dotted. With noise
+    poses of the mean, and each tip's path."""
     for end in (-problem.track, problem.track):
         axes.axvline(end, color="0.7", linestyle=":")
     axes.axhline(0.0, color="0.8", linewidth=0.8)
@@ -52,7 +52,7 @@ def draw_cart(problem: CartPole | InvertedDoublePendulum, axes: Any, path: Path,
 
 
 def draw_quadrotors(problem: Quadrotor, axes: Any, path: Path, k: int) -> None:
-    """Tracks in the room, its walls dotted, with the bar between the rotors now and then."""
+    """Tracks in the room, whose walls are dotted, with the bar between the rotors at some times."""
     draw_obstacles(axes, problem.obstacles, problem.clearance)
     some = torch.cat([torch.arange(0, k, max(1, len(path.times) // GHOSTS)), torch.tensor([k])])
     for x, look in tracks(path, k):
@@ -72,7 +72,7 @@ def draw_quadrotors(problem: Quadrotor, axes: Any, path: Path, k: int) -> None:
 
 
 def draw_satellites(problem: Satellite, axes: Any, path: Path, k: int) -> None:
-    """The pointing error of each start in time."""
+    """The pointing error over time, of each start and their mean."""
     error = path.each(lambda x: torch.rad2deg(problem.angle(problem.from_torus(x))))[: k + 1]
     axes.plot(path.times[: k + 1], error, color="C0", linewidth=0.6, alpha=0.5)
     axes.plot(path.times[: k + 1], error.mean(dim=1), color="C0", linewidth=2.5, label="mean of the starts")

@@ -11,18 +11,19 @@ from ocp_torch.runs.metrics.measures import Path, simulate
 from ocp_torch.runs.metrics.trial import random_starts
 from ocp_torch.runs.pictures.scenes import Scene, scene
 
-# With noise so many starts at most, and paths from each.
-NOISY_STARTS, SAMPLES = 3, 8
-# Time drawn, in units of 1 / rho, and frames of it.
-DURATION, FRAMES = 5.0, 160
-# Of a panel, in inches.
-WIDTH, HEIGHT = 4.6, 4.2
-# Of an animation, every fourth frame, coarsely: a GIF of a few hundred kilobytes.
-FRAMES_PER_SECOND, STRIDE, DPI = 12, 4, 60
+NOISY_STARTS = 3  # starts with noise, at most
+SAMPLES = 8  # paths from each start with noise
+DURATION = 5.0  # time drawn, in units of 1 / rho
+FRAMES = 160  # of this time
+WIDTH, HEIGHT = 4.6, 4.2  # of a panel, in inches
+# An animation of every fourth frame, at few dots per inch, makes a GIF of a few hundred kilobytes.
+STRIDE = 4
+DPI = 60
+FRAMES_PER_SECOND = 12
 
 
 def _panels(problem: Problem, look: Scene, policy: Policy, seed: int) -> list[tuple[str, Path]]:
-    """Titles and paths from random admissible starts: each apart, or all in one panel beside the same without control."""
+    """Titles and paths from random admissible starts: a panel for each, or one for all beside the same without control."""
     starts = min(look.starts, NOISY_STARTS) if problem.noisy else look.starts
     x0 = random_starts(problem, starts, derive_seed(seed, Branch.PICTURES))
     run = lambda each, starts: simulate(problem, each, starts, DURATION / problem.discount, FRAMES, SAMPLES)
@@ -69,7 +70,7 @@ def animate(problem: Problem, policy: Policy, path: str | FilePath, seed: int = 
     assert look is not None  # as was just required
     panels = _panels(problem, look, policy, seed)
     figure, writer = blank_figure(WIDTH * len(panels), HEIGHT), PillowWriter(fps=FRAMES_PER_SECOND)
-    figure.set_layout_engine("none")  # the same axes in every frame, and not found anew for each
+    figure.set_layout_engine("none")  # keeps the axes in place from frame to frame
     try:
         with writer.saving(figure, str(path), dpi=DPI):
             for frame in range(0, FRAMES + 1, STRIDE):

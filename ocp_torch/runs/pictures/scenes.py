@@ -1,4 +1,4 @@
-"""How a system looks: an arm with its obstacles, vehicles in their plane, phases and their order, a pendulum's portrait."""
+"""Drawings of systems, and which system has which: arms, vehicles in their plane, phases, phase portraits."""
 
 import math
 from collections.abc import Callable
@@ -28,8 +28,8 @@ from ocp_torch.runs.pictures.strokes import broken, draw_balls, draw_obstacles, 
 
 
 def draw_arm(problem: Linkage, axes: Any, path: Path, k: int) -> None:
-    """One trajectory: poses from light to dark, the way of the tip, target and obstacles; in the plane or in space. With
-    noise the poses are those of the mean, and the way of each tip is drawn."""
+    """One trajectory: poses from light to dark, the path of the tip, target and obstacles; in the plane or in space. With
+    noise poses of the mean, and each tip's path."""
     base = [0.0] * len(problem.shoulder)
     reach = 1.08 * max(problem.length, *(math.dist(problem.shoulder, place) for place in (problem.target, base)))
     limits = {f"{name}lim": (at - reach, at + reach) for name, at in zip("xyz", problem.shoulder, strict=False)}
@@ -49,7 +49,7 @@ def draw_arm(problem: Linkage, axes: Any, path: Path, k: int) -> None:
 
 
 def draw_vehicles(problem: PlanarVehicle, axes: Any, path: Path, k: int) -> None:
-    """Trajectories in the plane, or between its walls, with their headings."""
+    """Tracks in the plane or the room, with headings at some times."""
     draw_obstacles(axes, problem.obstacles, problem.clearance, None if problem.walls else problem.size)
     some = torch.cat([torch.arange(0, k, max(1, len(path.times) // 16)), torch.tensor([k])])
     for x, look in tracks(path, k):
@@ -64,7 +64,7 @@ def draw_vehicles(problem: PlanarVehicle, axes: Any, path: Path, k: int) -> None
 
 
 def draw_phases(problem: Kuramoto | PhaseNeurons, axes: Any, path: Path, k: int) -> None:
-    """The order parameter in time: each start, and their mean."""
+    """The order parameter over time, of each start and their mean."""
     order = path.each(problem.order_parameter)[: k + 1]
     axes.plot(path.times[: k + 1], order, color="C0", linewidth=0.6, alpha=0.5)
     axes.plot(path.times[: k + 1], order.mean(dim=1), color="C0", linewidth=2.5, label="mean of the starts")
@@ -72,7 +72,7 @@ def draw_phases(problem: Kuramoto | PhaseNeurons, axes: Any, path: Path, k: int)
 
 
 def draw_system(problem: System, axes: Any, path: Path, k: int) -> None:
-    """The first two coordinates in their units, or the only one in time; and the ends of their box, dotted."""
+    """The first two coordinates in their units, or the only one over time, with the ends of the box dotted."""
     shown = problem.coordinates[:2]
     alone = len(shown) == 1
     lines = [axes.axhline] if alone else [axes.axvline, axes.axhline]
@@ -82,7 +82,7 @@ def draw_system(problem: System, axes: Any, path: Path, k: int) -> None:
     halves = torch.tensor([0.5 * c.length for c in shown], dtype=torch.float64)
     for x, look in tracks(path, k):
         track = problem.from_torus(x)[:, :2]
-        track = broken(track / halves, 1.0) * halves  # where it goes around, it is not drawn across
+        track = broken(track / halves, 1.0) * halves  # no line across the picture where a coordinate goes around
         drawn = torch.stack([path.times[: k + 1], track[:, 0]], dim=-1) if alone else track
         axes.plot(*drawn.T, **look)
         axes.plot(*drawn[-1], "o", color=look["color"], markersize=4)
@@ -94,7 +94,7 @@ def draw_system(problem: System, axes: Any, path: Path, k: int) -> None:
 
 
 def draw_pendulums(problem: Pendulum, axes: Any, path: Path, k: int) -> None:
-    """The portrait of angle and velocity; the rod at the end in a corner."""
+    """The phase portrait of angle and velocity, and in a corner the rod of the first start at frame ``k``."""
     from matplotlib.patches import Wedge
 
     draw_system(problem, axes, path, k)
@@ -108,8 +108,8 @@ def draw_pendulums(problem: Pendulum, axes: Any, path: Path, k: int) -> None:
 
 @dataclass(frozen=True)
 class Scene:
-    """``draw(problem, axes, path, k)`` shows a path up to its frame ``k`` on Matplotlib's axes of this ``projection``; so
-    many ``starts`` are drawn, in one panel or ``apart``, each in its own."""
+    """``draw(problem, axes, path, k)`` shows a path up to its frame ``k`` on Matplotlib axes of this ``projection``. The
+    number of ``starts`` is drawn in one panel, or ``apart``, each in a panel of its own."""
 
     draw: Callable[[Any, Any, Path, int], None]
     starts: int
@@ -117,7 +117,7 @@ class Scene:
     projection: str = "rectilinear"
 
 
-# System -> its scene; a subclass before its parent.
+# System -> its scene, each subclass before its parent.
 SCENES = {
     RobotArm: Scene(draw_arm, 3, apart=True, projection="3d"),
     Linkage: Scene(draw_arm, 3, apart=True),
@@ -135,5 +135,5 @@ SCENES = {
 
 
 def scene(problem: Problem) -> Scene | None:
-    """The scene of ``problem``, or `None` where a map of `V` says it all."""
+    """The scene of ``problem``, or `None` if it has none."""
     return next((shown for system, shown in SCENES.items() if isinstance(problem, system)), None)

@@ -1,4 +1,4 @@
-"""What scenes are drawn of: obstacles in the plane and in space, and the tracks of paths."""
+"""Parts of all scenes: obstacles in the plane and in space, and the tracks of paths."""
 
 import math
 from typing import Any
@@ -21,7 +21,7 @@ def draw_obstacles(axes: Any, discs: list, clearance: float, period: float | Non
 
 
 def draw_balls(axes: Any, balls: list, clearance: float) -> None:
-    """As `draw_obstacles`, in space."""
+    """Draw balls ``[x, y, z, radius]`` in space, and the surface at the ``clearance`` around each as a mesh."""
     along, up = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 25), np.linspace(0.0, np.pi, 13))
     sphere = np.stack([np.cos(along) * np.sin(up), np.sin(along) * np.sin(up), np.cos(up)])
     for *centre, radius in balls:
@@ -31,7 +31,7 @@ def draw_balls(axes: Any, balls: list, clearance: float) -> None:
 
 
 def broken(track: Tensor, jump: float) -> Tensor:
-    """A track ``(K, c)`` with a gap (NaN) where it goes around the torus."""
+    """A track ``(K, c)`` with a gap (NaN) where it goes around the torus, that is where it leaps by more than ``jump``."""
     leap = (track[1:] - track[:-1]).abs().amax(dim=-1) > jump
     track = track.clone()
     track[1:][leap] = math.nan
@@ -39,7 +39,8 @@ def broken(track: Tensor, jump: float) -> Tensor:
 
 
 def tracks(path: Path, k: int) -> list[tuple[Tensor, dict[str, Any]]]:
-    """The states ``(k + 1, d)`` of each path up to frame ``k``, and how its line looks; with noise the means after them."""
+    """The states ``(k + 1, d)`` of each path up to frame ``k``, with the style of its line; with noise then those of the
+    mean of each start."""
     several = path.samples > 1
     looks = dict(linewidth=0.6, alpha=0.5) if several else dict(linewidth=1.2)
     drawn = [(x[: k + 1], {"color": f"C{i // path.samples}", **looks}) for i, x in enumerate(path.states.unbind(1))]

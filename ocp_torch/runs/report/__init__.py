@@ -1,1 +1,1 @@
-"""What a run, or many of them, have to say, as one page to look at. Imports what a run's folder is read with."""
+"""Reports of one run or of many as HTML pages, made from the files in their folders."""

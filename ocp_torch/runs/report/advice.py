@@ -2,7 +2,7 @@
 
 FRESH = "It cannot change at a resume: start a new run with it."
 WITHOUT_M = "Nothing, where the bound `shifted` is narrow: it needs no `M`."
-# Words of a warning, as the code that warns has them -> what to do about it. The first that fits is said.
+# Words of a warning, as in the code that warns -> what to do about it. The first entry that fits is used.
 ADVICE = {
     "nothing is certified:": "Look at what the problem declares of itself, then at its functions: one of them is not so.",
     "bounds contradicted each other": "Nothing, unless it is said of the end too: it was so at that step.",

@@ -1,4 +1,4 @@
-"""The bracket around the optimum, of one run, and the gaps of many."""
+"""Drawings of the bracket around the optimum of one run, and of the gaps of many."""
 
 import math
 from collections.abc import Sequence
@@ -6,14 +6,15 @@ from collections.abc import Sequence
 from ocp_torch.runs.report.drawings import AXIS, digits, dot, line, svg, ticks, write
 from ocp_torch.runs.report.words import label, number
 
-# Pixels for a row.
+# Height of a row in pixels.
 ROW = 42
 
 
 def bracket(certificate: dict) -> str:
-    """Bounds, `OPT` where known, and performances on a line, and the band between the best two that count; what is much
-    farther away is an arrow at the edge. Filled dots count, open ones would if a guess were right; what is not used is left
-    out."""
+    """SVG of the bounds, `OPT` where known, and performances, a row each, and the band between the best lower and upper one.
+
+    Filled dots count, open ones would if a guess were right; bounds that are not used are left out. Values far from the band
+    become arrows at the edge."""
     gap, exact = certificate["gap"], certificate["exact"]
     rows = [
         (label(side, n), e, k)

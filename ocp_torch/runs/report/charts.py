@@ -1,4 +1,4 @@
-"""Curves along the steps of a run."""
+"""SVG charts of curves along the steps of a run."""
 
 import math
 from collections.abc import Sequence
@@ -7,14 +7,14 @@ from ocp_torch.certificate.settings import LONGEST_NAME
 from ocp_torch.runs.report.drawings import AXIS, digits, dot, line, svg, write
 from ocp_torch.runs.report.page import COLORS, text
 
-# Pixels down; lines at most, and points up to which each is marked.
-CHART = 170
-MOST_LINES, MARKED = COLORS, 12
+CHART = 170  # height in pixels
+MOST_LINES = COLORS
+MARKED = 12  # curves of no more points than this have a dot at each
 
 
 def chart(series: dict[str, list[tuple[float, float]]], log: bool = False, span: Sequence[float] = ()) -> str:
-    """Curves of points ``(step, value)`` by name, with their legend; ``span`` are values that the axis must hold, by default
-    all of them. Nothing where there is nothing to draw."""
+    """SVG of curves of points ``(step, value)`` by name, with their legend; the vertical axis covers the values ``span``, by
+    default all values. Empty where there is nothing to draw."""
     keep = lambda y: math.isfinite(y) and (y > 0.0 or not log)
     lines = {n: [(x, y) for x, y in points if keep(y)] for n, points in list(series.items())[:MOST_LINES]}
     lines = {name: points for name, points in lines.items() if points}

@@ -1,4 +1,4 @@
-"""Pictures as SVG, which take their colours from the page and any width: places across are in per cent, down in pixels."""
+"""SVG pictures of any width, with the colours of the page: horizontal places are in per cent, vertical ones in pixels."""
 
 import math
 from collections.abc import Sequence
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from ocp_torch.certificate.settings import LONGEST_NAME
 from ocp_torch.runs.report.page import text
 
-# Pixels for the axis below a picture.
+# Height in pixels of the axis below a picture.
 AXIS = 22
 
 
@@ -28,13 +28,13 @@ def write(x: float, y: float, words: str, anchor: str = "start", kind: str = "")
 
 
 def ticks(marks: Sequence[str], y: float) -> list[str]:
-    """Three of them: at the left end, in the middle, at the right end."""
+    """Three labels ``marks`` at the height ``y``: at the left end, in the middle and at the right end."""
     places = ((0.0, "start"), (50.0, "middle"), (100.0, "end"))
     return [write(x, y, mark, anchor, "soft") for mark, (x, anchor) in zip(marks, places, strict=True)]
 
 
 def digits(value: float, span: float) -> str:
-    """With as many digits as tell apart what is ``span`` away."""
+    """``value`` with as many decimals as a range of length ``span`` needs."""
     if not span > 0.0 or max(abs(value), span) >= 1e6:
         return f"{value:.3g}"
     return f"{value:.{min(12, max(0, 2 - math.floor(math.log10(span))))}f}"

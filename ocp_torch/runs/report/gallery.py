@@ -1,4 +1,4 @@
-"""`gallery.html`: systems on one page, each with a picture, its bracket, the time it took and the command that trains it."""
+"""`gallery.html`: systems on one page, each with its picture, bracket, training time and training command."""
 
 import json
 from collections.abc import Sequence
@@ -23,8 +23,8 @@ COLUMNS = ("system", "certified gap", "simulated gap", "seconds")
 
 @dataclass(frozen=True)
 class Exhibit:
-    """A system of a gallery: its ``problem``, the ``folder`` of its run, the ``command`` that makes such a run alone, and,
-    where it ``failed``, why."""
+    """A system of a gallery: its ``problem``, the ``folder`` of its run, the ``command`` that makes such a run alone, and the
+    reason why it ``failed``, if it did."""
 
     name: str
     problem: Problem
@@ -34,7 +34,7 @@ class Exhibit:
 
 
 def seconds_in(folder: Path) -> dict[str, float]:
-    """What the systems of the gallery in ``folder`` took so far, in seconds. Raises `InputError` where that is damaged."""
+    """The seconds that each system of the gallery in ``folder`` took so far. Raises `InputError` for a damaged file."""
     file = folder / SECONDS
     found = require_section(str(file), read_json(file)) if kind(file) is not None else {}
     return {name: require_number(f"{file}: {name}", value, at_least=0.0) for name, value in found.items()}
@@ -61,7 +61,7 @@ def _counted(exhibits: Sequence[Exhibit], seconds: dict[str, float]) -> str:
 
 
 def _row(exhibit: Exhibit, seconds: dict[str, float]) -> list[str]:
-    """Its line of the table: gaps where it has some."""
+    """The exhibit's row of the table, with its gaps where there are some."""
     name = exhibit.name
     try:
         row = row_of(exhibit.folder, name)
@@ -86,7 +86,7 @@ def _card(exhibit: Exhibit, seconds: float | None, place: Path) -> str:
 
 
 def picture(folder: Path) -> str:
-    """The run's controller at work, or else a map of `V`; nothing where it drew neither."""
+    """The run's figure of the motion, or else its map of `V`; empty without either."""
     figures = drawn(folder)
     for start in ("motion", "value"):
         for name in sorted(figures):

@@ -1,4 +1,4 @@
-"""How to go on with a run: the commands, with its own names in them."""
+"""The commands to go on with a run, with its own names filled in."""
 
 import shlex
 from pathlib import Path
@@ -10,7 +10,7 @@ from ocp_torch.runs.report.page import code, section
 
 
 def going_on(folder: Path, problem: Problem, config: dict, certificate: dict) -> str:
-    """What to type for the run in ``folder``, of ``problem`` and its ``config``, which ended with ``certificate``."""
+    """The section of commands for the run in ``folder``, of ``problem`` and its ``config``, with its ``certificate``."""
     return section(
         "How to go on",
         *(f"<h3>{name}</h3>{code(lines)}" for name, lines in commands(folder, problem, config, certificate)),
@@ -18,10 +18,10 @@ def going_on(folder: Path, problem: Problem, config: dict, certificate: dict) ->
 
 
 def commands(folder: Path, problem: Problem, config: dict, certificate: dict) -> list[tuple[str, str]]:
-    """What each is for, and its lines."""
+    """Pairs of a title and the lines of a command."""
     made = config.get("problem") or {}
     ours = type(problem) in PROBLEMS.values()
-    # What only the command line may name: a resume has the arguments of a class already, but not those of a function.
+    # Only the command line may name a user's own problem; a resume knows the arguments of a class, but not of a simulator.
     own = [] if ours else naming(made)
     again = own[:1] if not isinstance(problem, Simulator) else ["problem=callable", *own[1:]]
     run = as_typed(str(folder))

@@ -1,4 +1,4 @@
-"""The first sentence of a report: how far from optimal the controller can be at most, or that nobody knows, and why."""
+"""The first sentence of a report: how far from optimal the controller can be at most, or why that is not known."""
 
 import math
 
@@ -7,13 +7,13 @@ from ocp_torch.runs.report.words import NEEDS, number, percent, sentence
 
 
 def certified(certificate: dict) -> bool:
-    """Whether anything worth saying bounds how far from optimal the controller can be."""
+    """Whether the certificate bounds how far from optimal the controller is, by a gap of at most `MEANS`."""
     found = _at_most(certificate)
     return certificate["contradiction"] is None and found is not None and found[0] <= MEANS
 
 
 def lead(certificate: dict) -> str:
-    """The sentence: that of the terminal, where it has one that means something."""
+    """The first sentence of the report on ``certificate``; that of the terminal where it bounds the controller's cost."""
     if certificate["contradiction"] is not None:
         return sentence(str(certificate["contradiction"]))
     said, found = in_words(certificate), _at_most(certificate)
@@ -31,8 +31,8 @@ def lead(certificate: dict) -> str:
 
 
 def _at_most(certificate: dict) -> tuple[float, str] | None:
-    """How much more than the optimum the controller costs at most, relative to it, and what that takes: by simulation, or
-    where there is none by the bounds alone."""
+    """How much more than the optimum the controller costs at most, relative to the optimum, and the assumptions in words: by
+    simulation, or without one by the bounds alone."""
     simulated, proved = _simulated(certificate), certificate["gap"]["certified"]
     if simulated is not None:
         return number(simulated), taking(certificate)
@@ -51,7 +51,7 @@ def _simulated(certificate: dict):
 
 
 def _why(certificate: dict) -> str:
-    """Why nothing is certified."""
+    """The reason, in words, why nothing is certified."""
     gap, lower = certificate["gap"], certificate["lower"]
     if not any(lower.values()):
         return "there is no lower bound on the optimum, as without a V; methods dual and pd train one"

@@ -1,4 +1,4 @@
-"""Many runs on one page: their table, their gaps as a picture, and of each what it says."""
+"""Many runs on one page: their table, a picture of their gaps, and the first sentence and bracket of each."""
 
 import os
 from pathlib import Path
@@ -28,7 +28,7 @@ def save_page(comparison: Comparison, file: Path) -> None:
 
 def _parts(comparison: Comparison, place: Path) -> list[str]:
     rows = comparison.rows
-    # What runs are ranked by stands where no screen is too narrow for it.
+    # The columns that runs are ranked by come first, where they fit on any screen.
     order = [*FIRST, *(name for name in COLUMNS if name not in FIRST)]
     shown = (dict(zip(COLUMNS, line, strict=True)) for line in comparison.cells)
     cells = [[text(line[name]) for name in order] for line in shown]
@@ -49,7 +49,7 @@ def _parts(comparison: Comparison, place: Path) -> list[str]:
 
 
 def _one(row: dict, folder: Path, place: Path) -> str:
-    """What a run says, folded; with a link to its report where there is one."""
+    """A run's sentence and bracket, folded, with a link to its report where there is one."""
     told = said(folder) + linked(folder, place)
     gap = next((row[name] for name in ("gap_certified", "gap_simulated") if row[name] is not None), None)
     head = f"{row['run']}: {row['problem']}, {row['method']}, {'no gap' if gap is None else percent(gap)}"
@@ -57,7 +57,7 @@ def _one(row: dict, folder: Path, place: Path) -> str:
 
 
 def said(folder: Path) -> str:
-    """How far from optimal the run in ``folder`` is, and its bracket; or why that cannot be shown."""
+    """The first sentence and the bracket of the run in ``folder``, or why they cannot be shown."""
     try:
         certificate = read_json(folder / "certificate.json", LARGEST_CERTIFICATE)
         return paragraph(text(lead(certificate))) + bracket(certificate)

@@ -1,4 +1,4 @@
-"""A page in one file: its style within, nothing fetched from anywhere, light or dark as the reader's screen is."""
+"""HTML pages of one file: the style is inside, nothing is fetched, and colours follow the reader's light or dark mode."""
 
 import base64
 import re
@@ -8,9 +8,9 @@ from html import escape
 
 from ocp_torch.errors import LONGEST, visible
 
-# Figures are drawn at 120 dots per inch: shown at that size on a screen of 96 they are sharp on finer ones too.
-SHARP = 0.8
-# Pixels from which a figure has a row of its own, and scrolls where the screen is narrower.
+# Figures are drawn at 120 dots per inch and shown at 96: this scale keeps their size.
+SCALE = 0.8
+# A figure of more pixels than this has a row of its own, and scrolls where the screen is narrower.
 WIDE = 800
 
 STYLE = """
@@ -61,12 +61,12 @@ STYLE += "".join(
 
 
 def text(value: object, most: int = LONGEST) -> str:
-    """Any ``value``, be it from a stranger's file, as HTML that shows it and does nothing else."""
+    """``value``, also from an untrusted file, as HTML that only shows it; shortened where it is longer than ``most``."""
     return escape(visible(value, most))
 
 
 def prose(value: object) -> str:
-    """The same for sentences of this package and docstrings: what stands in back-ticks is code."""
+    """`text` for sentences of this package and docstrings: words in back-ticks become code."""
     return re.sub(r"``(.+?)``|`(.+?)`", lambda m: f"<code>{m[1] or m[2]}</code>", text(" ".join(str(value).split())))
 
 
@@ -75,13 +75,13 @@ def paragraph(html: str, kind: str = "") -> str:
 
 
 def section(title: str, *parts: str) -> str:
-    """The ``parts`` under their ``title``, plain text; nothing where there are none."""
+    """The HTML ``parts`` under their ``title``, plain text; empty if all parts are."""
     filled = [part for part in parts if part]
     return "\n".join([f"<section><h2>{text(title)}</h2>", *filled, "</section>"]) if filled else ""
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int] = ()) -> str:
-    """Cells are HTML; the columns ``numbers`` do not wrap. A wide one scrolls by itself."""
+    """A table of HTML cells that scrolls if it is wide; the columns ``numbers`` do not wrap."""
     cell = lambda k, html: f'<td class="n">{html}</td>' if k in numbers else f"<td>{html}</td>"
     head = "".join(f"<th>{text(name)}</th>" for name in header)
     body = "\n".join(f"<tr>{''.join(cell(k, html) for k, html in enumerate(row))}</tr>" for row in rows)
@@ -89,7 +89,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequenc
 
 
 def listing(pairs: Iterable[tuple[str, str]], kind: str = "facts") -> str:
-    """Terms and what they are, both HTML."""
+    """A list of ``pairs`` of a term and its meaning, both HTML."""
     return f'<dl class="{kind}">' + "".join(f"<dt>{term}</dt><dd>{meaning}</dd>" for term, meaning in pairs) + "</dl>"
 
 
@@ -102,9 +102,9 @@ def code(lines: str) -> str:
 
 
 def image(png: bytes, caption: str) -> str:
-    """A ``png`` file within the page."""
-    width, height = (round(SHARP * n) for n in struct.unpack(">II", png[16:24]))
-    kind = ' class="wide scroll"' if width > SHARP * WIDE else ""
+    """The bytes of a ``png`` file as a figure within the page."""
+    width, height = (round(SCALE * n) for n in struct.unpack(">II", png[16:24]))
+    kind = ' class="wide scroll"' if width > SCALE * WIDE else ""
     data = base64.b64encode(png).decode()
     size = f'width="{width}" height="{height}"'
     shown = f'<img {size} alt="{text(caption)}" src="data:image/png;base64,{data}">'
@@ -112,7 +112,7 @@ def image(png: bytes, caption: str) -> str:
 
 
 def page(title: str, parts: Iterable[str]) -> str:
-    """The whole file."""
+    """The whole page as text."""
     head = (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'

@@ -1,4 +1,4 @@
-"""What a problem is, in words and formulas."""
+"""The description of a problem in words and formulas."""
 
 import contextlib
 import inspect
@@ -19,7 +19,7 @@ BRACKET = "F<sub>M</sub>(V) ≤ OPT ≤ Perf(u) ≤ J(w, μ)"
 
 
 def described(problem: Problem, section: dict) -> list[str]:
-    """``problem`` as HTML; ``section`` is what the configuration makes it from."""
+    """``problem`` as HTML; ``section`` is the part of the configuration that made it."""
     cls = type(problem)
     ours = cls.__module__.startswith(f"{PACKAGE}.")
     module = sys.modules.get(cls.__module__)

@@ -1,4 +1,4 @@
-"""`report.html` of a run: all that it left, in one file to look at."""
+"""`report.html` of a run: its results in one page."""
 
 from pathlib import Path
 
@@ -12,15 +12,16 @@ from ocp_torch.runs.report.page import page, paragraph, section, text
 from ocp_torch.runs.report.problem import described
 
 REPORT = "report.html"
-LARGEST_FIGURE, MOST_FIGURES = 2**23, 40
-# How a PNG file begins, and how many bytes there are at least.
-PNG, HEADER = b"\x89PNG\r\n\x1a\n", 24
-# What a certificate that no run wrote may raise where it is shown.
+LARGEST_FIGURE = 2**23  # bytes of a figure that is shown, at most
+MOST_FIGURES = 40
+PNG = b"\x89PNG\r\n\x1a\n"  # the first bytes of a PNG file
+HEADER = 24  # bytes up to the width and height of a PNG file
+# Exceptions of a damaged or crafted certificate where it is shown.
 DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 
 
 def write_report(folder: Path, problem: Problem, config: dict) -> Path:
-    """Write `report.html` of the run in ``folder``, of ``problem`` and its ``config``, from the files that lie there; its
+    """Write `report.html` of the run in ``folder``, of ``problem`` and its ``config``, from the files there, and return its
     path. Raises `InputError` where they are damaged."""
     certificate = read_json(folder / "certificate.json")
     metrics = read_json(folder / "metrics.json") if (folder / "metrics.json").exists() else None
@@ -33,7 +34,7 @@ def write_report(folder: Path, problem: Problem, config: dict) -> Path:
 
 
 def reason(error: BaseException) -> str:
-    """Why a certificate cannot be shown."""
+    """The reason, in words, why a certificate cannot be shown."""
     return visible(
         error if isinstance(error, InputError) else f"its files are damaged ({type(error).__name__}: {error})", 200
     )
@@ -62,7 +63,7 @@ def report(folder: Path, certificate: dict, metrics: dict | None, problem: Probl
 
 
 def drawn(folder: Path) -> dict[str, bytes]:
-    """The figures in ``folder`` by name."""
+    """The PNG figures in ``folder`` by name, as bytes."""
     found = {}
     for file in sorted((folder / "figures").glob("*.png"))[:MOST_FIGURES]:
         with opened(file, LARGEST_FIGURE) as stream:

@@ -12,7 +12,7 @@ from ocp_torch.runs.report.lead import certified, lead
 from ocp_torch.runs.report.page import code, folded, image, listing, paragraph, prose, section, table, text
 from ocp_torch.runs.report.problem import BRACKET
 
-# Figures by the beginning of their names, in the order of the page, and what they show; the others follow.
+# Beginning of the name of a figure -> what it shows, in the order of the page; other figures follow.
 FIGURES = {
     "motion": "The controller at work.",
     "value": "V: what it costs from each state on.",
@@ -20,18 +20,19 @@ FIGURES = {
     "occupation": "mu: where the discounted time is spent.",
     "slack": "The slack Q of the Hamilton-Jacobi-Bellman equation: the bounds pay for where it is above 0.",
 }
-# The bracket has a drawing of its own.
+# This figure is left out: the page draws the bracket itself.
 DRAWN = "certificate"
+# Entry of the metrics -> name of its row.
 ROWS = {"controller": "this controller", "zero": "no control", "classical": "a classical controller"}
 
 
 def first(certificate: dict) -> str:
-    """The sentence that matters most."""
+    """The first sentence: how far from optimal the controller can be."""
     return paragraph(text(lead(certificate)), "lead" if certified(certificate) else "lead alert")
 
 
 def closed(certificate: dict) -> list[str]:
-    """The bracket, and which number of it to trust."""
+    """The sections with the bracket, and with which of its numbers to trust."""
     note = "Filled dots count, open ones would if a guess were right; the band, simulation included, is where OPT lies."
     drawn = [paragraph(BRACKET, "formula"), bracket(certificate), paragraph(note, "soft")]
     trusted = (paragraph(prose(said)) for said in words.trust(certificate))
@@ -39,7 +40,7 @@ def closed(certificate: dict) -> list[str]:
 
 
 def what_bounds_say(certificate: dict) -> str:
-    """Every number with its error and what it rests on, and what those words mean."""
+    """The table of every number with its error and assumptions, and the meaning of these words."""
     exact, rows = certificate["exact"], list[list[str]]()
     needs, bases = dict[str, None](), dict[str, None]()
     level = f"± {words.percent(certificate['confidence'])}"
@@ -74,11 +75,11 @@ def _otherwise(side: str, name: str) -> str:
 
 
 def learning(found: history.Curves, certificate: dict) -> str:
-    """Bounds, gaps, losses and violations along the steps."""
+    """Charts of bounds, gaps, losses and violations along the steps."""
     group = lambda name: history.group(found, name)
     perf = {n: points for n, points in group("performance").items() if n == certificate.get("controller")}
     bounds, lower, best = group("bounds"), certificate["lower"], certificate["gap"]["lower_from"]
-    # The axis holds what the gap is between, in the second half of the quick evaluations: at first bounds are anywhere.
+    # The axis covers the two sides of the gap in the second half of the quick evaluations: at first bounds are anywhere.
     held = [bounds[name] for name in ([best] if best else lower) if name in bounds] + list(perf.values())
     tight = [y for points in held for _, y in points[(len(points) - 1) // 2 :]]
     curves = {words.label("lower", name): bounds.pop(name) for name in lower if name in bounds}
@@ -99,7 +100,7 @@ def learning(found: history.Curves, certificate: dict) -> str:
 
 
 def figures(drawn: dict[str, bytes], dim: int) -> str:
-    """Those that the run drew in ``dim`` dimensions, PNG by name."""
+    """The section of the figures ``drawn``, PNG bytes by name, of a problem in ``dim`` dimensions."""
     known = [(k, name) for name in drawn if name != DRAWN for k, start in enumerate(FIGURES) if name.startswith(start)]
     first = [(name, list(FIGURES.values())[k]) for k, name in sorted(known)]
     rest = [(name, name) for name in sorted(drawn) if name != DRAWN and name not in dict(first)]
@@ -110,7 +111,7 @@ def figures(drawn: dict[str, bytes], dim: int) -> str:
 
 
 def numbers(metrics: dict | None) -> str:
-    """What the controller achieves beside no control and a classical controller."""
+    """The table of the controller's metrics beside those of no control and a classical controller."""
     rows = {name: metrics[name] for name in ROWS if name in metrics} if metrics else {}
     if not rows or metrics is None:
         return ""
@@ -124,7 +125,7 @@ def numbers(metrics: dict | None) -> str:
 
 
 def warnings(certificate: dict) -> str:
-    """Each warning once, with what to do about it."""
+    """The section of warnings, each once, with what to do about it."""
     told = dict.fromkeys(str(w) for w in certificate["warnings"][:MOST_NOTES])
     shown = [(text(words.sentence(w)), f"What to do: {prose(advice(w))}") for w in told]
     return section("Warnings", listing(shown, "warnings")) if told else ""

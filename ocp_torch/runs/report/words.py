@@ -1,4 +1,4 @@
-"""What a report says of a certificate in words: which number to trust, what each bound is, and what it rests on."""
+"""Sentences of a report on a certificate: which number to trust, what each bound is, and what it rests on."""
 
 from ocp_torch.certificate import bounds
 from ocp_torch.certificate.bound import LOWER, UPPER
@@ -6,8 +6,10 @@ from ocp_torch.certificate.report import CONTROLLERS, MEANS, holding
 from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED
 from ocp_torch.runs.compare import number
 
-# A certified gap up to this, or up to so many times the simulated one, says enough of the controller.
-NARROW, FAR = 0.01, 2.0
+# A certified gap up to this, or up to so many times the simulated one, is narrow enough to judge the controller by.
+NARROW = 0.01
+NARROW_TIMES = 2.0
+# Names of bounds, of their assumptions and of the basis of these -> their meaning.
 BOUNDS = {
     "F_M": "the dual value of `V`, each violation of its inequality charged `M` times; needs no controller",
     "shifted": "`E[V mu0]` less the largest violation of the inequality of `V`; needs neither a controller nor an `M`",
@@ -38,7 +40,7 @@ def percent(part) -> str:
 
 
 def label(side: str, name: str) -> str:
-    """What the entry ``name`` of a ``side`` of a certificate is called."""
+    """The label of the entry ``name`` on a ``side`` of a certificate."""
     if side == "perf":
         return f"Perf: {CONTROLLERS.get(name, name)}"
     listed = bounds.on(side).get(name)
@@ -51,7 +53,7 @@ def sentence(words: str) -> str:
 
 
 def trust(certificate: dict) -> list[str]:
-    """Which number to trust, and why, a sentence each."""
+    """Sentences on which number to trust, and why."""
     gap, found = certificate["gap"], list[str]()
     sides = {side: label(side, str(gap[f"{side}_from"])) for side in (LOWER, UPPER) if gap[f"{side}_from"]}
     proved, seen = gap["certified"], gap["simulated"]
@@ -72,7 +74,7 @@ def trust(certificate: dict) -> list[str]:
             "good as the simulation, whose time steps were halved until they no longer mattered."
         )
     if proved is not None and seen is not None:
-        wide = number(proved) > max(NARROW, FAR * number(seen))
+        wide = number(proved) > max(NARROW, NARROW_TIMES * number(seen))
         found.append(
             "Trust the simulated one: the certified one is true, but says little of this controller."
             if wide
