@@ -1,1 +1,1 @@
-"""A run's folder: begun, gone on with, finished, read again. Imports training and everything below."""
+"""Runs and their folders: begin, resume, finish and read a run. Imports training and everything below."""

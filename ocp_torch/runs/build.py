@@ -38,11 +38,11 @@ from ocp_torch.training.trainer import Trainer
 from ocp_torch.training.warm_start.iteration import ValueIteration
 from ocp_torch.training.warm_start.settings import WarmStartSettings
 
-# Numbers that a step keeps per unit of a network and state: 6 to 10 were measured, in one and in four dimensions.
+# Numbers that a step keeps per unit of a network and state, at least: 6 to 10 were measured, in one and in four dimensions.
 VALUES_PER_UNIT = 5
-# Of all methods; a learning rate may be set for each that the chosen one has.
+# Players of all methods; a learning rate may be set for each that the chosen method has.
 PLAYERS = ("value", "density")
-# Parameters of glibc's mallopt: M_MMAP_THRESHOLD and M_TRIM_THRESHOLD, each as large as it may be, and M_ARENA_MAX.
+# Parameters of glibc's mallopt: M_MMAP_THRESHOLD and M_TRIM_THRESHOLD, at their largest values, and M_ARENA_MAX.
 MALLOPT = ((-3, 2**25), (-1, 2**31 - 1), (-8, 1))
 BOUND_FIELDS = ("occupation_bound", "value_bound", "control_bound")
 
@@ -76,25 +76,26 @@ def checked_problem(problem: Problem) -> Problem:
 
 
 def build_problem(section: object) -> Problem:
-    """The problem ``_target_`` names, made with the other fields as arguments and checked; any `Problem` subclass will do."""
+    """The problem that ``_target_`` names, any `Problem` subclass, made with the other fields as arguments and checked."""
     options = require_section("problem", section)
     cls = problem_class(options.pop("_target_", None))
     dim = options.get("dim")
-    if isinstance(dim, int) and 1 <= dim <= MOST_COORDINATES:  # a problem that large may take long to be made
+    if isinstance(dim, int) and 1 <= dim <= MOST_COORDINATES:  # before a large problem is made, which may take long
         _require_room(dim, options.get("control_dim"))
     return checked_problem(in_their_words(lambda: call(cls, "problem", options), cls.__name__, cls))
 
 
 def _require_room(dim: int, control_dim: object) -> None:
-    """Raise `InputError` where `B` at the states at which the embedding looks for waves would not fit into the memory."""
+    """Raise `InputError` where `B`, at all states at which the embedding looks for waves, would not fit into the memory."""
     given = control_dim if isinstance(control_dim, int) and 1 <= control_dim <= MOST_COORDINATES else dim
     require_memory("the number of entries of B, problem.dim times control_dim,", dim * given, 8.0 * WAVE_STATES)
 
 
 def use_threads(threads: int) -> None:
-    """Use ``threads`` CPU threads, and, with glibc, keep freed memory for the next tensor, of whichever thread: by default
-    large blocks return to the system at once, those of other threads whatever is set for the first, and the page faults of
-    getting them back can cost as much as the arithmetic (two threads took 1.4 times as long as one for the work of one)."""
+    """Use ``threads`` CPU threads, and with glibc keep freed memory for the next tensor of any thread.
+
+    By default large blocks return to the system at once, and the page faults of getting them back can cost as much as the
+    arithmetic: two threads took 1.4 times as long as one for the work of one."""
     torch.set_num_threads(threads)
     if platform.libc_ver()[0] == "glibc":
         for parameter, value in MALLOPT:
@@ -108,7 +109,7 @@ def _chosen(group: str, section: object, table: dict) -> tuple[str, dict]:
 
 
 def build_trainer(config: dict, problem: Problem | None = None) -> Trainer:
-    """Everything a run needs, in the order in which data flows; of ``problem``, where that has been made already. Raises
+    """The trainer of ``config``, with all its parts; ``problem`` is the problem, where it has been made already. Raises
     `InputError` for any wrong field."""
     seed = require_integer("seed", config["seed"], 0)
     problem = build_problem(config["problem"]) if problem is None else checked_problem(problem)
@@ -129,13 +130,13 @@ def build_trainer(config: dict, problem: Problem | None = None) -> Trainer:
         ranks.require_shares("method.density_batch", method["density_batch"])
     network = build_network(config["model"])
     warm_start = _warm_start(config, problem, objective, constants)
-    # The last of them: the first weights of the others are what they are without it.
+    # The last field, so that the initial weights of the others do not depend on it.
     names = (*objective.fields, *([] if warm_start is None else [TRAJECTORY_VALUE]))
     fields = Fields.build(problem, names, network, derive_seed(seed, Branch.WEIGHTS))
     fields = fields.to(dtype=settings.torch_dtype, device=settings.torch_device)
     if warm_start is not None:
         fields.trajectory_value.requires_grad_(False)
-    # What a step keeps of a state at least: x, f, a and mu0 (a constant B takes no room), and all units with derivatives.
+    # Numbers that a step keeps for a state, at least: x, f, a, mu0 (a constant B takes no room), units and derivatives.
     kept = 2 * problem.dim + 2 + VALUES_PER_UNIT * sum(p.shape[0] for p in fields.parameters() if p.dim() == 2)
     require_memory("trainer.batch", settings.batch, settings.torch_dtype.itemsize * kept)
     stepper = _build_stepper(config, fields, objective, settings.steps, cost_unit(problem))
@@ -166,7 +167,7 @@ def _sampler(config: dict, problem: Problem, settings: TrainerSettings, seed: in
 
 
 def _warm_start(config: dict, problem: Problem, objective: Objective, constants: Constants) -> WarmStartSettings | None:
-    """The settings of the warm start, where there is to be one; runs from before there was any have no section for it."""
+    """The settings of the warm start, or `None` for none, as in older runs, whose configuration has no section for it."""
     if config.get("warm_start") is None:
         return None
     settings = call(WarmStartSettings, "warm_start", require_section("warm_start", config["warm_start"]))
@@ -174,13 +175,13 @@ def _warm_start(config: dict, problem: Problem, objective: Objective, constants:
 
 
 def build_network(model: object) -> Callable[..., nn.Module]:
-    """A maker of networks of the configured ``model``, given the form a field wants."""
+    """A function that makes networks of the configured ``model``, given the form a field wants."""
     name, options = _chosen("model", model, MODELS)
     return lambda **form: call(MODELS[name], "model", options, **form)
 
 
 def build_certificate_settings(config: dict) -> CertificateSettings:
-    """How much the final certificate may cost."""
+    """The settings of the final certificate."""
     section = require_section("certificate", config["certificate"])
     stage_section = require_section("certificate.stage", section.pop("stage", {}))
     stage = call(StageSettings, "certificate.stage", stage_section)

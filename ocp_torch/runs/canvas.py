@@ -1,4 +1,4 @@
-"""An empty Matplotlib figure, and figures as files. Matplotlib takes half a second of CPU to import: only to draw."""
+"""Empty Matplotlib figures, and figures as files. Matplotlib takes half a second to import: only where something is drawn."""
 
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ FORMS = ("png", "pdf", "svg")
 
 
 def blank_figure(width: float, height: float, **options) -> Figure:
-    """A figure of so many inches that needs no screen; ``options`` are those of `matplotlib.figure.Figure`."""
+    """A figure of ``width`` by ``height`` inches that needs no screen; ``options`` are those of Matplotlib's `Figure`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -30,18 +30,18 @@ def blank_figure(width: float, height: float, **options) -> Figure:
 
 
 def drawn(figures: dict[str, Figure]) -> dict[str, np.ndarray]:
-    """The pixels ``(H, W, 3)`` of each, for files and for TensorBoard: a figure takes longer to lay out than to compute."""
+    """The pixels ``(H, W, 3)`` of each figure, drawn once for files and TensorBoard, as layout takes long."""
     pixels = {}
     for name, figure in figures.items():
-        canvas: Any = figure.canvas  # that of Agg, which has its pixels
+        canvas: Any = figure.canvas  # Agg's canvas, which has pixels
         canvas.draw()
         pixels[name] = np.asarray(canvas.buffer_rgba())[..., :3].copy()
     return pixels
 
 
 def save_figure(figure: Figure, file: Path, field: str) -> None:
-    """Write ``figure`` in the form that the name of ``file`` asks for; raises `InputError`, about ``field``, where that is no
-    picture's."""
+    """Write ``figure`` in the format of the suffix of ``file``; raises `InputError`, about ``field``, for another suffix than
+    `FORMS`."""
     form = file.suffix.lower()[1:]
     if form not in FORMS:
         raise InputError(f"{field} is {str(file)!r}, but must end in .png, .pdf or .svg.")
@@ -49,7 +49,7 @@ def save_figure(figure: Figure, file: Path, field: str) -> None:
 
 
 def save(pictures: dict[str, np.ndarray], folder: Path) -> None:
-    """Write `<name>.png` of each of the ``pictures``, as `drawn` gives them, in ``folder``."""
+    """Write each of the ``pictures`` of `drawn` as `<name>.png` in ``folder``."""
     if pictures:
         from matplotlib.image import imsave
     for name, pixels in pictures.items():

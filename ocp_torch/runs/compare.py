@@ -17,11 +17,11 @@ from ocp_torch.runs.canvas import blank_figure, save_figure
 from ocp_torch.training.checkpoint import newest
 
 LARGEST_CERTIFICATE = 2**22
-# Names come from files of strangers: nothing in them may steer a terminal, or fill it.
+# Names come from untrusted files: control characters and overlong names must not reach the terminal.
 printable = partial(visible, most=LONGEST_NAME)
-# A number that would take more characters is shown by its leading digits and its size.
+# A number that would take more characters is shown with six digits.
 WIDEST = 24
-# Column -> how a number in it is shown.
+# Column -> format of its numbers.
 COLUMNS = {
     "run": "",
     "problem": "",
@@ -43,8 +43,8 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Comparison:
-    """``rows`` of the columns `COLUMNS`, `None` where a number does not apply; ``unfinished``: per run, why it has no row;
-    ``folders``: where each run is."""
+    """``rows`` of the columns `COLUMNS`, `None` where a number does not apply; ``unfinished``: for runs without a row, the
+    reason; ``folders``: the folder of each run."""
 
     rows: list[dict]
     unfinished: dict[str, str]
@@ -52,11 +52,11 @@ class Comparison:
 
     @property
     def cells(self) -> list[list[str]]:
-        """Each row as its columns are shown."""
+        """The formatted cells of each row."""
         return [[_shown(row[c], form) for c, form in COLUMNS.items()] for row in self.rows]
 
     def table(self) -> str:
-        """For the terminal."""
+        """The table for the terminal."""
         cells = [list(COLUMNS), *self.cells]
         widths = [max(len(line[k]) for line in cells) for k in range(len(COLUMNS))]
         lines = ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in cells]
@@ -68,7 +68,7 @@ class Comparison:
         return self.table()
 
     def save_csv(self, file: Path) -> None:
-        """Numbers in full precision, empty where they do not apply."""
+        """Write the rows as CSV, with numbers in full precision, empty where they do not apply."""
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, COLUMNS)
         writer.writeheader()
@@ -76,7 +76,7 @@ class Comparison:
         write_atomically(file, lambda path: path.write_text(text.getvalue(), newline=""))
 
     def save_plot(self, file: Path) -> None:
-        """What lies between the lower bound and each upper side of every run, as a picture."""
+        """Draw, for every run, the range between the lower bound and each upper side."""
         figure = blank_figure(7.0, 1.2 + 0.4 * max(1, len(self.rows)))
         axis = figure.subplots()
         for k, row in enumerate(self.rows):
@@ -131,7 +131,7 @@ def run_folders(path: Path) -> list[Path]:
 
 
 def named(folders: list[Path]) -> dict[Path, str]:
-    """Each folder by the part of its path that it does not share with all the others, printable."""
+    """Each folder with a printable name: the part of its path that not all folders share."""
     parents = [list(folder.absolute().parts) for folder in folders]
     shared = 0
     while len(parents) > 1 and all(len(p) > shared + 1 for p in parents) and len({p[shared] for p in parents}) == 1:
@@ -141,7 +141,7 @@ def named(folders: list[Path]) -> dict[Path, str]:
 
 
 def row_of(folder: Path, name: str) -> dict:
-    """The row of one run. Raises `InputError`, saying why, when it has no certificate that can be read."""
+    """The row of one run. Raises `InputError` with the reason when it has no readable certificate."""
     file = folder / "certificate.json"
     if kind(file) is None:
         raise InputError(progress_of(folder))
@@ -153,7 +153,7 @@ def row_of(folder: Path, name: str) -> dict:
 
 
 def row_from(certificate: dict, name: str) -> dict:
-    """The row of a run with this ``certificate``; one that is damaged raises whatever its odd part leads to."""
+    """The row of a run with this ``certificate``; a damaged one may raise any error."""
     gap, bounds = certificate["gap"], {}
     for side in ("lower", "upper"):  # the bounds that the gap was taken from
         source = gap[f"{side}_from"]
@@ -167,7 +167,7 @@ def row_from(certificate: dict, name: str) -> dict:
         "perf": performance(certificate),
         **bounds,
         "exact": number_or_none(certificate["exact"]),
-        # None to rank by where the bounds cross, as older versions wrote them: one of them is then wrong.
+        # Older versions wrote negative gaps where the bounds cross: one bound is then wrong, and no gap is ranked.
         **{k: None if value is not None and value < 0.0 else value for k, value in gaps.items()},
         "share": number_or_none(certificate["share"]["certified"]),
         "stopped": printable(certificate.get("stopped", "steps")),
@@ -176,8 +176,8 @@ def row_from(certificate: dict, name: str) -> dict:
 
 
 def performance(certificate: dict) -> float | None:
-    """Of the controller that was certified, which older certificates do not name: the one that was given, or that which the
-    upper bounds speak of, or else the one with the smallest value that its errors allow."""
+    """The cost of the certified controller; `None` where it is unknown. Older certificates do not name that controller: it is
+    then the given one, or the subject of an upper bound, or else the one with the smallest cost, errors included."""
     known = {
         name: e for name, e in certificate["perf"].items() if e is not None and number_or_none(e["value"]) is not None
     }
@@ -190,19 +190,19 @@ def performance(certificate: dict) -> float | None:
 
 
 def number(value) -> float:
-    """``value`` of a file as a number that can be compared and drawn; `ValueError` or `TypeError` otherwise."""
+    """``value`` of a file as a finite number; `ValueError` or `TypeError` otherwise."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ValueError(f"{visible(value, 80)} is not a number")
     return value
 
 
 def number_or_none(value) -> float | None:
-    """`None`, or a `number`."""
+    """`number` of ``value``, or `None` for `None`."""
     return None if value is None else number(value)
 
 
 def progress_of(folder: Path) -> str:
-    """How far a run without a certificate came."""
+    """A sentence on how far a run without a certificate came."""
     try:
         state = newest(folder / "checkpoints")[0]
         total = state["config"]["trainer"]["steps"]

@@ -1,4 +1,4 @@
-"""The configurations that a run's folder keeps, one for each start, as plain data; and the checkpoint that a path names."""
+"""The configurations in a run's folder, one for each start, as plain data; and the checkpoint that a path names."""
 
 import contextlib
 import os
@@ -18,8 +18,8 @@ CONFIG, AUTO = "config.yaml", "auto"
 
 
 def locate(path: Path) -> tuple[Path | None, Path | None]:
-    """The run's folder and the checkpoint that ``path`` names: a folder stands for its newest good checkpoint (`None`),
-    and a checkpoint that lies in no run's folder has none."""
+    """The run's folder and the checkpoint that ``path`` names. A folder stands for its newest good checkpoint (`None`); the
+    folder of a checkpoint that is in no run's folder is `None`."""
     if "${" in str(path):
         raise InputError(f"resume is {str(path)!r}, which Hydra would take for an interpolation; rename the folder.")
     found = kind(path)
@@ -31,7 +31,7 @@ def locate(path: Path) -> tuple[Path | None, Path | None]:
 
 
 def load_state(path: Path) -> tuple[Any, Path, list[str]]:
-    """The state that ``path`` names, in this version's names; its file; and a sentence on each damaged newer one."""
+    """The state that ``path`` names, in this version's names; its file; and a sentence on each newer, damaged file."""
     checkpoint = locate(path)[1]
     if checkpoint is not None:
         state, notes = load_checkpoint(checkpoint), list[str]()
@@ -45,12 +45,12 @@ def load_state(path: Path) -> tuple[Any, Path, list[str]]:
 
 
 def starts(folder: Path) -> list[Path]:
-    """Where the configurations of all starts lie, the oldest first: `.hydra`, then `.hydra/resume_<n>` for each resume."""
+    """The folders of the configurations of all starts, the oldest first: `.hydra`, then `.hydra/resume_<n>`."""
     return [folder / ".hydra", *sorted((folder / ".hydra").glob("resume_*"), key=_number)]
 
 
 def next_subfolder(folder: Path) -> str:
-    """Where the next start's configuration goes."""
+    """The subfolder for the configuration of the next start."""
     if not (folder / ".hydra" / CONFIG).exists():
         return ".hydra"
     return f".hydra/resume_{_number(starts(folder)[-1]) + 1}"
@@ -62,17 +62,17 @@ def _number(path: Path) -> int:
 
 
 def saved_configuration(path: Path) -> dict:
-    """The plain configuration of the newest start that got going of the run that ``path`` names, or its checkpoint's copy."""
+    """The plain configuration of the newest start of the run ``path`` that passed its checks, or its checkpoint's copy."""
     folder = locate(path)[0]
     for start in reversed(starts(folder)[1:] if folder else []):
-        # Until a start has been checked, its file is what was asked for, names a run, and may be half written.
+        # Until a start has passed its checks, its file still names the run to resume, and may be half written.
         with contextlib.suppress(InputError, OSError):
             config = read_configuration(start / CONFIG)
             if config.get("resume", "") is None and (start / CONFIG).read_bytes().endswith(b"\n"):
                 return config
     if folder is not None and kind(folder / ".hydra" / CONFIG) is not None:
         config = read_configuration(folder / ".hydra" / CONFIG)
-        # One that names a run to go on with is that of a resume too: the folder had no configuration before.
+        # A configuration that names a run belongs to a resume, in a folder that had no configuration before.
         if config.get("resume") in (None, AUTO):
             return {**config, "resume": None}
     config = load_state(path)[0].get("config")
@@ -82,7 +82,7 @@ def saved_configuration(path: Path) -> dict:
 
 
 def read_configuration(file: Path) -> dict:
-    """A configuration file as plain nested data; runs nothing. Raises `InputError` when it is damaged or crafted."""
+    """A configuration file as plain nested data; no code in it runs. Raises `InputError` when it is damaged or crafted."""
     return current(read_yaml(file))
 
 
@@ -93,7 +93,7 @@ def current(config: dict) -> dict:
 
 
 def keep_configuration(folder: Path, config: dict) -> None:
-    """Write the configuration with which a run goes on, or begins again, beside its first start's."""
+    """Write the configuration with which a run goes on, or begins again, in the folder of its newest start."""
     text = yaml.safe_dump({**config, "resume": None}, sort_keys=False, allow_unicode=True)
     write_atomically(starts(folder)[-1] / CONFIG, lambda temporary: temporary.write_text(text))
 

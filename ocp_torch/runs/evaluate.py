@@ -22,8 +22,8 @@ log = logging.getLogger(__name__)
 
 
 def recertification(config: dict) -> Callable[[], Certificate]:
-    """What ``config`` asks for, checked: the certificate of a saved controller again, on states of ``seed`` (`None`: of its
-    own run's), and a GIF of its motion in the file ``animation``. Raises `InputError` for a wrong field."""
+    """A function that certifies the saved controller of ``config`` again, on states of ``seed`` (`None`: its run's), and
+    writes a GIF of its motion to ``animation``. Checks ``config`` first: `InputError` for a wrong field."""
     controller, seed, animation = load_run(config), config["seed"], config["animation"]
     if seed is not None:
         require_integer("seed", seed, 0)
@@ -43,8 +43,8 @@ def recertification(config: dict) -> Callable[[], Certificate]:
 
 
 def load_run(config: dict) -> Controller:
-    """The controller of ``config["run"]``, a run's folder, one that holds runs, or a file. A user's own problem comes from
-    ``config["problem"]``, that is from the command line, never from the file."""
+    """The controller of ``config["run"]``, which is a run's folder, a folder of runs, or a file. A user's own problem comes
+    from ``config["problem"]``, that is from the command line, never from the file."""
     path = Path(str(config["run"]))
     if kind(path) is None:
         raise InputError(
@@ -55,7 +55,7 @@ def load_run(config: dict) -> Controller:
 
 
 def settings_for(controller: Controller, config: dict) -> CertificateSettings:
-    """The settings of the controller's own run, with what ``config`` sets in their place. Raises `InputError` where the run's
+    """The settings of the controller's own run, with those that ``config`` sets instead. Raises `InputError` where the run's
     own would take more than a file may ask for."""
     own, asked = controller.config.get("certificate") or {}, require_section("certificate", config["certificate"])
     changed = {k: v for k, v in asked.items() if v is not None and k != "stage"}
@@ -68,7 +68,7 @@ def settings_for(controller: Controller, config: dict) -> CertificateSettings:
 
 
 def certify_saved(controller: Controller, settings: CertificateSettings, seed: int | None = None) -> Certificate:
-    """Print and return the certificate of ``controller``; with its own ``seed`` the numbers are those of its run."""
+    """Print and return the certificate of ``controller``; with its run's ``seed`` the numbers are those of the run."""
     threads = controller.config.get("trainer", {}).get("threads", 1)
     use_threads(require_integer("trainer.threads", threads, 1, maximum=MOST_THREADS))
     run = Run.read(controller.certificate)

@@ -11,7 +11,7 @@ log = logging.getLogger(__name__)
 
 
 def exporting(config: dict) -> Callable[[], None]:
-    """What ``config`` asks for, checked: the files of a saved controller. Raises `InputError` for a wrong field."""
+    """A function that exports the saved controller of ``config``, which is checked here: `InputError` for a wrong field."""
     controller, out, format = load_run(config), config["out"], config["format"]
     if format is not None:
         require_choice("format", format, FORMATS)

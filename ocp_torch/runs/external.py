@@ -1,4 +1,4 @@
-"""Certify a controller somebody brings: load it, train a `V` to judge it by, and put both into a certificate."""
+"""Certify any given controller: load it, train a `V` to judge it by, and put both into a certificate."""
 
 import logging
 from collections.abc import Callable
@@ -35,9 +35,9 @@ from ocp_torch.training.budgets import fill
 
 log = logging.getLogger(__name__)
 
-# States at which a controller trained under another limit is held against the problem's.
+# States at which a controller trained under another limit is checked against the problem's.
 LIMIT_PROBES = 2**14
-# The model whose own sizes the networks have that are trained for a given controller.
+# The model of the networks that are trained for a given controller, with its default sizes.
 MODEL = {"name": "mlp"}
 
 
@@ -49,7 +49,7 @@ def certify(
     seed: int = 0,
     train_steps: int | None = None,
 ) -> Certificate:
-    """What ``controller`` costs on ``problem``, and how far from optimal it can be.
+    """The certificate of ``controller`` on ``problem``: its cost, and how far from optimal it can be.
 
     ``controller`` maps states ``(N, d)`` in the unit cell to controls ``(N, m)``: any function of tensors or arrays, or a
     `Controller` of ours. ``value`` is a `V` to judge it by, ``(N, d) -> (N,)`` on the unit cell, continuous there and from 1
@@ -79,7 +79,7 @@ def certify(
 
 
 def _defaults(problem: Problem, certificate: dict) -> dict:
-    """The configuration of a run of ``problem``, as far as it is needed here, with the defaults of its dimension."""
+    """The part of a run's configuration that is needed here, with the defaults of the dimension of ``problem``."""
     return fill({"model": dict(MODEL), "trainer": {}, "optimizer": {}, "certificate": certificate}, problem)
 
 
@@ -103,7 +103,7 @@ def train_value(
 
 
 def checked_policy(controller: Callable | Controller, problem: Problem) -> Policy:
-    """A policy in float64: the networks of a `Controller` of ours, or a `BlackBox` around anything else."""
+    """The policy of ``controller`` in float64: the networks of a `Controller`, or a `BlackBox` around any function."""
     if not isinstance(controller, Controller):
         return BlackBox(controller, problem)
     if (controller.problem.dim, controller.problem.control_dim) != (problem.dim, problem.control_dim):
@@ -112,7 +112,7 @@ def checked_policy(controller: Callable | Controller, problem: Problem) -> Polic
             f"but the problem has d = {problem.dim} and m = {problem.control_dim}."
         )
     policy = controller.policy
-    if controller.problem.control_limit != problem.control_limit:  # its own limit it obeys by itself
+    if controller.problem.control_limit != problem.control_limit:  # a controller always obeys its own limit
         x = scrambled_sobol(LIMIT_PROBES, problem.dim, 0, torch.float64)
         with torch.no_grad():
             require_limit(batched(policy, x), x, problem.control_cost)
@@ -120,7 +120,7 @@ def checked_policy(controller: Callable | Controller, problem: Problem) -> Polic
 
 
 def value_of(value: Field | Controller, problem: Problem) -> Field:
-    """`V` in float64: the network of a `Controller` of ours, or anything else on the unit cell, tried on a few states."""
+    """`V` in float64: the network of a `Controller`, or any other function on the unit cell, tried at a few states."""
     if isinstance(value, Controller):
         if value.fields.value is None:
             raise InputError("value is a controller without V; give one trained by dual or pd.")
@@ -142,14 +142,14 @@ def value_of(value: Field | Controller, problem: Problem) -> Field:
 
 
 def kept_of(value: Field | Controller, problem: Problem) -> Subsolution | None:
-    """What the lower bound of ``value``, a controller's, is of, where that was trained for this very ``problem``."""
+    """The subsolution of the controller ``value``, where it was trained for this very ``problem``; else `None`."""
     if not isinstance(value, Controller) or value.fields.subsolution is None:
         return None
     return in_float64(value.fields.subsolution) if described(value.problem) == described(problem) else None
 
 
 def arguments(config: dict) -> dict:
-    """The arguments of `certify` that the plain ``config`` of the command line names; only it may name code to run."""
+    """The arguments of `certify` from the plain ``config`` of the command line, which alone may name code to run."""
     use_threads(1)
     problem = build_problem(config["problem"])
     settings = build_certificate_settings(_defaults(problem, config["certificate"]))
@@ -170,7 +170,7 @@ def arguments(config: dict) -> dict:
 
 
 def certify_in(given: dict, folder: Path) -> Certificate:
-    """Certify what `arguments` gave; print the table and leave `certificate.json` and its figure in ``folder``."""
+    """Certify what `arguments` gave, print the table, and write `certificate.json` and its figure to ``folder``."""
     certificate = certify(**given)
     write_atomically(folder / "certificate.json", certificate.save)
     canvas.save(canvas.drawn({"certificate": interval_figure(certificate.to_dict())}), folder / "figures")

@@ -24,9 +24,11 @@ from ocp_torch.problems.starts import initial_points
 from ocp_torch.runs.canvas import Figure, blank_figure
 from ocp_torch.runs.frame import Frame, frame_of, in_units
 
-LINE_POINTS, MAP_POINTS = 400, 80
-# Of the simulated occupation density: bins a coordinate by dimension, starts, steps of a trajectory.
-BINS, STARTS, FIGURE_STEPS = {1: 50, 2: 20}, 2048, 16
+LINE_POINTS = 400  # of a curve
+MAP_POINTS = 80  # of a map, along each coordinate
+BINS = {1: 50, 2: 20}  # dimension -> bins a coordinate of the simulated occupation density
+STARTS = 2048  # of its trajectories
+FIGURE_STEPS = 16  # of each trajectory
 TITLES = {
     "value": "V",
     "control_value": "u from V",
@@ -43,7 +45,7 @@ def interval_figure(certificate: dict) -> Figure:
     """The certificate (as a dict of its schema) on a line: bounds that count, `OPT` where known, and performances, with
     their intervals.
 
-    What is much farther from the tightest of them than they are from one another is cut off, with an arrow and its value.
+    Values much farther from the tightest ones than these are from one another are cut off, with an arrow and the value.
     """
     counting = lambda side: [(n, e) for n, e in certificate[side].items() if e and e.get("counts", True)]
     rows = [(f"{n} ≤ OPT", e, "C0") for n, e in counting(LOWER)]
@@ -74,7 +76,7 @@ def interval_figure(certificate: dict) -> Figure:
     if certificate["exact"] is not None:
         axis.axvline(certificate["exact"], color="k", linestyle=":", label="OPT")
         axis.legend(loc="upper right")
-    # A name may come from a file: its signs are not a formula.
+    # A name may come from a file, and must not be read as a formula.
     axis.set_yticks(range(len(rows)), [visible(name, LONGEST_NAME) for name, *_ in rows], parse_math=False)
     axis.invert_yaxis()
     title = f"{visible(certificate['problem'], LONGEST_NAME)}, {100 * certificate['confidence']:.4g} % intervals"
@@ -84,10 +86,10 @@ def interval_figure(certificate: dict) -> Figure:
 
 @dataclass(frozen=True)
 class Shown:
-    """What is drawn of trained ``fields``, whose `mu` follows by ``occupation`` (see `trained_policies`).
+    """Figures of trained ``fields``, whose `mu` follows by ``occupation`` (see `trained_policies`).
 
-    The density that is simulated is that of the controller ``kind``, by default the first, and so is the one drawn where it
-    was ``fitted`` to it. One that is ``quick`` leaves out the slack and the simulation.
+    The simulated density is that of the controller ``kind``, by default the first; so is the learned one if it was ``fitted``
+    to that controller. With ``quick`` slack and simulation are left out.
     """
 
     problem: Problem
@@ -138,8 +140,8 @@ class Shown:
 
 @torch.no_grad()
 def simulated_occupation(problem: Problem, policy: Function) -> Function:
-    """A histogram of `mu^u`, for one or two coordinates: where the closed loop of ``policy`` is at a time `T ~ Exp(rho)`,
-    from starts that weigh `mu0`, few enough for a fraction of a second."""
+    """A histogram of `mu^u`, for one or two coordinates: the states of the closed loop of ``policy`` at times `T ~ Exp(rho)`,
+    from starts weighted by `mu0`, few enough for a fraction of a second."""
     bins = BINS[problem.dim]
     points, start_mass = initial_points(problem, STARTS, 0, derive_seed(0, Branch.FIGURES), extra=1)
     x0, times = points[:, :-1], -torch.log1p(-points[:, -1]) / problem.discount
@@ -160,7 +162,7 @@ def simulated_occupation(problem: Problem, policy: Function) -> Function:
 
 @torch.no_grad()
 def _columns(function: Function | None, x: Tensor) -> Tensor | None:
-    """Values as columns ``(N, k)``; an infinite one becomes a gap in the plot."""
+    """The values of ``function`` at ``x`` as columns ``(N, k)``, with infinite ones as gaps (NaN); `None` without any."""
     if function is None or function(x[:1]) is None:
         return None
     values = batched(function, x).reshape(len(x), -1)

@@ -1,4 +1,4 @@
-"""The end of a run: what it hands out, also where it could not go on, and whether all of that is there."""
+"""The end of a run: write its results, also where it could not go on, and check that all of them are there."""
 
 import contextlib
 import copy
@@ -31,18 +31,17 @@ from ocp_torch.training.monitor import Monitor
 from ocp_torch.training.stopping import FAILED, NOT_FINITE
 from ocp_torch.training.trainer import Trainer
 
-# Lies beside the checkpoints from before the first file of the end is written until after the last: a start may have been
-# killed between two of them.
+# This file exists while the results are being written: a run that was killed meanwhile is known by it.
 MARK = "checkpoints/unfinished"
 
 
 def failure_of(trainer: Trainer, error: BaseException) -> str | None:
-    """Why the run cannot go on, where a loss or the user's problem failed; `None` for any other ``error``."""
+    """A sentence why the run cannot go on, where a loss or the user's problem failed; `None` for any other ``error``."""
     if isinstance(error, NonFiniteError):
         trainer.stopped = NOT_FINITE
         failure = f"Training stopped at step {trainer.step}, before the update: {error}"
         if trainer.health.best is None and BROKEN_PROBLEM not in failure:
-            raise InputError(failure) from None  # nobody knows how long it has diverged
+            raise InputError(failure) from None  # without an evaluation nobody knows since when it has diverged
         return failure
     told = blamed(error, type(trainer.problem))
     if told is None:
@@ -53,7 +52,8 @@ def failure_of(trainer: Trainer, error: BaseException) -> str | None:
 
 @contextlib.contextmanager
 def unless_it_failed(failure: str | None, trainer: Trainer):
-    """What is done with a problem that failed before may fail again, and is then left out."""
+    """Skip the rest of the body where the user's problem fails in it and has failed before (``failure``); where it fails for
+    the first time, raise `ProblemError`."""
     try:
         yield
     except (Exception, SystemExit) as error:
@@ -67,8 +67,8 @@ def unless_it_failed(failure: str | None, trainer: Trainer):
 def salvaged(
     trainer: Trainer, settings: CertificateSettings, failure: str, monitor: Monitor
 ) -> tuple[Certificate, Fields]:
-    """What a run that cannot go on still gives: the certificate of the fields of its best quick evaluation, or, where the
-    problem fails there as well, what that saw; without any that of the fields as they are. `InputError` when nothing."""
+    """The results of a run that cannot go on: fields and certificate of its best quick evaluation, refined, or as they were
+    where the problem fails again; without any evaluation those of the present fields. `InputError` if there are none."""
     best, seen = trainer.health.best, trainer.health.certificate
     if best is None and trainer.step == 0:
         raise InputError(failure)
@@ -88,7 +88,7 @@ def salvaged(
 
 
 def with_warnings(trainer: Trainer, certificate: Certificate, notes: list[str]) -> Certificate:
-    """``certificate`` with what else a user should know of the run."""
+    """``certificate`` with the ``notes`` and the warnings of the run."""
     found = sanity_warnings(trainer.problem, trainer.constants, certificate, trainer.seed)
     fresh = [note for note in (*notes, *trainer.health.notes, *found) if note not in certificate.warnings]
     return replace(certificate, warnings=[*certificate.warnings, *fresh])
@@ -97,7 +97,7 @@ def with_warnings(trainer: Trainer, certificate: Certificate, notes: list[str]) 
 def hand_out(
     trainer: Trainer, certificate: Certificate, fields: Fields, folder: Path, monitor: Monitor, failure: str | None
 ) -> Controller:
-    """Write the controller that ``certificate`` speaks of, the certificate and figures; that controller."""
+    """Write the controller of ``certificate``, the certificate and figures; returns the controller."""
     write_atomically(folder / MARK, lambda path: path.write_text("a resume makes what is missing\n"))
     named = certificate.controller or certificate.subject
     kind = named or ("value" if fields.value is not None else "density")
@@ -121,16 +121,15 @@ def hand_out(
 
 
 def glimpse(trainer: Trainer) -> dict[str, np.ndarray]:
-    """Pictures of `V`, `u` and `mu` as they are in the middle of training; a problem that draws random numbers goes on as if
-    nobody had looked."""
+    """Pictures of `V`, `u` and `mu` in the middle of training, which leave the random generators as they were."""
     how = trainer.constants, trainer.objective.occupation
     with generators_kept():
         return canvas.drawn(Shown(trainer.problem, trainer.averaged_fields, *how, quick=True).figures())
 
 
 def with_subsolution(fields: Fields, certificate: Certificate, kind: str) -> Fields:
-    """``fields``, and what the lower bound of ``certificate`` is of; without a subsolution that serves neither that bound nor
-    the controllers that are handed out, of ``kind``, and followed."""
+    """``fields`` with the subsolution of ``certificate``'s lower bound; else with their own subsolution if the controller of
+    ``kind`` or the one followed uses it; else without any."""
     used = BOUNDING in (kind, certificate.followed)
     found = certificate.subsolution or (fields.subsolution if used else None)
     others = {name: network for name, network in fields.networks.items() if name != SUBSOLUTION}
@@ -140,7 +139,7 @@ def with_subsolution(fields: Fields, certificate: Certificate, kind: str) -> Fie
 
 
 def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields: Fields) -> Controller:
-    """The controller of policy ``kind`` that ``trainer`` hands out, from its averaged ``fields``."""
+    """The controller of policy ``kind`` that ``trainer`` hands out, with the averaged ``fields``."""
     return Controller(
         problem=trainer.problem,
         fields=fields,
@@ -154,7 +153,7 @@ def controller_of(trainer: Trainer, certificate: Certificate, kind: str, fields:
 
 
 def _flat(config: dict, prefix: str = "") -> dict:
-    """A nested configuration as one level with dotted names; what TensorBoard does not take is in JSON."""
+    """A nested configuration as one level with dotted names; values that TensorBoard does not take become JSON."""
     flat: dict = {}
     for key, value in config.items():
         if isinstance(value, dict):
@@ -165,12 +164,12 @@ def _flat(config: dict, prefix: str = "") -> dict:
 
 
 def complete(folder: Path) -> None:
-    """All files of the end are written."""
+    """Note that all results are written."""
     (folder / MARK).unlink(missing_ok=True)
 
 
 def missing(folder: Path, trainer: Trainer, settings: CertificateSettings) -> str | None:
-    """What the end of the run in ``folder`` lacks, in words, or `None`."""
+    """The results that the run in ``folder`` lacks, in words, or `None`."""
     files = ["certificate.json", FILE_NAME]
     if trainer.settings.figures:
         files += ["figures/certificate.png", *(["figures/motion.png"] if scene(trainer.problem) is not None else [])]

@@ -1,4 +1,4 @@
-"""Where a figure of functions on the torus is drawn, and in what units: turns of each coordinate, or those of a system."""
+"""Frames of figures of functions on the torus: states to draw at, and axes in turns or in a system's own units."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ Function = Callable[[Tensor], Any]
 
 @dataclass(frozen=True)
 class Frame:
-    """The unit cell from ``start`` on in each coordinate, through its middle in those that are not drawn. Coordinates have
-    ``labels``, which are formulas where they are ``symbols``; a place is `centre + length x`."""
+    """The unit cell from ``start`` on in each coordinate, cut through the middle of coordinates that are not drawn.
+    Coordinates have ``labels``, formulas where they are ``symbols``; their values on the axes are `centre + length x`."""
 
     labels: tuple[str, ...]
     centre: Tensor
     length: Tensor
     start: Tensor
     symbols: bool = True
-    control: str = ""  # what a single control is called and measured in
+    control: str = ""  # name and unit of a single control
 
     def line(self, count: int) -> Tensor:
         """States ``(count, 1)`` along the only coordinate."""
@@ -42,7 +42,7 @@ class Frame:
 
     @property
     def ends(self) -> Tensor:
-        """Where each axis begins and ends, ``(d, 2)``."""
+        """The beginning and end of each axis, ``(d, 2)``."""
         return torch.stack([self.places(at) for at in (self.start, self.start + 1.0)], dim=-1)
 
     @property
@@ -57,7 +57,7 @@ class Frame:
 
 
 def frame_of(problem: Problem) -> Frame:
-    """The frame of ``problem``: one in physical units begins where its coordinates do, and has their names and units."""
+    """The frame of ``problem``; in physical units it begins where the coordinates do, and has their names and units."""
     if (measures := problem.measures) is not None:
         labels, chart = tuple(c.label for c in measures.coordinates), Chart(measures.coordinates)
         control = measures.controls[0].label if problem.control_dim == 1 else ""
@@ -68,8 +68,8 @@ def frame_of(problem: Problem) -> Frame:
 
 
 def in_units(problem: Problem, control: Function) -> Function:
-    """A ``control`` ``(N, m)`` on the torus in its unit where it has one; as it is where there are several, of which a figure
-    shows the size, whose square is twice the price."""
+    """A single ``control`` on the torus in its unit, where it has one. Several controls ``(N, m)`` are left as they are: a
+    figure shows their size, whose square is twice the price."""
     measures = problem.measures
     if measures is None or problem.control_dim > 1:
         return control

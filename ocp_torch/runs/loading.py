@@ -22,8 +22,8 @@ log = logging.getLogger(__name__)
 def load_policy(source: str, problem: Problem) -> Callable | Controller:
     """The controller the command line names: FILE.py:function, a run's folder or a file of ours, .onnx, or TorchScript.
 
-    A .py file is code, and so is TorchScript: it can write files by itself. Only what is trusted is named here; an .onnx
-    file, like one of ours, can do nothing but compute.
+    A .py file is code, and so is TorchScript, which can write files by itself: name only trusted ones here. An .onnx file,
+    like one of ours, can only compute.
     """
     if str(source).rpartition(":")[0].endswith(".py"):
         return resolved(str(source), "controller")
@@ -43,7 +43,8 @@ def load_policy(source: str, problem: Problem) -> Callable | Controller:
 
 
 def load_saved(path: Path, problem: Problem) -> Controller:
-    """A controller of ours, by its file or its run's folder, for ``problem``, or, of one of the package's, for its class."""
+    """A controller of ours, by its file or its run's folder. A user's own ``problem`` is given to it; a problem of the
+    package is the file's, of the class of ``problem``, else `InputError`."""
     file = controller_file(path)
     if problem_name(problem) not in PROBLEMS:
         return load_controller(file, problem=problem)
@@ -63,6 +64,6 @@ def _torchscript(path: Path) -> Callable:
 
 @cache
 def _warn_of_code(path: Path) -> None:
-    """Say once what TorchScript can do."""
+    """Log a warning, once, that TorchScript can write files."""
     said = "warning: %s is TorchScript, code that can write your files; load it if you trust it, or take ONNX."
     log.warning(said, path)

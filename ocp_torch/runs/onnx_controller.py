@@ -1,4 +1,4 @@
-"""A controller in an ONNX file, as a function of states of the torus: somebody's own, or one that was exported here."""
+"""A controller in an ONNX file as a function of states of the torus: a user's own, or one that was exported here."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,13 +15,13 @@ from ocp_torch.problems import Problem
 from ocp_torch.problems.physical.system import System
 
 PRECISIONS = {"tensor(double)": torch.float64, "tensor(float)": torch.float32}
-# Under which an exported controller keeps what it is of.
+# Key of the metadata of an exported controller.
 KEY = "ocp_torch"
 
 
 def onnx_controller(path: Path, problem: Problem) -> Callable[[Tensor], Tensor]:
-    """States ``(N, d)`` of the torus to controls ``(N, m)`` by the model in ``path``; one that was exported in physical units
-    is given and asked for such. Raises `InputError` for a file that holds no such function."""
+    """The model in ``path`` as a function of states ``(N, d)`` of the torus to controls ``(N, m)``; physical units of an
+    exported model are converted. Raises `InputError` for a file that holds no such function."""
     try:
         import onnxruntime
     except ImportError:
@@ -82,6 +82,6 @@ def _physical(session: Any) -> bool:
     """Whether the file says that it was exported in physical units."""
     try:
         kept = json_object(session.get_modelmeta().custom_metadata_map.get(KEY, "{}"))
-    except NotPlain:  # of somebody else's making
+    except NotPlain:  # metadata of another program
         return False
     return kept.get("coordinates") == PHYSICAL

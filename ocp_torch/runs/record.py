@@ -16,7 +16,7 @@ from ocp_torch.runs.build import build_problem
 
 log = logging.getLogger(__name__)
 
-# States evaluated at once.
+# States evaluated at once, which bounds the memory.
 CHUNK = 4096
 
 

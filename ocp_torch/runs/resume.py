@@ -1,4 +1,4 @@
-"""What a resumed run is made of: its own configuration, and what the command line may change in it."""
+"""The configuration of a resumed run: its own, with what the command line may change in it."""
 
 import contextlib
 import copy
@@ -16,16 +16,16 @@ from ocp_torch.problems.commands import PACKAGE, UNKNOWN, ForeignProblem, naming
 from ocp_torch.runs.configuration import CONFIG, current, saved_configuration
 from ocp_torch.training.checkpoint import LAST
 
-# Classes that a file may name; those of earlier versions are read by their present names.
+# Classes that a file may name; earlier names are translated before.
 OWN_TARGETS = {f"{PACKAGE}.{c.__name__}" for c in PROBLEMS.values()}
-# What runs from before there was any have no section for.
+# Sections that runs of earlier versions lack.
 NEWER = ("sampler", "warm_start", "resume")
-# What a checkpoint's tensors belong to; everything else may be set anew at a resume.
+# Fields that a checkpoint's tensors depend on; every other field may change at a resume.
 FIXED = ("problem", "method", "model", "averaging", "sampler", "warm_start", "seed", "optimizer.name", "trainer.dtype")
 
 
 def find_run(composed: dict, roots: Iterable[Path]) -> Path | None:
-    """The last run below ``roots`` of the configuration ``composed`` that has a checkpoint to go on from."""
+    """The last run below ``roots`` with the configuration ``composed`` and a checkpoint; `None` if there is none."""
     depths = ("", "*/", "*/*/", "*/*/*/")
     files = [file for root in roots for depth in depths for file in root.glob(f"{depth}checkpoints/{LAST}")]
     for file in sorted(files, key=lambda file: file.stat().st_mtime, reverse=True):
@@ -36,13 +36,13 @@ def find_run(composed: dict, roots: Iterable[Path]) -> Path | None:
 
 
 def same(one: dict, other: dict) -> bool:
-    """Whether two configurations are those of the same run."""
+    """Whether two configurations, apart from `resume`, are the same."""
     return {**current(one), "resume": None} == {**current(other), "resume": None}
 
 
 def resumed_configuration(composed: dict, named: Iterable[str]) -> dict:
-    """The configuration with which the run ``composed["resume"]`` goes on: its own, with what the command line ``named``
-    taken from ``composed``. Raises `InputError` where a file names a problem that only the command line may name."""
+    """The configuration with which the run ``composed["resume"]`` goes on: its own, with the fields that the command line
+    ``named`` taken from ``composed``. Raises `InputError` where a file names a problem that only a command line may name."""
     named = [name for name in named if name != "resume"]
     path = Path(str(composed["resume"]))
     saved = saved_configuration(path)
@@ -91,8 +91,8 @@ def _transplant(result: dict, source: Any, keys: list[str]) -> None:
 
 
 def filled_from(config: dict, made: object) -> dict:
-    """``config`` with fields that are null as they were in ``made``, the run's configuration when it was saved: defaults by
-    dimension may have changed since. The number of rounds follows the steps, as in a new run."""
+    """``config`` with null fields filled from ``made``, the run's configuration when it was saved: defaults by dimension may
+    have changed since. Where steps are given, null rounds stay null and follow the steps, as in a new run."""
     if not isinstance(made, dict):
         return config
     filled: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""One run in its folder: made from a configuration, it begins or goes on, trains, and is finished."""
+"""One run in its folder: built from a configuration, begun or resumed, trained, and finished."""
 
 import logging
 import shutil
@@ -46,8 +46,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """A run that is ready to go: its trainer, where it begins or where its checkpoint left it; and of one that was resumed
-    the ``state`` it was given, and a sentence on each newer checkpoint that is damaged."""
+    """A run that is ready to go: its trainer, fresh or as its checkpoint left it; for a resumed run also the ``state`` it was
+    given, and a sentence on each newer checkpoint that is damaged."""
 
     config: dict
     trainer: Trainer
@@ -58,8 +58,8 @@ class TrainingRun:
 
 @dataclass(frozen=True)
 class Ending:
-    """What a run hands out: ``controller`` with its ``certificate``, ``metrics`` where its problem has some; and, where a
-    loss or the problem ``failed``, why it could not go on, in a sentence."""
+    """The results of a run: ``controller`` with its ``certificate``, ``metrics`` where its problem has some; and, where a
+    loss or the problem ``failed``, a sentence with the reason."""
 
     certificate: Certificate
     controller: Controller
@@ -68,8 +68,8 @@ class Ending:
 
 
 def training_run(config: dict, problem: Problem | None = None) -> TrainingRun:
-    """The run that the plain ``config`` describes, at the checkpoint that its ``resume`` names, which is read once; of
-    ``problem``, where that has been made already.
+    """The run that the plain ``config`` describes, at the checkpoint that its ``resume`` names, which is read once;
+    ``problem`` is the problem, where it has been made already.
 
     Raises `InputError` for any wrong field, damaged file, or change that a resume cannot make; writes nothing.
     """
@@ -96,7 +96,7 @@ def training_run(config: dict, problem: Problem | None = None) -> TrainingRun:
 
 
 def train(run: TrainingRun, folder: Path) -> None:
-    """``run`` in ``folder`` to its end; one that is finished already says so, and what is missing of it is made. Of several
+    """Carry out ``run`` in ``folder``; if it is finished already, say so and make files that are missing. Of several
     processes the first does all of that, and the others `assist` it."""
     if not run.trainer.ranks.first:
         return assist(run.trainer)
@@ -104,7 +104,7 @@ def train(run: TrainingRun, folder: Path) -> None:
     with only_writer(folder):
         for note in run.notes:
             log.warning("warning: %s", note)
-        # What Hydra wrote is what was asked for, not what the run is.
+        # Hydra wrote the configuration that was asked for, not that of the resumed run.
         if run.state is not None or len(starts(folder)) > 1:
             keep_configuration(folder, run.config)
         if run.state is not None:
@@ -122,8 +122,8 @@ def train(run: TrainingRun, folder: Path) -> None:
 
 
 def run_to_end(trainer: Trainer, settings: CertificateSettings, folder: Path) -> Certificate:
-    """`ending` of a run that nobody else watches. Raises `InputError` when a loss stops being finite or the user's problem
-    fails, once what the best quick evaluation so far gives is handed out."""
+    """The certificate of `ending`. Raises `InputError` when a loss stops being finite or the user's problem fails, after
+    handing out the results of the best quick evaluation so far."""
     started = time.perf_counter()
     end = ending(trainer, settings, folder)
     log.info("controller from %s, %.0f s in all, in %s", end.controller.kind, time.perf_counter() - started, folder)
@@ -135,7 +135,7 @@ def run_to_end(trainer: Trainer, settings: CertificateSettings, folder: Path) ->
 
 
 def assist(trainer: Trainer) -> None:
-    """What a process does that is not the first of its run: its share of every step, and of the certificate. It writes
+    """The work of a process that is not the first of its run: its share of every step and of the certificate. It writes
     nothing."""
     if trainer.fresh:
         seed_generators(trainer.seed)
@@ -147,7 +147,7 @@ def assist(trainer: Trainer) -> None:
 
 
 def handed_out(trainer: Trainer) -> str:
-    """Which controller a run that could not go on hands out, in words."""
+    """A sentence on which controller a run that could not go on hands out."""
     return "the best evaluation before" if trainer.health.best else f"step {trainer.step}, without any evaluation"
 
 
@@ -158,12 +158,12 @@ def ending(
     watch: Callable[[Path, Trainer], Monitor] = Monitor,
     exits: bool = True,
 ) -> Ending:
-    """Fill ``folder`` with a run: events, `checkpoints/`, `certificate.json`, `controller.safetensors`, figures,
-    `metrics.json` for problems with numbers of their own, and `report.html`; what it hands out. ``watch`` makes what it is
-    told to; a second signal ends the process, unless it is not the run's own (``exits``).
+    """Train to the end and fill ``folder``: events, `checkpoints/`, `certificate.json`, `controller.safetensors`, figures,
+    `metrics.json` for problems with metrics, and `report.html`; returns the results. ``watch`` makes the run's monitor; with
+    ``exits`` a second signal ends the process.
 
-    A trainer that was resumed goes on where it is. SIGTERM and Ctrl-C raise `Preempted` once the state is saved. Raises
-    `InputError` when there is nothing to hand out, and `StorageError` when a file cannot be written.
+    A resumed trainer goes on where it is. SIGTERM and Ctrl-C raise `Preempted` once the state is saved. Raises `InputError`
+    when there is nothing to hand out, and `StorageError` when a file cannot be written.
     """
     last = folder / "checkpoints" / LAST
     for place in (folder, last.parent, *folder.glob(".hydra/resume_*")):
@@ -201,7 +201,7 @@ def ending(
 def _trained(
     trainer: Trainer, settings: CertificateSettings, monitor: Monitor, last: Path, signals: Signals
 ) -> tuple[Certificate, Fields]:
-    """Train to the end; the certificate, and the fields it is of. A target gap is reached when the certificate says so."""
+    """Train to the end; the certificate and its fields. A target gap counts as reached only by the full certificate."""
     target = trainer.settings.target_gap
     while True:
         signals.saved = False
@@ -220,7 +220,7 @@ def _trained(
 def _certified(
     trainer: Trainer, settings: CertificateSettings, target: float | None
 ) -> tuple[Certificate, Fields, bool]:
-    """The certificate, the fields it is of, and whether its gap is below ``target``, or there is none."""
+    """The certificate, its fields, and whether its gap is below ``target``, or there is no target."""
     fields, note = trainer.evaluator.choose(trainer.run)
     fields = trainer.evaluator.tightened(fields, trainer.run, settings, trainer.tell)
     certificate = trainer.certify(settings, fields)
@@ -230,7 +230,7 @@ def _certified(
 
 
 def summary(trainer: Trainer) -> str:
-    """What is about to be trained, in a few lines."""
+    """A summary of what is about to be trained, in a few lines."""
     problem, settings, constants = trainer.problem, trainer.settings, trainer.constants
     weights = sum(p.numel() for p in trainer.fields.parameters())
     name, method = trainer.names

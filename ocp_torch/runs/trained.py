@@ -1,4 +1,4 @@
-"""What a run that was trained from Python gives."""
+"""The results of a run that was trained from Python."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,8 +12,8 @@ from ocp_torch.runs.report.report import write_report
 
 @dataclass(frozen=True)
 class History:
-    """One dict for each moment, made for `pandas.DataFrame(history.looks)`: ``step``, ``samples`` drawn, ``seconds``
-    spent in steps, and the scalars of a `Moment`. The last of the ``looks`` is the final certificate."""
+    """Lists of a dict for each moment, as `pandas.DataFrame(history.looks)` takes them: ``step``, ``samples`` drawn,
+    ``seconds`` spent in steps, and the scalars of a `Moment`. The last of the ``looks`` is the final certificate."""
 
     steps: list[dict[str, float]] = field(default_factory=list)
     looks: list[dict[str, float]] = field(default_factory=list)
@@ -22,8 +22,8 @@ class History:
 
 @dataclass(frozen=True, repr=False)
 class TrainedRun:
-    """What `train` gives. ``certificate`` is the dict of `certificate.json`, printed as a table by `print(run)`; ``metrics``
-    that of `metrics.json`, for problems with numbers of their own; ``folder`` where the run was written, `None` for nowhere.
+    """The result of `train`. ``certificate`` is the dict of `certificate.json`, printed as a table by `print(run)`;
+    ``metrics`` that of `metrics.json`, for problems with metrics; ``folder`` the run's folder, `None` if nothing was kept.
     """
 
     controller: Controller
@@ -33,7 +33,7 @@ class TrainedRun:
     folder: Path | None = None
 
     def report(self) -> Path:
-        """Write the run's `report.html` anew; its path. Raises `InputError` where the run is in no folder."""
+        """Write the run's `report.html` anew and return its path. Raises `InputError` where the run is in no folder."""
         if self.folder is None:
             raise InputError("this run is in no folder, and a report is made of its files; train it with folder=...")
         return write_report(self.folder, self.controller.problem, self.controller.config)
@@ -48,7 +48,7 @@ class TrainedRun:
 
 
 class TrainingFailed(InputError):
-    """A loss stopped being finite, or the problem failed, under way; ``run`` is what there is of it all the same."""
+    """A loss stopped being finite, or the problem failed, during training; ``run`` has the results up to then."""
 
     def __init__(self, sentence: str, run: TrainedRun) -> None:
         super().__init__(sentence)

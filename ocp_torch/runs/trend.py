@@ -1,4 +1,4 @@
-"""Gaps of runs against a number of their configurations: what a noise level, a budget or a size does to a certificate."""
+"""Plots of the gaps of runs against a number of their configurations, such as a noise level, a budget or a size."""
 
 from itertools import groupby
 from pathlib import Path
@@ -9,7 +9,7 @@ from ocp_torch.runs.canvas import blank_figure, save_figure
 from ocp_torch.runs.compare import Comparison, number
 from ocp_torch.runs.configuration import saved_configuration
 
-# Column of a comparison -> how it is drawn.
+# Column of a comparison -> style of its line.
 GAPS: dict[str, dict[str, Any]] = {
     "gap_certified": dict(linestyle="-", marker="o"),
     "gap_simulated": dict(linestyle=":", marker="x"),
@@ -17,7 +17,7 @@ GAPS: dict[str, dict[str, Any]] = {
 
 
 def field_of(folder: Path, field: str) -> float:
-    """The number ``field``, as `problem.noise`, of the run in ``folder``. Raises `InputError` where there is none."""
+    """The number ``field``, such as `problem.noise`, of the run in ``folder``. Raises `InputError` where there is none."""
     value: Any = saved_configuration(folder)
     try:
         for part in field.split("."):
@@ -42,7 +42,7 @@ def save_trend(comparison: Comparison, field: str, file: Path) -> None:
             means = [100.0 * sum(g for at, g in known if at == x) / sum(at == x for at, _ in known) for x in xs]
             axis.plot(xs, means, color=f"C{k}", label=f"{problem}, {method}, {gap[4:]}", **look)
     above = [x for x, _ in points if x > 0.0]
-    if above and all(x >= 0.0 for x, _ in points):  # a logarithmic axis, and 0 a step before its first number
+    if above and all(x >= 0.0 for x, _ in points):  # a logarithmic axis, with 0 a step before the first number
         axis.set_xscale("symlog", linthresh=min(above), linscale=0.5)
     axis.set(yscale="log", ylabel="gap, %")
     axis.set_xlabel(field, parse_math=False)

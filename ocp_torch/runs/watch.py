@@ -1,4 +1,4 @@
-"""A run that is watched from Python: the numbers it shows are kept, and told to a callback that may stop it."""
+"""Runs started from Python: their scalars are kept, and passed to a callback that may stop the run."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,17 +14,20 @@ from ocp_torch.steppers import StepReport
 from ocp_torch.training.monitor import Monitor, record
 from ocp_torch.training.trainer import Trainer
 
-STEP, LOOK, WARM_START = "step", "look", "warm start"
+# Kinds of a `Moment`.
+STEP = "step"
+LOOK = "look"
+WARM_START = "warm start"
 
 
 @dataclass(frozen=True)
 class Moment:
-    """What a callback is told.
+    """The argument of a callback.
 
     ``kind`` is `step` (one of every `trainer.log_every`), `look` (a quick evaluation, every `trainer.evaluate_every`) or
-    `warm start` (a try of its controller). ``step`` counts training steps, of a warm start its rounds. ``scalars`` are named
-    as in TensorBoard (`loss/value`, `bounds/F_M`, `gap/certified`), in the units of the problem's cost; ``certificate`` is
-    that of a look, as in `certificate.json`, from few samples, and `None` elsewhere.
+    `warm start` (a try of its controller). ``step`` counts training steps, or the rounds of a warm start. ``scalars`` are
+    named as in TensorBoard (`loss/value`, `bounds/F_M`, `gap/certified`), in the units of the problem's cost. A look has a
+    ``certificate`` from few samples, a dict as in `certificate.json`; elsewhere it is `None`.
     """
 
     kind: str
@@ -38,11 +41,11 @@ Callback = Callable[[Moment], object]
 
 
 class CallbackFailed(BaseException):
-    """A callback raised, as its cause tells. No `Exception`: it is not the problem that failed."""
+    """A callback raised its ``__cause__``. Not an `Exception`, so that no handler takes it for a failure of the problem."""
 
 
 class Scalars:
-    """Stands before TensorBoard's ``writer``, where there is one, and keeps the scalars that pass."""
+    """Passes scalars on to TensorBoard's ``writer``, where there is one, and keeps a copy."""
 
     def __init__(self, writer: SummaryWriter | None = None) -> None:
         self._writer, self._new = writer, dict[str, float]()
@@ -53,7 +56,7 @@ class Scalars:
             self._writer.add_scalar(name, value, step)
 
     def take(self) -> dict[str, float]:
-        """Those since it was asked last."""
+        """The scalars added since the last call."""
         new, self._new = self._new, {}
         return new
 
@@ -99,7 +102,7 @@ class Watch(Monitor):
             answer = self._callback(moment)
         except Exception as error:  # whatever a user's code may raise
             raise CallbackFailed from error
-        # What a callback that draws or appends happens to return is no answer.
+        # Only `True` stops the run: a callback that draws or appends may return something else.
         self._trainer.asked |= isinstance(answer, bool | np.bool_) and bool(answer)
 
     def _keep(self, rows: list[dict], step: int, scalars: dict[str, float]) -> None:

@@ -1,1 +1,1 @@
-"""What a practitioner asks of a controller: does it reach, avoid, synchronise; against nothing and against the classics."""
+"""Metrics of a controller, such as reaching and avoiding, beside no control and classical controllers."""

@@ -1,4 +1,4 @@
-"""A simple classical controller for each system, as a yardstick: tuned once, by hand or by random search."""
+"""A simple classical controller for each system, to compare with: tuned once, by hand or by random search."""
 
 from collections.abc import Callable
 from functools import partial
@@ -24,39 +24,38 @@ from ocp_torch.problems.systems.satellite import Satellite
 from ocp_torch.problems.systems.unicycle import Unicycle
 from ocp_torch.runs.metrics import feedback
 
-# Arms: the gain per second, and the damping of the pseudo-inverse relative to the arm's length.
-REACH, DAMPING = 1.5, 0.1
-# Vehicles: gains per second of speed and of turn rate.
-DRIVE, STEER = 1.0, 2.0
-# Oscillators: the gain of descent.
-DESCENT = 2.0
-# Pendulum: the gain of the pump; those of the balance, on angle (1/s^2) and velocity (1/s); and angle in rad and speed in
-# rad/s below which it balances.
-PUMP, BALANCE, CATCH = 0.2, (20.0, 5.0), (0.5, 2.0)
+REACH = 1.5  # arms: gain, per second
+DAMPING = 0.1  # arms: damping of the pseudo-inverse, relative to the arm's length
+DRIVE = 1.0  # vehicles: gain of the speed, per second
+STEER = 2.0  # vehicles: gain of the turn rate, per second
+DESCENT = 2.0  # oscillators: gain of the descent
+PUMP = 0.2  # pendulum: gain of the energy pump
+BALANCE = (20.0, 5.0)  # pendulum: gains of the balance, on angle (1/s^2) and velocity (1/s)
+CATCH = (0.5, 2.0)  # pendulum: angle in rad and speed in rad/s below which it balances
 
 
 def classical_policy(problem: Problem) -> Policy | None:
-    """The classical controller of ``problem``, or `None` where nobody has named one."""
+    """The classical controller of ``problem``, or `None` where there is none."""
     found = (control for kind, control in CONTROLS.items() if isinstance(problem, kind))
     return next((partial(control, problem) for control in found), None)
 
 
 def resolved_rate(problem: Linkage, x: Tensor) -> Tensor:
     r"""`dtheta/dt = k J^+ (target - p)`, `J^+` the damped pseudo-inverse (Whitney, 1969; Nakamura and Hanafusa, 1986)."""
-    damping = (DAMPING * problem.length) ** 2 or 1.0  # a tip on the last of its joints does not move: J = 0
+    damping = (DAMPING * problem.length) ** 2 or 1.0  # length 0: J = 0, and any damping will do
     J, way = problem.jacobian(problem.from_torus(x)), problem.to_target(x)
     square = J @ J.mT + damping * torch.eye(way.shape[1]).to(x)
     return problem.to_controls(REACH * (J.mT @ torch.linalg.solve(square, way.unsqueeze(-1))).squeeze(-1))
 
 
 def _bearing(problem: Unicycle | Dubins, x: Tensor) -> tuple[Tensor, Tensor]:
-    """The way to the target along and across the heading, in metres, both ``(N,)``."""
+    """The offset of the target along and across the heading, in metres, both ``(N,)``."""
     way, ahead = problem.to_target(x), problem.heading(problem.from_torus(x))
     return (way * ahead).sum(dim=-1), ahead[:, 0] * way[:, 1] - ahead[:, 1] * way[:, 0]
 
 
 def go_to_goal(problem: Unicycle, x: Tensor) -> Tensor:
-    """Speed in proportion to the way ahead, turn rate to the bearing of the nearer end, front or back."""
+    """Speed in proportion to the offset ahead, turn rate to the bearing of the target from the nearer end, front or back."""
     along, across = _bearing(problem, x)
     bearing = torch.atan2(across, along.abs()) * torch.where(along < 0.0, -1.0, 1.0)
     return problem.to_controls(torch.stack([DRIVE * along, STEER * bearing], dim=-1))
@@ -88,8 +87,8 @@ def energy_pump(problem: Pendulum, x: Tensor) -> Tensor:
 
 
 def gather_speed(problem: MountainCar, x: Tensor) -> Tensor:
-    """Full force to the right, but to the left while the car goes there with less energy than takes it half way up; none at
-    the goal."""
+    """Full force to the right; to the left while the car moves left with less than half the energy that takes it up the left
+    hill; none at the goal."""
     s = problem.from_torus(x)
     bottom, top = -problem.gravity / HILLS, problem.energy(s.new_tensor([[problem.low, 0.0]]))
     back = (s[:, 1] < 0.0) & (problem.energy(s) < 0.5 * (bottom + top))
@@ -97,7 +96,7 @@ def gather_speed(problem: MountainCar, x: Tensor) -> Tensor:
     return problem.to_controls(force.unsqueeze(-1))
 
 
-# The control ``(N, m)`` at states ``(N, d)``, for each kind of problem that has one.
+# Class of problem -> its classical control ``(N, m)`` at states ``(N, d)``.
 CONTROLS: dict[type[Problem], Callable[..., Tensor]] = {
     Linkage: resolved_rate,
     Unicycle: go_to_goal,

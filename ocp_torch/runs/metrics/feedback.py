@@ -15,22 +15,21 @@ from ocp_torch.problems.systems.quadrotor import Quadrotor
 from ocp_torch.problems.systems.rest import linearised, riccati
 from ocp_torch.problems.systems.satellite import Satellite
 
-# Double pendulum, driven at the shoulder and at the elbow: gains on the driven joint's angle (1/s^2), on its velocity (1/s)
-# and of the energy's term (1/(J s)), and the cost of the linear balance, per unit of time, below which it balances; and the
-# largest of what the energy is multiplied by.
+# Double pendulum driven at the shoulder, and at the elbow: gains on the driven joint's angle (1/s^2) and velocity (1/s) and
+# of the energy term (1/(J s)), and the cost of the linear balance below which it balances.
 SWINGS = (13.0, 2.0, 4.0, 1.5), (14.0, 9.0, 31.0, 2.5)
+# Double pendulum: limit of the missing energy times the other joint's velocity.
 PUMPED = 5.0
-# Satellite: the frequency of the critically damped loop, in rad/s.
-STIFFNESS = 0.1
-# Cart and pole: the gain of the energy, per J m, those on position (1/s^2) and velocity (1/s) of the cart, and the cost of
-# the linear balance, per unit of time, below which it balances.
-SHAPING, CENTRE, BALANCED = 15.0, (2.0, 2.0), 0.4
-# Phase-locked loop: its natural frequency in rad/s, and its damping.
-NATURAL, DAMPED = 1.0, 0.707
+STIFFNESS = 0.1  # satellite: frequency of the critically damped loop, in rad/s
+SHAPING = 15.0  # cart and pole: gain of the energy, per J m
+CENTRE = (2.0, 2.0)  # cart and pole: gains on the position (1/s^2) and velocity (1/s) of the cart
+BALANCED = 0.4  # cart and pole: cost of the linear balance below which it balances
+NATURAL = 1.0  # phase-locked loop: natural frequency in rad/s
+DAMPED = 0.707  # phase-locked loop: damping ratio
 
 
 def regulator(system: System, rest: tuple[float, ...]) -> tuple[Tensor, Tensor]:
-    """`P` and `B'P` at a state of ``rest`` (`riccati`, undiscounted), for physical states; found once for a system."""
+    """`P` and `B'P` at a state of ``rest`` (`riccati`, undiscounted), for physical states; computed once for a system."""
     kept = vars(system)
     if "_regulator" not in kept:
         with torch.enable_grad():
@@ -41,8 +40,8 @@ def regulator(system: System, rest: tuple[float, ...]) -> tuple[Tensor, Tensor]:
 
 
 def swing_up(problem: DoublePendulum, x: Tensor) -> Tensor:
-    r"""The driven joint is accelerated by `-k_P theta - k_D theta' + k_E sat((E - E*) omega)`, `omega` the other joint's
-    velocity (partial feedback linearisation: Spong, 1995; with the energy: Spong, 1996); near upright, LQR."""
+    r"""Accelerate the driven joint by `-k_P theta - k_D theta' + k_E sat((E - E*) omega)`, `omega` the other joint's velocity
+    (partial feedback linearisation: Spong, 1995; with the energy: Spong, 1996); near upright, LQR."""
     s, j = problem.from_torus(x), problem.joint
     a, B = problem.dynamics(s)
     stiff, damp, pump, balanced = SWINGS[j]
@@ -58,8 +57,8 @@ def swing_up(problem: DoublePendulum, x: Tensor) -> Tensor:
 
 
 def shape_energy(problem: CartPole, x: Tensor) -> Tensor:
-    r"""The cart is accelerated by `k E theta' cos theta - k_1 p - k_2 p'`, `E` the energy of the pole on a cart that stands,
-    so that `E` goes to 0; near upright, LQR (Chung and Hauser, 1995; Spong, 1996)."""
+    r"""Accelerate the cart by `k E theta' cos theta - k_1 p - k_2 p'`, `E` the energy of the pole on a standing cart, so that
+    `E` goes to 0; near upright, LQR (Chung and Hauser, 1995; Spong, 1996)."""
     s = problem.from_torus(x)
     position, pole, velocity, spin = s.unbind(dim=-1)
     a, B = problem.dynamics(s)
@@ -89,7 +88,7 @@ def loop_filter(problem: PhaseLockedLoop, x: Tensor) -> Tensor:
 
 
 def hover(problem: Quadrotor, x: Tensor) -> Tensor:
-    """LQR about hovering at the target, which knows of no obstacle."""
+    """LQR about hovering at the target, which ignores obstacles."""
     rest = (*problem.target, 0.0, 0.0, 0.0, 0.0)
     _, K = regulator(problem, rest)
     return -(problem.from_torus(x) - x.new_tensor(rest)) @ K.T.to(x)

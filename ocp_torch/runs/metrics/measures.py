@@ -1,4 +1,4 @@
-"""Trajectories at equal times, for numbers and pictures: the certificate has its own; and what is measured on each system."""
+"""Trajectories at equal times, for metrics and pictures but not for certificates, and the metrics of each system."""
 
 import math
 from collections.abc import Callable
@@ -28,19 +28,18 @@ from ocp_torch.problems.systems.quadrotor import Quadrotor
 from ocp_torch.problems.systems.reaching import Reaching
 from ocp_torch.problems.systems.satellite import Satellite
 
-# What counts as reached, relative to the arm's length or the width of the plane; as upright, in rad and rad/s; as pointed, in
-# degrees. Definitions of what the numbers say, not tuned.
-REACHED = 0.05
+# Definitions of the metrics, not tuned.
+REACHED = 0.05  # distance from the target, as a part of the arm's length or the plane's width
 LOCKED = 0.5 * math.pi  # rad of phase error, beyond which a detector pushes the wrong way
-POINTED = 1.0
-UPRIGHT = (0.2, 0.5)
-LATE = 0.25  # the part of a trajectory that is its end
+POINTED = 1.0  # degrees of pointing error
+UPRIGHT = (0.2, 0.5)  # tilt in rad and speed in rad/s
+LATE = 0.25  # part of a trajectory that counts as its end
 
 
 @dataclass(frozen=True)
 class Path:
-    """``times`` ``(K,)`` in the problem's unit, ``states`` ``(K, N, d)``, and each discounted ``cost`` ``(N,)``; ``samples``
-    neighbours are draws of the noise from one start."""
+    """``times`` ``(K,)`` in the problem's unit, ``states`` ``(K, N, d)``, and the discounted ``cost`` ``(N,)`` of each path;
+    ``samples`` consecutive paths are draws of the noise from one start."""
 
     times: Tensor
     states: Tensor
@@ -49,26 +48,27 @@ class Path:
 
     @property
     def means(self) -> Tensor:
-        """The mean of the samples of each start, ``(K, N / samples, d)``: of the way they went, not of where they are on the
-        torus, where opposite states have none."""
+        """The mean path of the samples of each start, ``(K, N / samples, d)``: of the distances gone, as opposite states on
+        the torus have no mean."""
         moves = (self.states.diff(dim=0) + 0.5).remainder(1.0) - 0.5
         ways = torch.cat([self.states[:1], self.states[:1] + moves.cumsum(dim=0)])
         return ways.unflatten(1, (-1, self.samples)).mean(dim=2).remainder(1.0)
 
     def each(self, function: Callable[[Tensor], Tensor], late: bool = False) -> Tensor:
-        """``function`` of all states, or of those of the last quarter of the time, as ``(K', N)``."""
+        """``function`` ``(N, d) -> (N,)`` at all states, or only at those of the last quarter of the time, ``(K', N)``."""
         x = self.states[-max(1, round(LATE * len(self.times))) :] if late else self.states
         return function(x.flatten(0, 1)).reshape(x.shape[:2])
 
 
 @torch.no_grad()
 def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, steps: int, samples: int = 1) -> Path:
-    r"""From ``x0`` ``(N, d)`` for ``duration``, by RK4 with a control recomputed at each stage; with noise ``samples``
-    paths from each start, by the midpoint rule and what the noise does in a step, which is the same for all controllers that
-    take the same steps. A `HeldPolicy` is asked no less often than it is meant to be, and held in between, in finer steps.
+    r"""The paths under ``policy`` from ``x0`` ``(N, d)`` for ``duration``, in ``steps`` steps: by RK4 with a control
+    recomputed at each stage. With noise ``samples`` paths from each start, by the midpoint rule plus the noise of a step,
+    whose draws are the same for all controllers with the same steps. A `HeldPolicy` is asked at least as often as it is made
+    for, and held in between, in finer steps.
 
-    The cost is `int_0^T rho e^{-rho t} (f + R(u)) dt` by the trapezoidal rule: good to a few digits, where the certificate's
-    performance has an error bound.
+    The cost is `int_0^T rho e^{-rho t} (f + R(u)) dt` by the trapezoidal rule: good to a few digits, without the error bound
+    of the certificate's performance.
     """
     holds, substeps = 1, 1  # of each step
     if isinstance(policy, HeldPolicy):
@@ -106,7 +106,7 @@ def simulate(problem: Problem, policy: Policy, x0: Tensor, duration: float, step
 
 
 def admissible(problem: Problem, x: Tensor) -> Tensor:
-    """Which states ``(N,)`` are fair starts; all, unless there are obstacles: then those that keep the clearance."""
+    """Whether states ``x`` are fair starts, ``(N,)``: those that keep the clearance from obstacles; all without obstacles."""
     if isinstance(problem, Reaching):
         return problem.gap(x) > problem.clearance
     return torch.ones_like(x[:, 0], dtype=torch.bool)
@@ -114,7 +114,7 @@ def admissible(problem: Problem, x: Tensor) -> Tensor:
 
 @singledispatch
 def measure(problem: Problem, path: Path) -> dict[str, float] | None:
-    """What ``path`` achieved, by name; `None` for a problem that asks for nothing but a low cost."""
+    """The metrics of ``path`` by name; `None` for a problem without any."""
     return None
 
 
@@ -132,8 +132,8 @@ def _(problem, path: Path) -> dict[str, float]:
 
 @measure.register
 def _(problem: Dubins, path: Path) -> dict[str, float]:
-    """It cannot stop: the mean distance from the target late on, in metres; and how many were ever in an obstacle, or out of
-    a room."""
+    """The mean late distance from the target in metres, as the vehicle cannot stop; and the parts of the starts from which it
+    is ever in an obstacle or out of a room."""
     crossed, left = (path.each(problem.gap) < 0.0).any(dim=0), path.each(problem.outside).any(dim=0)
     found = {"distance": float(path.each(problem.distance, late=True).mean()), "crossed": _part(crossed)}
     return found | ({"left": _part(left)} if problem.walls else {})
@@ -142,14 +142,14 @@ def _(problem: Dubins, path: Path) -> dict[str, float]:
 @measure.register(Kuramoto)
 @measure.register(PhaseNeurons)
 def _(problem, path: Path) -> dict[str, float]:
-    """The order parameter at the start and, over the last quarter of the time, late."""
+    """The mean order parameter at the start, and over the last quarter of the time."""
     before, after = problem.order_parameter(path.states[0]), path.each(problem.order_parameter, late=True)
     return {"order_before": float(before.mean()), "order_after": float(after.mean())}
 
 
 @measure.register
 def _(problem: Pendulum, path: Path) -> dict[str, float]:
-    """Upright: within 0.2 rad and 0.5 rad/s at the end."""
+    """The part of the starts from which the pendulum is upright, within 0.2 rad and 0.5 rad/s, at the end."""
     angle, velocity = problem.from_torus(path.states[-1]).unbind(dim=-1)
     return {"upright": _part((angle.abs() <= UPRIGHT[0]) & (velocity.abs() <= UPRIGHT[1]))}
 
@@ -172,7 +172,7 @@ def _(problem: Quadrotor, path: Path) -> dict[str, float]:
 
 @measure.register
 def _(problem: Satellite, path: Path) -> dict[str, float]:
-    """The mean pointing error in degrees, first and late on; the parts within a degree late on, and ever out of the box."""
+    """The mean pointing error in degrees, at first and late; the parts within a degree late, and ever out of the box."""
     error = lambda x: torch.rad2deg(problem.angle(problem.from_torus(x)))
     late, left = path.each(error, late=True), path.each(problem.outside).any(dim=0)
     before, pointed = float(error(path.states[0]).mean()), (late <= POINTED).all(dim=0)
@@ -218,12 +218,12 @@ def _(problem: PhaseLockedLoop, path: Path) -> dict[str, float]:
 
 
 def has_metrics(problem: Problem) -> bool:
-    """Whether ``problem`` has numbers of its own."""
+    """Whether ``problem`` has metrics."""
     return measure.dispatch(type(problem)) is not measure.dispatch(Problem)
 
 
 def _swung_up(problem: System, path: Path, tilts: Tensor, speeds: Tensor) -> dict[str, float]:
-    """Whether all ``tilts`` and ``speeds`` ``(N, k)`` at the end are those of a body upright, and the box was never left."""
+    """Metrics of bodies that must stay in the box and be upright at the end, at ``tilts`` and ``speeds`` ``(N, k)``."""
     upright = (tilts.cos() >= math.cos(UPRIGHT[0])).all(dim=-1) & (speeds.abs() <= UPRIGHT[1]).all(dim=-1)
     left = path.each(problem.outside).any(dim=0)
     return {"success": _part(upright & ~left), "upright": _part(upright), "left": _part(left)}

@@ -20,19 +20,24 @@ from ocp_torch.runs.metrics.measures import admissible, has_metrics, measure, si
 
 log = logging.getLogger(__name__)
 METRICS = "metrics.json"
-# A part of 512 starts has a standard error of at most 2.2 %; 240 steps for a time of 8 / rho are 30 per 1 / rho.
-STARTS, STEPS = 512, 240
-# Part of a turn of any coordinate that at half of all states a step of the trial takes at most without control: where things
-# move faster there are more steps.
-LONGEST_STEP, PACED = 0.05, 2**10
-# The time of a trial in units of 1 / rho; what the discount still sees after it is e^-8.
+# Starts of a trial: a part of 512 has a standard error of at most 2.2 %.
+STARTS = 512
+# The time of a trial in units of 1 / rho; the discount of what comes later is below e^-8.
 TRIAL = 8.0
-# Uniform states, and states from `mu0`, drawn for each start, of which the admissible ones are taken.
-CANDIDATES, DRAWN = 64, 4
+# Steps of a trial, at least: 30 per 1 / rho.
+STEPS = 240
+# More steps are taken where a coordinate would else move by more than this part of a turn in a step, without control and at
+# the median state.
+LONGEST_STEP = 0.05
+# States that the median is taken over.
+PACE_STATES = 2**10
+CANDIDATES = 64  # uniform states drawn for each start, of which admissible ones are taken
+DRAWN = 4  # states from `mu0` drawn instead where it is narrow or in a box
 
 
 def write_metrics(problem: Problem, policy: Policy, seed: int, folder: Path | None) -> dict | None:
-    """Print the numbers of ``policy``, write them as `metrics.json` in ``folder``, return them; where the problem has any."""
+    """Print the metrics of ``policy``, write them as `metrics.json` in ``folder`` and return them; `None` for a problem
+    without metrics."""
     found = metrics(problem, policy, derive_seed(seed, Branch.METRICS))
     if found is None:
         return None
@@ -43,10 +48,10 @@ def write_metrics(problem: Problem, policy: Policy, seed: int, folder: Path | No
 
 
 def metrics(problem: Problem, policy: Policy, seed: int = 0, starts: int = STARTS) -> dict | None:
-    """``controller``, ``zero`` and ``classical`` (where there is one), each with its numbers and mean discounted ``cost``.
+    """``controller``, ``zero`` and ``classical`` (where there is one), each with its metrics and mean discounted ``cost``.
 
-    All from the same ``starts`` (`random_starts`), for ``duration`` in the problem's unit of time; `None` for a problem
-    without numbers of its own. Statistics, not bounds: a part `p` has the standard error `sqrt(p (1 - p) / starts)`.
+    All are simulated from the same ``starts`` (`random_starts`), for ``duration`` in the problem's unit of time; `None` for a
+    problem without metrics. Statistics, not bounds: a part `p` has the standard error `sqrt(p (1 - p) / starts)`.
     """
     if not has_metrics(problem):
         return None
@@ -55,7 +60,7 @@ def metrics(problem: Problem, policy: Policy, seed: int = 0, starts: int = START
     steps = max(STEPS, math.ceil(duration * _pace(problem) / LONGEST_STEP))
     policies = {"controller": policy, "zero": zero_policy(problem), "classical": classical_policy(problem)}
     found = {}
-    # A classical policy knows no limit of the control, and others round; one that is held is within it.
+    # Classical policies ignore limits of the control, and others round; a held policy is within them.
     cut = lambda each: lambda x: problem.control_cost.within(each(x), torch.ones_like(x[:, 0]))
     within = lambda each: each if isinstance(each, HeldPolicy) else cut(each)
     for name, each in policies.items():
@@ -66,7 +71,7 @@ def metrics(problem: Problem, policy: Policy, seed: int = 0, starts: int = START
 
 
 def random_starts(problem: Problem, count: int, seed: int) -> Tensor:
-    """``(count, d)`` float64: drawn from `mu0` where it is narrow or in a box; else uniform admissible ones, or any."""
+    """Starts ``(count, d)``, float64: from `mu0` where it is narrow or in a box, else uniform; admissible if enough are."""
     own_start = type(problem).initial_density is not System.initial_density
     boxed = isinstance(problem, System) and bool(problem.chart.boxed) and not own_start
     if boxed or starts_narrowly(problem):
@@ -80,12 +85,12 @@ def random_starts(problem: Problem, count: int, seed: int) -> Tensor:
 
 def _pace(problem: Problem) -> float:
     """Turns per unit of time of the fastest coordinate without control, the median over states."""
-    (drift,) = problem.probe(PACED, 0, "a")
+    (drift,) = problem.probe(PACE_STATES, 0, "a")
     return float(drift.abs().amax(dim=-1).median())
 
 
 def metrics_table(found: dict) -> str:
-    """What a user reads: a row for each controller."""
+    """The metrics as a table for the terminal: a row for each controller."""
     rows = {name: found[name] for name in ("controller", "zero", "classical") if name in found}
     names = list(rows["controller"])
     lines = [f"{found['starts']} random starts, {found['duration']:g} units of time"]

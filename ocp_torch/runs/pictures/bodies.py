@@ -17,7 +17,7 @@ GHOSTS = 12
 
 
 def draw_double_pendulum(problem: DoublePendulum, axes: Any, path: Path, k: int) -> None:
-    """One trajectory: poses from light to dark, and the path of the tip; with noise poses of the mean, and all tips' paths."""
+    """One trajectory: poses from light to dark, and the tip's path; with noise poses of the mean, and all tips' paths."""
     reach = 1.08 * sum(problem.lengths)
     *others, (mean, _) = tracks(path, k)
     poses = problem.joints(problem.from_torus(mean))
