@@ -87,7 +87,8 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
         self.generator = torch.Generator().manual_seed(derive_seed(seed, Branch.EPISODES))
         candidates = torch.rand(CANDIDATES, problem.dim, dtype=torch.float64, generator=fixed_generator())
         narrow = starts_narrowly(problem)
-        self._drawn = drawn_starts(problem, DRAWN_STARTS, derive_seed(seed, Branch.EPISODES)) if narrow else None
+        # The same ones in each environment: which of them an episode has is then a matter of its seed alone.
+        self._drawn = drawn_starts(problem, DRAWN_STARTS, derive_seed(0, Branch.EPISODES)) if narrow else None
         self._ceiling = MARGIN * float(problem.initial_density(candidates).max())
         self._weight = -math.expm1(-problem.discount * self.time_step)
         self.x, self.elapsed = torch.full((1, problem.dim), 0.5, dtype=torch.float64), 0.0

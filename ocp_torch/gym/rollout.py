@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 
 # Frames of a video at most, and steps of an episode: an environment may have no end.
 MOST_FRAMES, MOST_STEPS = 600, 100_000
+# Of an action at the limit of an environment, in single precision.
+ROUNDING = 1e-6
 # The environment of a problem of one's own.
 OWN = "ocp_torch/Problem-v0"
 # What environments call the time of a step: ours, Pendulum-v1, MuJoCo's and Acrobot-v1, CartPole-v1.
@@ -38,6 +40,7 @@ class Agent:
 
     def __init__(self, controller: Controller, env, name: str) -> None:
         self.controller, self.name, self.space = controller, name, env.action_space
+        self.acted = self.cut = 0  # actions, and how many of them the environment does not allow
         own = env.unwrapped
         self.step = step_of(own)
         if hasattr(own, "from_observation"):
@@ -69,8 +72,12 @@ class Agent:
             )
         if not np.isfinite(given).all():
             raise InputError(f"to_action gave {given} for {self.name}, but must give finite numbers.")
-        action = given.astype(self.space.dtype)
-        return np.clip(action, self.space.low, self.space.high) if hasattr(self.space, "low") else action
+        within = np.clip(given, self.space.low, self.space.high) if hasattr(self.space, "low") else given
+        self.acted, self.cut = self.acted + 1, self.cut + int((abs(given - within) > ROUNDING * abs(given)).any())
+        action = within.astype(self.space.dtype)
+        if np.issubdtype(action.dtype, np.integer) and (action != within).any():
+            raise InputError(f"to_action gave {given} for {self.name}, but must give whole numbers.")
+        return action
 
 
 def step_of(env) -> float | None:
@@ -111,7 +118,12 @@ class RolloutJob:
 
     def run(self) -> Rollouts:
         """Play and print; then film the first episode again, if asked to."""
+        mine = self.controller.problem
         with closing(self.environment()) as env:
+            theirs = getattr(env.unwrapped, "problem", mine)
+            if type(theirs) is not type(mine):
+                said = "warning: %s is of the problem %s, but the controller is for %s."
+                log.warning(said, self.env, type(theirs).__name__, type(mine).__name__)
             found = play(self.controller, env, self.env, self.episodes, self.seed)
         log.info("%s: %s", self.env, found)
         if self.video is not None:
@@ -158,6 +170,10 @@ def play(controller: Controller, env, name: str, episodes: int, seed: int, frame
     if endless:
         log.warning(
             "warning: %s: %d of %d episodes had no end within %s steps.", name, endless, episodes, f"{MOST_STEPS:,}"
+        )
+    if agent.cut:
+        log.warning(
+            "warning: %s: %d of %d actions were beyond its limits, and were cut to them.", name, agent.cut, agent.acted
         )
     return Rollouts(np.array(returns), np.array(lengths))
 

@@ -85,11 +85,13 @@ def test_arguments_reach_the_problem_and_the_environment(gymnasium):
         gymnasium.make("ocp_torch/Problem-v0")
 
 
-def test_episodes_repeat_by_seed_and_differ_without(gymnasium):
-    first, second = (gymnasium.make("ocp_torch/Torus-v0") for _ in range(2))
+@pytest.mark.parametrize("name", ["ocp_torch/Torus-v0", "ocp_torch/DoubleIntegrator-v0"])
+def test_episodes_repeat_by_seed_and_differ_without(gymnasium, name):
+    """The second starts in a narrow place."""
+    first, second = (gymnasium.make(name) for _ in range(2))
     assert np.array_equal(first.reset(seed=3)[0], second.reset(seed=3)[0])
     assert not np.array_equal(first.reset(seed=3)[0], first.reset(seed=4)[0])
-    third, fourth = (gymnasium.make("ocp_torch/Torus-v0").reset()[0] for _ in range(2))
+    third, fourth = (gymnasium.make(name).reset()[0] for _ in range(2))
     assert not np.array_equal(third, fourth)
 
 
@@ -171,6 +173,18 @@ def test_the_environment_is_of_the_controllers_own_problem(gymnasium, run, tmp_p
             with closing(job.environment()) as env:
                 assert env.unwrapped.problem.discount == discount
             assert job.run().lengths.tolist() == [50]
+
+
+def test_an_environment_of_another_problem_is_told(gymnasium, run, caplog):
+    gymnasium.register("Other-v0", entry_point=lambda **options: ControlEnvironment(Manufactured(dim=1), **options))
+    try:
+        asked(run, env="Other-v0", episodes=1).run()
+        assert "Other-v0 is of the problem Manufactured, but the controller is for Circle" in caplog.text
+        caplog.clear()
+        asked(run, env="ocp_torch/Circle-v0", episodes=1).run()
+        assert "but the controller" not in caplog.text
+    finally:
+        gymnasium.registry.pop("Other-v0")
 
 
 def test_wrong_requests_are_one_sentence(gymnasium, run):

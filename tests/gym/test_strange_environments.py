@@ -90,3 +90,27 @@ def test_an_episode_without_end_is_told(monkeypatch, caplog):
         monkeypatch.setattr(ocp_torch.gym.rollout, "MOST_STEPS", 9)
         assert play(Player(), Theirs(), NAME, 1, 0).lengths.tolist() == [4]
         assert caplog.text.count("no end") == 1
+
+
+def test_actions_beyond_the_limits_of_an_environment_are_told_and_those_at_them_are_not(caplog):
+    most = float(np.float32(2.0)) * (1.0 + 1e-8)
+    for torque, cut in ((most, 0), (2.5, 4)):
+        with caplog.at_level(logging.WARNING):
+            play(Player(action=lambda self, u, given=torque: np.full(1, given)), Theirs(), NAME, 1, 0)
+        assert ("4 of 4 actions were beyond its limits" in caplog.text) == bool(cut)
+
+
+def test_actions_that_count_are_cut_before_they_become_whole_numbers():
+    """-1 had become 255, and .9 nothing."""
+    seen = []
+    theirs = lambda: Theirs(step=lambda action: (SHOWN, seen.append(action) or 0.0, False, True, {}))
+    bytes_, count = gymnasium.spaces.Box(0, 255, (1,), np.uint8), gymnasium.spaces.Discrete(3)
+    for space, given, gives in ((bytes_, [-1.0], 0), (bytes_, [256.0], 255), (count, 2.0, 2)):
+        env, player = theirs(), Player(action=lambda self, u, given=given: np.array(given))
+        env.action_space = space
+        play(player, env, NAME, 1, 0)
+        assert seen.pop() == gives
+    env, player = theirs(), Player(action=lambda self, u: np.array(0.9))
+    env.action_space = count
+    with pytest.raises(InputError, match="to_action gave 0.9 for Pendulum-v1, but must give whole numbers"):
+        play(player, env, NAME, 1, 0)
