@@ -9,6 +9,7 @@ Giles, 2008), and costs no more than it.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -136,68 +137,80 @@ class Mean(NamedTuple):
     steps: int  # the finest
 
 
-@torch.no_grad()
-def expectation(
-    dynamics: Dynamics,
-    noise: Callable[[Tensor], Any],
-    x0: Tensor,
-    weights: Tensor,
-    replicates: int,
-    grid: Grid,
-    weight: Weight,
-    tolerance: float,
-    seed: int,
-    audit: Dynamics | None = None,
-    together: bool = False,
-) -> Mean:
+@dataclass(frozen=True, eq=False)
+class Multilevel:
     """The mean by ``weights`` ``(N,)`` of the `path_integral` from ``x0`` ``(N, d)``, ``replicates`` sets one after the
-    other. Steps are halved until halving moves it by less than ``tolerance`` or little beside its standard error.
+    other, on ever finer steps along ever fewer paths.
 
-    The bias is the change of the extrapolated mean by the last halving, with twice its standard error added or times
-    `REMAINDER`, whichever is larger; where ``dynamics`` round, the change by ``audit`` over a few paths is added. Paths are
-    followed ``together`` on all cores if ``dynamics`` and ``noise`` are pure.
+    Paths are followed ``together`` on all cores if ``dynamics`` and ``noise`` are pure.
     """
-    motions = noise(x0[:1]).shape[-1]
-    rows = torch.arange(len(x0)).unflatten(0, (replicates, -1))
-    chunks = rows.split(max(1, DRAWN_TOGETHER // replicates), dim=1)
 
-    def followed(halvings: int, by: Dynamics = dynamics, thinned: int = 0) -> tuple[Tensor, Tensor]:
-        """Integrals ``(replicates, n)`` along the first `n` paths of each replicate, and their ends."""
+    dynamics: Dynamics
+    noise: Callable[[Tensor], Any]
+    x0: Tensor
+    weights: Tensor
+    replicates: int
+    grid: Grid
+    weight: Weight
+    seed: int
+    together: bool = False
+
+    @torch.no_grad()
+    def mean(self, tolerance: float, audit: Dynamics | None = None) -> Mean:
+        """The mean, extrapolated. Steps are halved until halving moves it by less than ``tolerance`` or little beside its
+        standard error.
+
+        The bias is what the last halving moved the extrapolated mean by, with twice the standard error of that or
+        `REMAINDER` times; and, where the dynamics round, by how much ``audit`` moves the mean over a few paths.
+        """
+        mass = self.weights.view_as(self._rows)
+        thinnings = max(1, self._rows.shape[1] // FEWEST_PATHS).bit_length() - 1
+        integrals, end = self._followed(self.dynamics, 0)
+        first = mean = (mass * integrals).mean(dim=1)
+        coarse, before, bias = integrals, torch.zeros(()), math.inf
+        for halvings in range(1, min(MOST_HALVINGS, thinnings + HALVINGS_ON_FEWEST) + 1):
+            fine, _ = self._followed(self.dynamics, halvings)
+            of = slice(fine.shape[1])
+            change = mass[:, of] * (fine - coarse[:, of])
+            mean = mean + change.mean(dim=1)
+            extrapolated = mean + change.mean(dim=1)
+            if halvings > 1:
+                moved = (2.0 * change - before[:, of]).flatten()
+                size, error = abs(float(moved.mean())), float(moved.std()) / math.sqrt(len(moved))
+                bias = max(REMAINDER * size, size + 2.0 * error)
+                chance = float(extrapolated.std()) / math.sqrt(self.replicates) if self.replicates > 1 else 0.0
+                if bias <= max(tolerance, GOOD_PART * chance):
+                    break
+            coarse, before = fine, change
+        if audit is not None:
+            exact, _ = self._followed(audit, 0, thinnings)
+            of = slice(exact.shape[1])
+            off = (mass[:, of] * (exact - integrals[:, of])).flatten()
+            bias += abs(float(off.mean())) + 2.0 * float(off.std()) / math.sqrt(len(off))
+        return Mean(integrals.flatten(), extrapolated - first, end, bias, self.grid.steps * 2**halvings)
+
+    @cached_property
+    def _rows(self) -> Tensor:
+        """The numbers of the paths, ``(replicates, n)``."""
+        return torch.arange(len(self.x0)).unflatten(0, (self.replicates, -1))
+
+    def _followed(self, dynamics: Dynamics, halvings: int, thinned: int = 0) -> tuple[Tensor, Tensor]:
+        """Integrals ``(replicates, n)`` along the first `n` paths of each replicate, half as many after each of ``halvings``
+        or ``thinned`` times, and their ends."""
+        rows, grid = self._rows, self.grid
         few = rows[:, : max(FEWEST_PATHS, rows.shape[1] >> max(halvings, thinned))]
-        first, moves = 0, []
-        for number, chunk in enumerate(chunks):
-            if first < few.shape[1]:
-                drawn = increments(grid.of(chunk.flatten()), motions, halvings, seed, number)
-                moves.append(drawn.unflatten(1, chunk.shape)[:, :, : few.shape[1] - first])
-            first += chunk.shape[1]
         at, fine = few.flatten(), Grid(grid.horizon, grid.steps * 2**halvings, grid.grading)
-        drawn = torch.cat(moves, dim=2).flatten(1, 2)
-        along = lambda n: path_integral(by, noise, x0[at[n]], fine.of(at[n]), drawn[:, n], weight)
-        integrals, end = in_pieces(along, torch.arange(len(at)), together, PATHS_PER_PIECE, long=True)
+        drawn = self._drawn(few.shape[1], halvings).flatten(1, 2)
+        along = lambda n: path_integral(dynamics, self.noise, self.x0[at[n]], fine.of(at[n]), drawn[:, n], self.weight)
+        integrals, end = in_pieces(along, torch.arange(len(at)), self.together, PATHS_PER_PIECE, long=True)
         return integrals.view_as(few), end
 
-    mass = weights.view_as(rows)
-    thinnings = max(1, rows.shape[1] // FEWEST_PATHS).bit_length() - 1
-    integrals, end = followed(0)
-    mean, coarse, before, bias = (mass * integrals).mean(dim=1), integrals, torch.zeros(()), math.inf
-    for halvings in range(1, min(MOST_HALVINGS, thinnings + HALVINGS_ON_FEWEST) + 1):
-        fine, _ = followed(halvings)
-        of = slice(fine.shape[1])
-        change = mass[:, of] * (fine - coarse[:, of])
-        mean = mean + change.mean(dim=1)
-        extrapolated = mean + change.mean(dim=1)
-        if halvings > 1:
-            moved = (2.0 * change - before[:, of]).flatten()
-            size, error = abs(float(moved.mean())), float(moved.std()) / math.sqrt(len(moved))
-            bias = max(REMAINDER * size, size + 2.0 * error)
-            chance = float(extrapolated.std()) / math.sqrt(replicates) if replicates > 1 else 0.0
-            if bias <= max(tolerance, GOOD_PART * chance):
-                break
-        coarse, before = fine, change
-    if audit is not None:
-        exact, _ = followed(0, audit, thinnings)
-        of = slice(exact.shape[1])
-        off = (mass[:, of] * (exact - integrals[:, of])).flatten()
-        bias += abs(float(off.mean())) + 2.0 * float(off.std()) / math.sqrt(len(off))
-    steps = grid.steps * 2**halvings
-    return Mean(integrals.flatten(), extrapolated - (mass * integrals).mean(dim=1), end, bias, steps)
+    def _drawn(self, count: int, halvings: int) -> Tensor:
+        """The increments of the first ``count`` paths of each replicate, ``(steps, replicates, count, motions)``."""
+        motions, first, moves = self.noise(self.x0[:1]).shape[-1], 0, []
+        for number, chunk in enumerate(self._rows.split(max(1, DRAWN_TOGETHER // self.replicates), dim=1)):
+            if first < count:
+                drawn = increments(self.grid.of(chunk.flatten()), motions, halvings, self.seed, number)
+                moves.append(drawn.unflatten(1, chunk.shape)[:, :, : count - first])
+            first += chunk.shape[1]
+        return torch.cat(moves, dim=2)

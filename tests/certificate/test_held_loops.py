@@ -139,11 +139,10 @@ def test_beside_a_held_control_a_worse_controller_stays_rough_and_what_is_rememb
     problem = Circle()
     efforts = []
 
-    def simulated(problem, policy, trajectories, *rest):
-        *_, doublings, audited = rest
-        assert audited
-        efforts.append((policy, trajectories, doublings))
-        return Simulation(problem, policy, trajectories, *rest)
+    def simulated(problem, policy, **how):
+        assert how["audited"]
+        efforts.append((policy, how["trajectories"], how["doublings"]))
+        return Simulation(problem, policy, **how)
 
     monkeypatch.setattr(candidates, "Simulation", simulated)
     held_one, away = optimal_held(problem, 0.05), lambda x: -problem.exact_control(x)

@@ -27,9 +27,9 @@ def test_with_noise_a_controller_that_is_clearly_worse_is_followed_shortly_even_
     """Without, so few trajectories are no work. The last ones are those of doing nothing."""
     problem, made = Manufactured(dim=1, noise=noise), []
 
-    def simulated(problem, policy, trajectories, *rest):
-        made.append(trajectories)
-        return Simulation(problem, policy, trajectories, *rest)
+    def simulated(problem, policy, **how):
+        made.append(how["trajectories"])
+        return Simulation(problem, policy, **how)
 
     monkeypatch.setattr(candidates, "Simulation", simulated)
     wild = lambda x: torch.full_like(x, 30.0)

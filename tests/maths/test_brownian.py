@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from ocp_torch.maths.brownian import Grid, discounted, expectation, increments, path_integral
+from ocp_torch.maths.brownian import Grid, Multilevel, discounted, increments, path_integral
 
 # An Ornstein-Uhlenbeck process `dx = -RATE x dt + SPREAD dW` from START, its cost x^2 discounted at RHO.
 RATE, SPREAD, START, RHO, HORIZON = 1.3, 0.5, 0.7, 2.0, 8.0
@@ -82,7 +82,9 @@ REPLICATES, PATHS = 8, 128
 
 def mean(dynamics, noise, x0, grid, weight, tolerance, seed):
     """The mean of all paths, its standard error and the bound on its bias."""
-    found = expectation(dynamics, noise, x0, torch.ones(len(x0)).double(), REPLICATES, grid, weight, tolerance, seed)
+    found = Multilevel(dynamics, noise, x0, torch.ones(len(x0)).double(), REPLICATES, grid, weight, seed).mean(
+        tolerance
+    )
     totals = found.integrals.view(REPLICATES, -1).mean(dim=1) + found.refinement
     return float(totals.mean()), float(totals.std()) / math.sqrt(REPLICATES), found.bias
 
@@ -101,17 +103,8 @@ def test_intervals_cover_an_ornstein_uhlenbeck_process():
 def test_refinement_takes_away_the_error_of_the_first_steps():
     """On 4 steps the mean is off by far more than its interval; halved and extrapolated it is within."""
     start = torch.full((REPLICATES * 1024, 1), START, dtype=torch.float64)
-    found = expectation(
-        dynamics,
-        constant,
-        start,
-        torch.ones(len(start)).double(),
-        REPLICATES,
-        equal(len(start), 8),
-        discounted(RHO),
-        1e-6,
-        3,
-    )
+    ones, grid = torch.ones(len(start)).double(), equal(len(start), 8)
+    found = Multilevel(dynamics, constant, start, ones, REPLICATES, grid, discounted(RHO), 3).mean(1e-6)
     value, error, bias = mean(dynamics, constant, start, equal(len(start), 8), discounted(RHO), 1e-6, 3)
     assert abs(float(found.integrals.mean()) - EXACT) > 5.0 * (2.365 * error + bias)
     assert abs(value - EXACT) <= 2.365 * error + bias

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from ocp_torch.maths.brownian import DRAWN_TOGETHER, Grid, at_random_times, discounted, expectation, path_integral
+from ocp_torch.maths.brownian import DRAWN_TOGETHER, Grid, Multilevel, at_random_times, discounted, path_integral
 
 RHO = 2.0
 
@@ -25,7 +25,7 @@ def test_groups_of_paths_from_one_start_are_independent():
     grid = Grid(torch.ones(count, dtype=torch.float64), 4, 1.0)
     noise = lambda x: torch.ones(len(x), 1, 1, dtype=x.dtype)
     dynamics = lambda x: (0.0 * x, x[:, 0])
-    run = lambda seed: expectation(dynamics, noise, x0, weights, 1, grid, discounted(RHO), 1.0, seed)
+    run = lambda seed: Multilevel(dynamics, noise, x0, weights, 1, grid, discounted(RHO), seed).mean(1.0)
     result, _, end, *_ = run(0)
     for values in (result, end[:, 0]):
         first, second = values[:DRAWN_TOGETHER], values[DRAWN_TOGETHER:]
@@ -45,7 +45,7 @@ def test_means_are_extrapolated_and_the_bias_covers_what_is_left(steps):
     finest = Grid(grid.horizon, 4 * steps, 1.0)
     moves = torch.zeros(4 * steps, 3, 1, dtype=torch.float64)
     plain = float(path_integral(dynamics, still, x0, finest, moves, discounted(RHO))[0].mean()) - exact
-    found = expectation(dynamics, still, x0, weights, 3, grid, discounted(RHO), math.inf, 0)
+    found = Multilevel(dynamics, still, x0, weights, 3, grid, discounted(RHO), 0).mean(math.inf)
     error, bias = float(found.integrals.mean() + found.refinement.mean()) - exact, found.bias
     assert abs(error) < 0.3 * abs(plain)
     assert abs(error) <= bias < 8.0 * abs(plain)

@@ -193,9 +193,9 @@ def test_looks_remember_the_controller_of_the_warm_start_until_its_weights_or_th
     trainer = small(*SWING, *WARM, *FEW, "method=dual")
     made = []
 
-    def simulated(problem, policy, *rest):
+    def simulated(problem, policy, **how):
         made.append(isinstance(policy, HeldPolicy))
-        return Simulation(problem, policy, *rest)
+        return Simulation(problem, policy, **how)
 
     monkeypatch.setattr(candidates, "Simulation", simulated)
 

@@ -58,8 +58,20 @@ def simulate_candidates(
             effort *= MORE_HELD
         if roughly:
             effort, tolerance, doublings = max(2, effort // BASELINE_PART), ROUGH_FACTOR * tolerance, ROUGH_DOUBLINGS
-        sets, how = (settings.replicates, seed, value, initial), (settings.horizon, tolerance, rounded, doublings)
-        return Simulation(problem, policy, effort, *sets, *how, settings.audited).run()
+        return Simulation(
+            problem,
+            policy,
+            trajectories=effort,
+            replicates=settings.replicates,
+            seed=seed,
+            value=value,
+            initial=initial,
+            horizon=settings.horizon,
+            tolerance=tolerance,
+            rounded=rounded,
+            doublings=doublings,
+            audited=settings.audited,
+        ).run()
 
     held = [name for name, candidate in candidates.items() if isinstance(candidate.policy, HeldPolicy)]
     many = problem.noisy or held or settings.trajectories * settings.replicates > CHEAP

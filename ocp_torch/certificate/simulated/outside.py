@@ -45,15 +45,16 @@ def time_outside(problem: Problem, policy: Policy, settings: CertificateSettings
     few = settings.trajectories // BASELINE_PART
     if not isinstance(problem, System) or not problem.chart.boxed or few < FEWEST_TRAJECTORIES:
         return None
-    effort = few, settings.replicates, seed
     found = Simulation(
         _clock(problem),
         policy,
-        *effort,
-        lambda x: torch.full_like(x[:, 0], VARIATE),
-        [VARIATE],
-        settings.horizon,
-        max(TOLERANCE, settings.tolerance),
+        trajectories=few,
+        replicates=settings.replicates,
+        seed=seed,
+        value=lambda x: torch.full_like(x[:, 0], VARIATE),
+        initial=[VARIATE],
+        horizon=settings.horizon,
+        tolerance=max(TOLERANCE, settings.tolerance),
     ).run()
     return replace(found.perf, value=max(0.0, found.perf.value - 1.0))
 

@@ -12,7 +12,7 @@ from ocp_torch.certificate.simulated.between import jumped_over
 from ocp_torch.certificate.simulated.held import held_integrals
 from ocp_torch.certificate.simulated.loops import FeedbackLoop, HeldLoop, Loop, Sliding
 from ocp_torch.certificate.simulated.steps import Steps
-from ocp_torch.maths.brownian import Grid, at_random_times, discounted, expectation
+from ocp_torch.maths.brownian import Grid, Multilevel, at_random_times, discounted
 from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.runge_kutta import (
@@ -115,15 +115,35 @@ class Paths:
             grid, weight = Grid(torch.full_like(self.mass, steps.horizon), steps.count, steps.grading), discounted(rho)
         else:
             grid, weight = Grid(times, steps.count, 1.0), at_random_times(rho)
-        of = self.loop.noise, self.state, self.mass, self.replicates, grid, weight, self.allowed, self.seed
+        paths = Multilevel(
+            dynamics=steps.taken_by(self.quick),
+            noise=self.loop.noise,
+            x0=self.state,
+            weights=self.mass,
+            replicates=self.replicates,
+            grid=grid,
+            weight=weight,
+            seed=self.seed,
+            together=self.together,
+        )
         exact = steps.taken_by(self.loop) if self._is_rounded else None
-        results, refinement, ends, error, finest = expectation(steps.taken_by(self.quick), *of, exact, self.together)
+        results, refinement, ends, error, finest = paths.mean(self.allowed, exact)
         worth = 0.0 if self.value is None else self.value(self.state[:, : self.loop.problem.dim])
         return Followed(results - worth, ends, refinement, error, self._wall(finest))
 
     def _held(self, loop: HeldLoop, quick: HeldLoop) -> Followed:
-        of = loop, quick, self.value, self.state, self.mass, self.replicates
-        results, ends, error = held_integrals(*of, self.steps.horizon, self.allowed, self._generator, self.together)
+        results, ends, error = held_integrals(
+            loop,
+            quick,
+            self.value,
+            self.state,
+            self.mass,
+            replicates=self.replicates,
+            horizon=self.steps.horizon,
+            tolerance=self.allowed,
+            generator=self._generator,
+            together=self.together,
+        )
         return Followed(results, ends, self._no_refinement, error, self._wall(self.steps.count))
 
     def _smooth(self) -> Followed:

@@ -217,7 +217,7 @@ class Simulation:
         )
 
     def _judged(self, paths: Paths) -> Simulated:
-        """What ``paths`` show. The bias is the error of integration (`refined`, with noise `expectation`), plus, where the
+        """What ``paths`` show. The bias is the error of integration (`refined`, with noise `Multilevel`), plus, where the
         horizon is truncated, the discount left there times the rate's supremum as met along the trajectories, with
         head-room; what states that no random path met may add; what is left of a mean that has no variance (`unmet_tail`);
         and all that any state may cost, where an audit shows a wall that the steps jump over (`jumped_over`)."""
