@@ -91,50 +91,85 @@ def fit_closed_loop(
     ``fields`` the policy is a given one in float64, and both `mu` and `V` are fitted in float32. ``pool`` gives samples of
     the closed loop, by default from evaluations at Sobol points.
     """
-    trained = None if fields is None else fields.value
+    value = None if fields is None else fields.value
     like = torch.zeros(()) if fields is None else next(fields.parameters())
     loop = ClosedLoop(problem, policy)
-    names = (LOG_OCCUPATION, VALUE) if trained is None else (LOG_OCCUPATION,)
-    known = getattr(trained, "embedding", None)  # its waves include those found in the slack of V
-    waves = known.mixed if isinstance(known, FourierEmbedding) else None
-    fitted = Fields.build(problem, names, network, derive_seed(seed, Branch.POLICY_EVALUATION, 0), waves).to(like)
-    if fields is not None and fields.log_occupation is not None:
-        fitted.log_occupation.load_state_dict(fields.log_occupation.state_dict())
     count = min(POOL, settings.steps * settings.batch)
     pool = pool or Pool(loop, derive_seed(seed, Branch.POLICY_EVALUATION, 1), like, count, double=fields is None)
-    judged = pool.samples.take(slice(EXCESS_STATES))
-    fixed = None if trained is None else LoweredSlack(loop, trained, judged)
-    if fixed is not None and problem.has_simulator:
-        fixed.climb(UNCHANGED, ASCENTS, ASCENT_STEPS)
-    hi, lo = (0.0, 0.0) if fixed is None else fixed.suprema()
-    steep = fixed is not None and max(hi, lo) > STEEP * fixed.unit
-    first, batch = (settings.rounds - 1, STEEP_FACTOR * settings.batch) if steep else (0, settings.batch)
-    enough = settings.good_excess * (STEEP_EARLY_PART if steep else EARLY_PART)
-    draw = lambda phase: pool.draw(batch)
-    objective, phase = PolicyEvaluation(loop, trained is None, positive_weight(hi, lo)), Phase(constants)
-    stepper, average = short_fit(fitted, objective, settings.lr, settings.steps * 2**first)
+    while True:
+        start = _start(problem, fields, network, seed).to(like)
+        fit = ClosedLoopFit(loop, start, value, pool, constants, settings)
+        if fit.done():
+            return fit.average.module
+        settings = replace(settings, lr=RESTART_FACTOR * settings.lr)
 
-    def excess() -> float:
+
+def _start(problem: Problem, fields: Fields | None, network: Callable[..., torch.nn.Module], seed: int) -> Fields:
+    """The fields that a fit starts from, see `fit_closed_loop`."""
+    value = None if fields is None else fields.value
+    names = (LOG_OCCUPATION, VALUE) if value is None else (LOG_OCCUPATION,)
+    known = getattr(value, "embedding", None)  # its waves include those found in the slack of V
+    waves = known.mixed if isinstance(known, FourierEmbedding) else None
+    start = Fields.build(problem, names, network, derive_seed(seed, Branch.POLICY_EVALUATION, 0), waves)
+    if fields is not None and fields.log_occupation is not None:
+        start.log_occupation.load_state_dict(fields.log_occupation.state_dict())
+    return start
+
+
+class ClosedLoopFit:
+    """A fit to ``loop`` from the fields ``start``, at one learning rate. ``value`` is the trained `V`, which stays as it is;
+    without one `V^u` is fitted too."""
+
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        start: Fields,
+        value: Field | None,
+        pool: "Pool | Drawn",
+        constants: Constants,
+        settings: StageSettings,
+    ) -> None:
+        self.loop, self.fitted, self.pool, self.settings = loop, start, pool, settings
+        self.judged = pool.samples.take(slice(EXCESS_STATES))
+        self.slack = None if value is None else LoweredSlack(loop, value, self.judged)
+        if self.slack is not None and loop.problem.has_simulator:
+            self.slack.climb(UNCHANGED, ASCENTS, ASCENT_STEPS)
+        hi, lo = (0.0, 0.0) if self.slack is None else self.slack.suprema()
+        steep = self.slack is not None and max(hi, lo) > STEEP * self.slack.unit
+        self.first, self.batch = (settings.rounds - 1, STEEP_FACTOR * settings.batch) if steep else (0, settings.batch)
+        self.enough = settings.good_excess * (STEEP_EARLY_PART if steep else EARLY_PART)
+        self.phase = Phase(constants)
+        objective = PolicyEvaluation(loop, value is None, positive_weight(hi, lo))
+        self.stepper, self.average = short_fit(start, objective, settings.lr, settings.steps * 2**self.first)
+
+    def done(self) -> bool:
+        """Make the rounds that are needed; false where `mu` collapses to 0."""
+        draw = lambda phase: self.pool.draw(self.batch)
+        for k in range(self.first, self.settings.rounds):
+            steps = self.settings.steps * 2**k
+            self.pool.grow(min(POOL, steps * self.batch))
+            for step in range(steps):
+                advance(self.stepper, self.average, draw, self.phase)
+                if k == self.first and self._is_good_after(step + 1):
+                    return True
+                if k == self.first and step == COLLAPSE_STEP and self._has_collapsed():
+                    return False
+            if self._excess() <= self.settings.good_excess:
+                break
+        return True
+
+    def _is_good_after(self, steps: int) -> bool:
+        return steps >= EXCESS_FIRST and steps % EXCESS_EVERY == 0 and self._excess() <= self.enough
+
+    def _has_collapsed(self) -> bool:
+        return self.settings.lr > LEAST_CHECKED_RATE and vanished(self.fitted.log_occupation, self.judged)
+
+    def _excess(self) -> float:
         """The size of `LoweredSlack.excess`, which is negative where another multiple of `mu` suits a `V` that is far off."""
-        value, log_mu = fixed.value if fixed else average.module.value, average.module.log_occupation
-        terms, *_ = terms_on(Generator.of(loop, judged), value, log_mu)
-        return abs((fixed or LoweredSlack(loop, value, judged)).excess(terms))
-
-    for k in range(first, settings.rounds):
-        steps = settings.steps * 2**k
-        pool.grow(min(POOL, steps * batch))
-        for step in range(steps):
-            advance(stepper, average, draw, phase)
-            due = k == first and step + 1 >= EXCESS_FIRST and (step + 1) % EXCESS_EVERY == 0
-            if due and excess() <= enough:
-                return average.module
-            looked_at = k == first and step == COLLAPSE_STEP and settings.lr > LEAST_CHECKED_RATE
-            if looked_at and vanished(fitted.log_occupation, judged):
-                slower = replace(settings, lr=RESTART_FACTOR * settings.lr)
-                return fit_closed_loop(problem, policy, fields, network, constants, slower, seed, pool)
-        if excess() <= settings.good_excess:
-            break
-    return average.module
+        fields = self.average.module
+        value = self.slack.value if self.slack else fields.value
+        terms, *_ = terms_on(Generator.of(self.loop, self.judged), value, fields.log_occupation)
+        return abs((self.slack or LoweredSlack(self.loop, value, self.judged)).excess(terms))
 
 
 @torch.no_grad()
