@@ -4,6 +4,7 @@ import torch
 
 from ocp_torch.problems.physical.disturbed import Disturbed
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.replaced import replaced
 
 # States that are tried; elsewhere the noise may not be 0, so that only a sentence follows.
 ASKED = 4096
@@ -20,6 +21,6 @@ def idle_noise(problem: Problem) -> str | None:
     sigma = problem.noise(*problem.probe(ASKED, DESIGN, "x"))
     if sigma is None or bool(sigma.any()):
         return None
-    written = isinstance(problem, Disturbed) and type(problem).noise is Disturbed.noise
+    written = isinstance(problem, Disturbed) and not replaced(problem, "noise", Disturbed)
     name = "disturbance" if written else "noise"
     return f"{name} is 0 at all of {ASKED:,} states that were tried; where there is no noise it must give None"

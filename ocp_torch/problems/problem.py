@@ -19,6 +19,7 @@ from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.physical.measures import Measures
 from ocp_torch.problems.placed import Placed
 from ocp_torch.problems.played import Played
+from ocp_torch.problems.replaced import replaced
 from ocp_torch.problems.reproducible import Reproducible
 from ocp_torch.problems.samples import Samples, driven
 
@@ -136,9 +137,8 @@ class Problem(Reproducible, Placed, Played):
     def noise_divergences(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
         """`div D` ``(N, d)``, with components `sum_j d_j D_ij`, and its divergence ``(N,)``, where there is noise: by
         autograd through `noise`. An override may give known formulas, or `None` where they are unknown."""
-        if type(self).noise is Problem.noise:
-            return torch.zeros_like(x), torch.zeros_like(x[:, 0])
-        return jets.diffusion_divergences(self.noise, x)
+        constant = torch.zeros_like(x), torch.zeros_like(x[:, 0])
+        return jets.diffusion_divergences(self.noise, x) if replaced(self, "noise", Problem) else constant
 
     def initial_density(self, x: Tensor) -> Tensor:
         """Density `mu0` of the initial state, ``(N,)``, with mean 1 over the torus; uniform unless overridden."""
@@ -163,8 +163,8 @@ class Problem(Reproducible, Placed, Played):
 
     @property
     def driftless(self) -> bool:
-        """Whether `a = 0`: true exactly when `drift` is not overridden, unless a subclass knows better."""
-        return type(self).drift is Problem.drift
+        """Whether `a = 0`: true exactly when `drift` is not replaced, unless a subclass knows better."""
+        return not replaced(self, "drift", Problem)
 
     def drift_divergence(self, x: Tensor) -> Tensor | None:
         """`div a`, ``(N,)``: by autograd through `drift`. An override may give a known formula, or `None` where unknown."""
@@ -172,7 +172,7 @@ class Problem(Reproducible, Placed, Played):
 
     def control_divergence(self, x: Tensor) -> Tensor | None:
         """The divergence of each column of `B`, ``(N, m)``; by forward-mode autograd unless `B` is constant."""
-        if type(self).control_matrix is Problem.control_matrix:
+        if not replaced(self, "control_matrix", Problem):
             return x.new_zeros(len(x), self.control_dim)
         basis = torch.eye(self.dim, dtype=x.dtype, device=x.device)
         along = lambda e: torch.func.jvp(self.control_matrix, (x,), (e.expand_as(x),))[1]

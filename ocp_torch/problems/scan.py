@@ -12,6 +12,7 @@ from torch import Tensor
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.maths.supremum import climb
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.replaced import replaced
 
 # States scanned at once, which bounds the memory.
 CHUNK = 2**16
@@ -67,9 +68,9 @@ def _columns(problem: Problem, x: Tensor) -> Tensor:
     columns = [problem.state_cost(x).unsqueeze(-1)]
     if not problem.driftless:
         columns.append(problem.drift(x))
-    if type(problem).control_matrix is not Problem.control_matrix:
+    if replaced(problem, "control_matrix", Problem):
         columns.append(problem.control_matrix(x).flatten(1))
-    if type(problem).noise is not Problem.noise and (sigma := problem.noise(x)) is not None:
+    if replaced(problem, "noise", Problem) and (sigma := problem.noise(x)) is not None:
         columns.append(sigma.flatten(1))
     return torch.cat(columns, dim=1)
 

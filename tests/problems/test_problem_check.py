@@ -5,6 +5,7 @@ import time
 import pytest
 import torch
 
+from ocp_torch import Angle, Problem, System
 from ocp_torch.errors import InputError
 from ocp_torch.maths.cores import cores
 from ocp_torch.problems import Simulator
@@ -12,7 +13,7 @@ from ocp_torch.problems.checks.check import check_once
 from ocp_torch.problems.checks.mass import sampled_mass
 from ocp_torch.runs.build import build_problem
 from support import hostile_problems
-from support.hostile_problems import LEGAL, REFUSED, Good, with_
+from support.hostile_problems import LEGAL, REFUSED, TURN, Good, column, with_
 from support.refusals import refused
 
 
@@ -26,6 +27,49 @@ def test_a_slip_is_one_sentence_that_says_where(name):
 @pytest.mark.parametrize("name", LEGAL)
 def test_what_is_legal_is_let_through(name):
     check_once(LEGAL[name]())
+
+
+def test_functions_of_the_object_itself_count_as_those_of_its_class():
+    problem, x = Plain(2, 2), torch.rand(5, 2, dtype=torch.float64)
+    assert problem.driftless
+    problem.drift = lambda x: 0.3 * torch.ones_like(x)  # of divergence 0, so that no difference shows it
+    check_once(problem)
+    assert not problem.driftless
+    problem.drift = lambda x: torch.sin(TURN * x)
+    problem.control_matrix = lambda x: torch.diag_embed(2.0 + torch.cos(TURN * x))
+    problem.noise = lambda x: column()(problem, x)
+    check_once(problem)
+    for divergence in (problem.drift_divergence(x), problem.control_divergence(x), problem.noise_divergences(x)[0]):
+        assert float(divergence.detach().abs().max()) > 0.0
+    problem.initial_density = lambda x: 1.5 * torch.ones_like(x[:, 0])
+    with refused("initial_density of .*Plain integrates to 1.5"):
+        check_once(problem)
+
+
+class Plain(Problem):
+    def state_cost(self, x):
+        return 1.0 + torch.cos(TURN * x[:, 0])
+
+
+def test_a_disturbance_of_the_object_itself_is_noise():
+    system = Gusty()
+    assert not system.noisy
+    system.disturbance = lambda s: torch.ones_like(s)[..., None]
+    assert system.noisy
+    assert float(system.noise(torch.rand(3, 1, dtype=torch.float64)).min()) == pytest.approx(1.0 / TURN)
+    system.drift = lambda x: 0.5 * torch.ones_like(x)
+    assert float(system.vector_fields(torch.rand(3, 1))[0].min()) == 0.5
+
+
+class Gusty(System):
+    def __init__(self):
+        super().__init__([Angle("phase")], ["rate"])
+
+    def cost(self, s):
+        return 1.0 + s[:, 0].cos()
+
+    def dynamics(self, s):
+        return 0.0 * s, torch.ones_like(s)[..., None]
 
 
 def kept(self, x):

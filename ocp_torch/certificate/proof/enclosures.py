@@ -27,6 +27,7 @@ from ocp_torch.problems.exact.manufactured import Manufactured
 from ocp_torch.problems.exact.torus import Torus
 from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.replaced import replaced
 
 # Data evaluated at one state are taken to be right up to so much, relative to 1 + their size: 2^16 units in the last place
 # of float64 are left to the rounding of the user's formula.
@@ -57,7 +58,7 @@ def lipschitz_enclosure(problem: Problem, box: Box) -> Enclosure | None:
         value: Tensor | None = getattr(problem, name)(box.centre)
         if value is None:  # no noise
             continue
-        if getattr(type(problem), name) is getattr(Problem, name) and name not in vars(problem):
+        if not replaced(problem, name, Problem):
             constant = 0.0
         if constant is None:
             return None

@@ -20,6 +20,7 @@ from ocp_torch.maths.seeds import Branch, derive_seed, fixed_generator
 from ocp_torch.maths.supremum import batched
 from ocp_torch.problems.blame import place
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.replaced import replaced
 
 CHECKED_PATHS = 64
 # States checked on each step: on steps of a fiftieth of a turn 20 of the paths show a wall a thousandth of a turn thick.
@@ -48,7 +49,7 @@ def jumped_over(loop: Loop, steps: Steps, state: Tensor, taken: Tensor, seed: in
     elif problem.scan_factor:  # problems of the package have neither walls nor such noise
         if bool((spread(state[rows]) == 0.0).any()):
             speeds[turns] = lambda states: loop(states)[0][:, : problem.dim] * (spread(states) == 0.0)
-        if type(problem).noise is not Problem.noise:
+        if replaced(problem, "noise", Problem):
             speeds[ends] = spread
     for path in _paths(loop, steps, state[rows], taken[rows] * steps.multiples[rows], seed) if speeds else ():
         for what, speed in speeds.items():

@@ -13,6 +13,7 @@ from ocp_torch.maths.seeds import Branch, derive_seed, fixed_generator
 from ocp_torch.problems.checks.functions import Functions
 from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.replaced import replaced
 from ocp_torch.problems.simulator.simulator import Simulator
 
 Density = Callable[[Tensor], Tensor]
@@ -71,7 +72,7 @@ class Mass:
 def require_mass(functions: Functions) -> None:
     """Raise where `mu0` certainly does not integrate to 1."""
     problem = functions.problem
-    known = type(problem).initial_density in (Problem.initial_density, System.initial_density)
+    known = not replaced(problem, "initial_density", Problem, System)
     if known or (isinstance(problem, Simulator) and not problem._oracle.gives_mu0):
         return
     found = sampled_mass(lambda x: functions.ask("initial_density", x), problem.dim, functions.count // 4)

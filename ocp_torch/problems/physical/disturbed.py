@@ -6,6 +6,7 @@ from torch import Tensor
 from ocp_torch.maths import jets
 from ocp_torch.problems.physical.chart import Chart
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.replaced import replaced
 
 
 class Disturbed(Problem):
@@ -30,7 +31,7 @@ class Disturbed(Problem):
     @property
     def _constant(self) -> bool:
         """Whether the disturbance is the same everywhere."""
-        return type(self).disturbance is Disturbed.disturbance
+        return not replaced(self, "disturbance", Disturbed)
 
     def _disturbance_at(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
         """Physical states and `disturbance` there; ``x`` and `None` where there is no disturbance."""

@@ -17,6 +17,7 @@ from ocp_torch.problems.physical.measures import Measures
 from ocp_torch.problems.physical.prices import positive_each, scaled_limit, weight_roots
 from ocp_torch.problems.physical.start import Density, Start, start_density
 from ocp_torch.problems.problem import VectorFields
+from ocp_torch.problems.replaced import replaced
 
 # States at which the largest cost in the box is sought.
 COST_STATES = 2**14
@@ -168,8 +169,8 @@ class System(Disturbed):
         return self.from_torus(x) if self.chart.boxed else x * self.chart.lengths(x)
 
     def vector_fields(self, x: Tensor, divergences: bool = True) -> VectorFields:
-        """`Problem.vector_fields` from one evaluation of `dynamics`, unless a subclass overrides one of its parts."""
-        if any(getattr(type(self), name) is not getattr(System, name) for name in TOGETHER):
+        """`Problem.vector_fields` from one evaluation of `dynamics`, unless a function of one's own replaces one of its parts."""
+        if any(replaced(self, name, System) for name in TOGETHER):
             return super().vector_fields(x, divergences)
         return self._together(x, divergences)
 
@@ -211,7 +212,7 @@ class System(Disturbed):
 
     @property
     def initial_mixture(self) -> Mixture | None:
-        if type(self).initial_density is not System.initial_density:
+        if replaced(self, "initial_density", System):
             return None
         return getattr(self._density, "mixture", None)
 

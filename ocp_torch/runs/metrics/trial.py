@@ -14,6 +14,7 @@ from ocp_torch.files.storage import write_atomically
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
+from ocp_torch.problems.replaced import replaced
 from ocp_torch.problems.starts import drawn_starts, starts_narrowly
 from ocp_torch.runs.metrics.classical import classical_policy
 from ocp_torch.runs.metrics.measures import admissible, has_metrics, measure, simulate
@@ -72,7 +73,7 @@ def metrics(problem: Problem, policy: Policy, seed: int = 0, starts: int = START
 
 def random_starts(problem: Problem, count: int, seed: int) -> Tensor:
     """Starts ``(count, d)``, float64: from `mu0` where it is narrow or in a box, else uniform; admissible if enough are."""
-    own_start = type(problem).initial_density is not System.initial_density
+    own_start = replaced(problem, "initial_density", System)
     boxed = isinstance(problem, System) and bool(problem.chart.boxed) and not own_start
     if boxed or starts_narrowly(problem):
         x = drawn_starts(problem, DRAWN * count, seed)
