@@ -24,14 +24,14 @@ from ocp_torch.problems.physical.system import System
 
 SCHEMA = 3  # of a controller's file, raised when an older version could not read what is written
 # Attributes of a controller that the file holds as they are.
-SAVED_AS_IS = ("model", "occupation", "kind", "certificate", "config")
+SAVED = ("model", "occupation", "kind", "certificate", "config")
 # Controls are returned in the type of the states.
 States = TypeVar("States", Tensor, np.ndarray)
 
 
 @dataclass(repr=False)
 class Controller:
-    """The controls `u(x)` of a run, with all that they came from.
+    """A controller `u(x)`, with all that it came from.
 
     ``kind`` says which policy `u` is: ``value`` (from `V` alone), ``density`` (`w / mu`), ``minimised`` (`w / mu` with the
     `mu` of Lemma 2 in place of the trained one), ``trajectories`` (best for a whole step, from the `V` of the warm start) or
@@ -125,7 +125,7 @@ class Controller:
             "dtype": str(next(self.fields.parameters()).dtype).removeprefix("torch."),
             "fields": list(self.fields.networks),
             "bounds": asdict(self.constants),
-            **{name: getattr(self, name) for name in SAVED_AS_IS},
+            **{name: getattr(self, name) for name in SAVED},
         }
         save_tensors(Path(path), dict(self.fields.state_dict()), metadata)
 

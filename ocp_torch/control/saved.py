@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from ocp_torch.control.controller import SAVED_AS_IS, SCHEMA, Controller
+from ocp_torch.control.controller import SAVED, SCHEMA, Controller
 from ocp_torch.control.described import problem_name, require_same
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE
 from ocp_torch.errors import InputError, notes
@@ -72,7 +72,7 @@ def _rebuilt(path: Path, tensors: dict, metadata: dict, problem: Problem | None,
     fields.load_state_dict(tensors)
     fields = fields.to(device).requires_grad_(False)
     constants = Constants(**{**metadata["bounds"], "warnings": notes(metadata["bounds"]["warnings"])})
-    return Controller(problem, fields, constants, **{name: metadata[name] for name in SAVED_AS_IS})
+    return Controller(problem, fields, constants, **{name: metadata[name] for name in SAVED})
 
 
 def _problem_of(path: Path, metadata: dict, problem: Problem | None) -> Problem:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError
 
-PARTS_PER_EDGE = 8  # equal ones, between two of which a box may be split
+BINS = 8  # equal parts of an edge, between two of which a box may be split
 LEAST_STATES = 24  # on each side of a split: the density rests on their mean
 LEAST_GAIN = 1e-3  # part by which a split lowers the sum over all boxes
 
@@ -142,16 +142,10 @@ def _best_cut(x: np.ndarray, square: np.ndarray, low: np.ndarray, size: np.ndarr
     n, dim = x.shape
     if n < 2 * LEAST_STATES:
         return None
-    bins = np.clip(((x - low) / size * PARTS_PER_EDGE).astype(int), 0, PARTS_PER_EDGE - 1) + PARTS_PER_EDGE * np.arange(
-        dim
-    )
-    within = lambda each: (
-        np.bincount(bins.ravel(), np.repeat(each, dim), dim * PARTS_PER_EDGE)
-        .reshape(dim, PARTS_PER_EDGE)
-        .cumsum(axis=1)
-    )
+    bins = np.clip(((x - low) / size * BINS).astype(int), 0, BINS - 1) + BINS * np.arange(dim)
+    within = lambda each: np.bincount(bins.ravel(), np.repeat(each, dim), dim * BINS).reshape(dim, BINS).cumsum(axis=1)
     count, mass = within(np.ones(n))[:, :-1], within(square)[:, :-1]
-    part = np.arange(1, PARTS_PER_EDGE) / PARTS_PER_EDGE
+    part = np.arange(1, BINS) / BINS
     halves = np.sqrt(part * mass) + np.sqrt((1.0 - part) * (square.sum() - mass).clip(0.0))
     gain = np.sqrt(size.prod()) * (np.sqrt(square.sum()) - halves)
     gain[(count < LEAST_STATES) | (n - count < LEAST_STATES)] = 0.0

@@ -22,8 +22,8 @@ REACH_STEP = 3e-3  # the first step of such ascents
 # Part of the starts from which each stage of such ascents goes on, and its steps: as sure as 24 steps from all starts, in two
 # thirds of the time.
 STAGES = ((1.0, 8), (0.25, 16))
-GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
-NARROWINGS = 26  # of the interval of `minimiser` by the golden section: 4e-6 of it is left
+GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)  # the golden section
+NARROWINGS = 26  # of the interval of `minimiser` by it: 4e-6 of the interval is left
 
 
 @dataclass(frozen=True)

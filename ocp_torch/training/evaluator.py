@@ -45,7 +45,7 @@ QUICK = QuickSettings(
 FULL_OVER_QUICK = 6.0
 # Seconds per state where `V` is trained on for its bound, relative to training: a unicycle's step took 24 ms for 2,048 states
 # there, 10 ms for 512 in training.
-TIGHTENING_OVER_TRAINING = 0.6
+STATE_COST = 0.6
 
 
 @dataclass(eq=False)
@@ -86,9 +86,7 @@ class Evaluator:
         states = float(stage.steps * stage.batch)
         if settings.searches(state.constants) and self.trained.fields.value is not None and self.problem.has_simulator:
             longest = STEEP_FACTOR * 2 ** (stage.rounds - 1)  # as beside kinks
-            states = states * longest + TIGHTENING_OVER_TRAINING * new_states(
-                self.problem, settings.points, settings.bound_steps
-            )
+            states = states * longest + STATE_COST * new_states(self.problem, settings.points, settings.bound_steps)
         return FULL_OVER_QUICK * self.seconds + states * state.seconds / max(state.samples, 1)
 
     def reaches(self, gap: float, run: Run) -> bool:

@@ -53,8 +53,8 @@ class Evaluation:
         return cls(step, gap, perf[1] if perf else None, noise, supposed)
 
     def better_than(self, other: "Evaluation | None", sure: bool = False) -> bool:
-        """Whether this has the smaller gap, or the smaller performance where neither has a gap; with ``sure``, by more than
-        the noise of both, and not where the other would have the smaller gap if `F_M` counts."""
+        """Whether this has the only or the smaller gap, or the smaller performance where neither has a gap; with ``sure``, by
+        more than the noise of both, and not where the other would have the smaller gap if `F_M` counts."""
         if other is None:
             return self.gap is not None or self.perf is not None
         if sure and self.supposed is not None and other.supposed is not None and self.supposed > other.supposed:

@@ -31,7 +31,7 @@ class TrainerSettings:
     figures: bool  # draw figures at the end and in TensorBoard
     progress: bool  # a progress bar, where the output is a terminal
     newton_steps: int = 0  # Gauss-Newton steps on V at the end of a round; runs from before there were any do not say
-    newton_after: int = 0  # steps of the first round after which they are tried early, and may end it; 0 for never
+    newton_after: int = 0  # steps of the first round after which they are tried, and may end training; 0 for never
     effort: float = 1.0  # by which null steps of training, warm start and certificate have been multiplied
     graphs: bool = True  # on a GPU, steps are replayed from CUDA graphs; runs from before there were any do not say
 

@@ -23,19 +23,7 @@ from ocp_torch.training.warm_start.iteration import ValueIteration
 # What learning rates depend on: where it differs at a resume, the rates are those of the new configuration.
 rates_of = lambda config: (config["optimizer"], config["schedule"], config["trainer"]["steps"])
 # Attributes that are saved as they are.
-SAVED_AS_IS = (
-    "config",
-    "step",
-    "round",
-    "samples",
-    "seconds",
-    "elapsed",
-    "pending",
-    "retry",
-    "ended",
-    "refined",
-    "solved",
-)
+SAVED = ("config", "step", "round", "samples", "seconds", "elapsed", "pending", "retry", "ended", "refined", "solved")
 
 
 @dataclass
@@ -67,7 +55,7 @@ class TrainState:
         constants = self.constants
         return {
             **dict(zip(("problem", "method"), self.names, strict=True)),
-            **{name: getattr(self, name) for name in SAVED_AS_IS},
+            **{name: getattr(self, name) for name in SAVED},
             "bounds": {"M": constants.M, "warnings": list(constants.warnings), "unbounded": constants.unbounded},
             "fields": self.fields.state_dict(),
             "average": self.average.state_dict(),

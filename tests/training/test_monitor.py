@@ -15,7 +15,7 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.finish import glimpse
 from ocp_torch.runs.run import run_to_end
-from ocp_torch.training.evaluator import TIGHTENING_OVER_TRAINING
+from ocp_torch.training.evaluator import STATE_COST
 from ocp_torch.training.monitor import Monitor, Stages, liouville_residual
 from ocp_torch.training.running import RunningEstimates
 from support.small import METHODS, small
@@ -154,5 +154,5 @@ def test_the_time_that_is_told_counts_what_the_certificate_trains(monkeypatch):
     evaluator.seconds, trainer.state.seconds, trainer.state.samples = 2.0, 3.0, 1000
     assert evaluator.expected(plain) == pytest.approx(6.0 * 2.0 + 5000 * 0.003)
     searched = evaluator.expected(replace(plain, mollify=None))
-    assert searched == pytest.approx(6.0 * 2.0 + (STEEP_FACTOR * 5000 + TIGHTENING_OVER_TRAINING * 40 * 2048) * 0.003)
+    assert searched == pytest.approx(6.0 * 2.0 + (STEEP_FACTOR * 5000 + STATE_COST * 40 * 2048) * 0.003)
     assert evaluator.expected(replace(plain, mollify=None, points=1024)) < searched

@@ -156,7 +156,7 @@ class ValueIteration:
         return {name: tensor.detach().clone() for name, tensor in self.average.state_dict().items()}
 
     def state_dict(self) -> dict:
-        plain = {name: getattr(self, name) for name in SAVED_AS_IS}
+        plain = {name: getattr(self, name) for name in SAVED}
         if self.done:  # what is left of it is in the fields
             return plain
         modules = {name: getattr(self, name).state_dict() for name in ("network", "average", "optimizer")}
@@ -170,7 +170,7 @@ class ValueIteration:
 
     def load_state_dict(self, state: dict) -> None:
         """Restore what `state_dict` gave. Raises `InputError` where its states are no states of the problem."""
-        for name in SAVED_AS_IS:
+        for name in SAVED:
             setattr(self, name, type(getattr(self, name))(state[name]))
         if self.done:
             return
@@ -183,4 +183,4 @@ class ValueIteration:
 
 
 # Attributes that are saved as they are.
-SAVED_AS_IS = ("round", "done", "found", "loss", "cost", "least")
+SAVED = ("round", "done", "found", "loss", "cost", "least")
