@@ -14,8 +14,8 @@ T = TypeVar("T")
 class Ahead(Generic[T]):
     """The value that the generator ``work`` returns, whose yields part it into pieces after which it can be stopped.
 
-    Whoever asks for the `answer` does the work, unless it was begun before in a thread of its own. The answer is the same:
-    ``work`` must share nothing with what goes on beside it but what neither changes, and no global random numbers.
+    A call of `answer` does the work, unless it was begun before in a thread of its own. The answer is the same: ``work`` must
+    use no global random numbers, and share only what is not changed with what goes on beside it.
     """
 
     def __init__(self, work: Generator[None, None, T]) -> None:
@@ -57,5 +57,5 @@ class Ahead(Generic[T]):
                 next(self._work)
         except StopIteration as end:
             self._answer.append(end.value)
-        except BaseException as error:  # for whoever asks
+        except BaseException as error:  # raised by `answer`
             self._error = error

@@ -51,10 +51,10 @@ def side_by_side(function: Callable[[T], S], pieces: Sequence[T], together: bool
         # A thread would take as many of PyTorch's as there are cores, not as are set: slower, and sums in another order.
         if torch.get_num_threads() != threads:
             torch.set_num_threads(threads)
-        for k, piece in left:  # whoever is free takes the next
+        for k, piece in left:  # each thread that is free takes the next
             try:
                 found[k] = function(piece)
-            except BaseException as error:  # for whoever asked
+            except BaseException as error:  # raised in the calling thread
                 failed[k] = error
                 return
 

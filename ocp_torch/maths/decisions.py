@@ -56,7 +56,7 @@ class Told(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if _makes(func, args) or func is Tensor.to and args[0].is_cpu and _leaves_cpu(args[1:], kwargs):
-            return next(self.constants).clone()  # whoever is given it may change it
+            return next(self.constants).clone()  # the function may change it
         return func(*args, **(kwargs or {}))
 
 

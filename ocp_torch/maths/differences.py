@@ -1,4 +1,4 @@
-"""A function that nobody can differentiate as one that autograd can: its derivatives are central differences."""
+"""Functions without derivatives of their own, made differentiable for autograd by central differences."""
 
 from collections.abc import Callable
 

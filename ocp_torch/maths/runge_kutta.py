@@ -26,7 +26,7 @@ GOOD_PART = 0.1
 # the circle took half of the time, for an error of 5.5e-7 in place of 5.8e-7.
 RELEVANT_PART = 0.2
 AUDITED = 64  # random trajectories that are integrated again
-AUDIT_FACTOR = 4  # with steps so many times finer than at first
+AUDIT_FACTOR = 4  # least factor by which their steps are then finer than at first
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Refined(NamedTuple):
 
 
 def in_finer_steps(integrate: Integrate, times: Tensor) -> Integrate:
-    """``integrate`` with so many ``times`` ``(N,)`` the steps that it is asked for, at least 1, trajectory by trajectory."""
+    """``integrate`` with ``times`` ``(N,)``, at least 1, as many steps as it is asked for, trajectory by trajectory."""
 
     def each(rows: Tensor, steps: int) -> tuple[Tensor, Tensor]:
         wanted = times[rows]

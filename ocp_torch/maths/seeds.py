@@ -65,7 +65,7 @@ def fixed_generator(number: int = 0) -> torch.Generator:
 def generators_kept() -> Iterator[None]:
     """A context after which the process's own generators, of PyTorch, NumPy and Python, are as they were before."""
     states = np.random.get_state(), random.getstate()  # noqa: NPY002
-    # Where nobody has used a GPU yet it has no generator to keep.
+    # A GPU that was not used yet has no generator to keep.
     used = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
     try:
         with torch.random.fork_rng(devices=used):

@@ -1,4 +1,4 @@
-r"""The dual with an exact penalty, D(M) (section 4.1 of the paper), and the bound without `M` where no `M` will do."""
+r"""The dual with an exact penalty, D(M) (section 4.1 of the paper), and the bound without `M` where no `M` is known."""
 
 from torch import Tensor
 

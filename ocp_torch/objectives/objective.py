@@ -21,14 +21,14 @@ CLOSED, SADDLE, NETWORK = "closed", "saddle", "network"
 # Where no `M` is known to be large enough, the weight of the penalty grows geometrically to `M` during each round.
 LEAST_WEIGHT = 1.0 / 20.0  # part of `M` at the start of a round; a heavier one leaves `V` stuck far below `V*`
 GROWTH_PART = 0.7  # part of a round in which it grows; a longer growth leaves `V` less time to become feasible
-# There the squared slack weighs so many times as much from the second round on: the simulated gap of dubins was 1.42 %
-# without this factor, and 1.06 % with it.
+# Factor of the squared slack's weight there, from the second round on: the simulated gap of dubins was 1.42 % without it,
+# and 1.06 % with it.
 LATER_RESIDUAL = 32.0
 
 
 @dataclass(frozen=True)
 class Phase:
-    """Made by whoever trains, at each step, and passed on to losses: an objective has neither a clock nor a state.
+    """The state of training at a step, passed on to losses: an objective has neither a clock nor a state.
 
     ``constants`` are `M`, `C_V` and `C_u` in force; ``progress`` is the part of the present round that is done, in [0, 1];
     the samples are one of ``shares`` equal parts of a batch; ``growing`` is the `growth`, where that is a tensor; ``later``

@@ -36,7 +36,7 @@ DIFFERENCE = 1e-3
 # Residuals of smooth solutions grow up to threefold at first. Beside a kink the first step makes them a hundred times as
 # large, and no other is made.
 LARGEST_GROWTH = 10.0
-# After so many steps residuals of smooth solutions had fallen to .5 or less of what they were, in 1 to 64 coordinates; with
+# At this step residuals of smooth solutions had fallen to .5 or less of what they were, in 1 to 64 coordinates; with
 # kinks in 5 and 6 they stayed at .8 or more.
 CHECKED_STEP = 12
 FALLEN_TO = 0.6

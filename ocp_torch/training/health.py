@@ -69,7 +69,7 @@ class Evaluation:
         return self.perf is not None
 
     def in_words(self) -> str:
-        """What fields are judged by, as a user is told."""
+        """The gap or performance that fields are judged by, as words for the user."""
         if self.gap is not None:
             return f"a gap of {100 * self.gap:.3g} %"
         return f"a performance of {math.nan if self.perf is None else self.perf:.6g}"
@@ -158,5 +158,5 @@ def sanity_warnings(problem: Problem, constants: Constants, certificate: Certifi
 def best_constant(problem: Problem, constants: Constants, seed: int) -> float:
     """`max_c F_M(c) = max_c c - M E[(c - f)_+]` over constants `c`, reached at the `1 / M` quantile of `f`."""
     f, weight = problem.probe(CONSTANT_STATES, derive_seed(seed, Branch.BEST_CONSTANT), "f", "weight")
-    c = torch.quantile(f, min(1.0, 1.0 / constants.M))  # any c gives a lower bound: that of unweighted states will do
+    c = torch.quantile(f, min(1.0, 1.0 / constants.M))  # any c gives a bound, also this one of unweighted states
     return float(c - constants.M * (weight * (c - f).clamp_min(0.0)).mean())

@@ -71,7 +71,7 @@ class Monitor(Silent):
         self.bar = tqdm(total=max(trainer.end, step), initial=step, unit="step", dynamic_ncols=True, disable=hidden)
         self.stages = Stages(hidden)
         self._folder = folder
-        # What is drawn at a quick evaluation, by name; whoever has a room for figures says how.
+        # Makes the pictures of a quick evaluation, by name; set by the run, which knows how to draw.
         self.pictures: Callable[[Trainer], dict[str, Any]] = lambda _: {}
         self._shown: dict[str, str] = {}
         self._mark = (time.perf_counter(), trainer.samples)

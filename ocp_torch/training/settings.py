@@ -27,7 +27,7 @@ class TrainerSettings:
     checkpoint_every: int  # steps between checkpoints; 0 for one at the end
     keep: int  # checkpoints kept: last.pt, last-1.pt, ...
     target_gap: float | None  # stop once this certified gap is reached; null for never
-    max_seconds: float | None  # stop training after so many seconds, those before a resume included; null for never
+    max_seconds: float | None  # of training, those before a resume included; null for no limit
     figures: bool  # draw figures at the end and in TensorBoard
     progress: bool  # a progress bar, where the output is a terminal
     newton_steps: int = 0  # Gauss-Newton steps on V at the end of a round; runs from before there were any do not say

@@ -13,7 +13,7 @@ from ocp_torch.training.state import TrainState
 STEPS, TARGET_GAP, MAX_SECONDS = "steps", "target_gap", "max_seconds"
 SOLVED = "solved"  # Gauss-Newton steps found the solution before all others were made
 NOT_FINITE, FAILED = "not_finite", "failed"
-ASKED = "callback"  # whoever watches asked for it
+ASKED = "callback"  # the user's callback asked for it
 # After a full certificate that did not reach the target gap, the next is tried at this multiple of the step: even a long run
 # makes few, and stops at most a quarter later than it could.
 RETRY_FACTOR = 1.25
@@ -82,7 +82,7 @@ class Signals:
         self._before: dict = {}
 
     def __enter__(self) -> "Signals":
-        # Only the main thread may; elsewhere whoever runs this decides what a signal does.
+        # Only the main thread may set handlers; elsewhere the calling program decides what a signal does.
         if threading.current_thread() is threading.main_thread():
             self._before = {number: signal.signal(number, self._caught) for number in CAUGHT_SIGNALS}
         return self
