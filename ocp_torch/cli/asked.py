@@ -1,4 +1,4 @@
-"""What is asked for from Python, as the command line would ask for it: the same names, the same configuration."""
+"""Requests from Python turned into those of the command line: the same names, the same configuration."""
 
 import contextlib
 import re
@@ -20,18 +20,18 @@ from ocp_torch.problems import PROBLEMS, Problem
 from ocp_torch.problems.blame import named
 from ocp_torch.problems.commands import LONGEST, PACKAGE, as_typed
 
-# A problem, or the name of one, as in circle or my_module.MyProblem.
+# A problem, or the name of one, such as circle or my_module.MyProblem.
 Asked = Problem | str
 FIELD = re.compile(r"[A-Za-z_]\w*([./][A-Za-z_]\w*)*")
-# The advice for a command line that adds an argument.
+# Advice in error messages that makes no sense in Python.
 ADDED = re.compile(r"; write \+\S+=\.\.\. to add an argument of your own")
-# What Hydra keeps in a process of the application it is in.
+# Hydra's global state.
 APPLICATION = (GlobalHydra, HydraConfig, VersionBase)
 
 
 def data_of(config_name: str, problem: Asked, parameters: Mapping[str, Any], settings: Mapping[str, Any]) -> dict:
-    """The plain configuration ``config_name`` of ``problem``, or of the one of that name with ``parameters``, and with
-    ``settings`` by dotted names. Raises `InputError` as the command line does."""
+    """The plain configuration ``config_name`` of ``problem``, an object or a name with ``parameters``, with ``settings`` by
+    dotted names. Raises `InputError` as the command line does."""
     fields = flat(settings)
     given = isinstance(problem, Problem)
     if not given and not isinstance(problem, str):
@@ -59,7 +59,7 @@ def data_of(config_name: str, problem: Asked, parameters: Mapping[str, Any], set
 
 
 def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """``settings`` on one level, by dotted names. Raises `InputError` for a name that is none, or not of a field."""
+    """``settings`` on one level, by dotted names. Raises `InputError` for a name that no field can have."""
     found: dict[str, Any] = {}
     for name, value in settings.items():
         if not isinstance(name, str) or not FIELD.fullmatch(name):
@@ -74,7 +74,7 @@ def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def plain(name: str, value: Any) -> Any:
-    """``value`` of numbers, words and lists of them; `InputError` for anything else."""
+    """``value`` if it is made of numbers, words and lists of them, as plain data; `InputError` for anything else."""
     if isinstance(value, np.generic | np.ndarray | torch.Tensor):
         value = value.tolist()
     if isinstance(value, list | tuple):
@@ -88,20 +88,20 @@ def plain(name: str, value: Any) -> Any:
 
 
 def section_of(problem: Problem) -> dict:
-    """How a configuration names ``problem``: its class, and those of its arguments that a file can hold."""
+    """``problem`` as a section of a configuration: its class, and those of its arguments that a file can hold."""
     name = problem_name(problem)
     section: dict[str, Any] = {
         "_target_": f"{PACKAGE}.{type(problem).__name__}" if name in PROBLEMS else named(problem)
     }
     for key, value in plain_parameters(problem.parameters).items():
-        with contextlib.suppress(InputError):  # what no file can hold is given again to load a controller
+        with contextlib.suppress(InputError):  # other arguments must be given again to load a controller
             section[key] = plain(key, value)
     return section
 
 
 @contextlib.contextmanager
 def own_hydra() -> Iterator[None]:
-    """Hydra as if nobody had used it in this process, which finds it as it was."""
+    """Run the body with a fresh global state of Hydra, and restore the old one afterwards."""
     before = Singleton._instances
     Singleton._instances = {key: made for key, made in before.items() if key not in APPLICATION}
     try:

@@ -1,5 +1,5 @@
-"""What a process does that torchrun started beside the first one of a run: it helps, writes nothing, and prints nothing while
-there is somebody else to say what is wrong."""
+"""The part of a process that torchrun started beside the first one of a run: it helps, writes nothing, and prints nothing as
+long as the first process can tell what is wrong."""
 
 import logging
 import sys
@@ -17,17 +17,17 @@ from ocp_torch.training.stopping import Preempted
 
 
 def assist(ranks: Alone, check: Callable[[], Checked], work: Callable[..., object]) -> NoReturn:
-    """``work`` on what ``check`` made, as often as the first process of ``ranks`` wants it, and the end of this process.
+    """Do this process's share of ``work`` on what ``check`` made, then end the process.
 
-    Its status is 0 also where the run fails, unless nobody else can tell: with another one torchrun would end the first
-    process in the middle of its last words.
+    The exit status is 0 even where the run fails, unless no other process can tell the error: otherwise torchrun would kill
+    the first process before it has told it.
     """
     logging.getLogger().addHandler(logging.NullHandler())  # without any, Python prints warnings
     try:
         work(ranks.alike(check).made, Path())
     except LostError as error:
         fail(f"{str(error).rstrip('.')}; what it saved last is there to go on from.")
-    except (Left, Preempted, NonFiniteError, KeyboardInterrupt):  # of which the first process tells
+    except (Left, Preempted, NonFiniteError, KeyboardInterrupt):  # the first process tells these
         pass
     except (Exception, SystemExit) as error:
         told = blamed(error) or (error if isinstance(error, InputError) else None)

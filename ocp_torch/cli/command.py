@@ -1,4 +1,4 @@
-"""A command: what `scripts/<name>.py` and the installed `ocp-<name>` both call."""
+"""A command, as `scripts/<name>.py` and the installed `ocp-<name>` call it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from ocp_torch.cli.launch import launch
 
 @dataclass(frozen=True)
 class Command:
-    """Called, it runs the command line: ``work(check(data), folder)``, with the configuration ``name`` (see `launch`)."""
+    """A call runs the command line: ``work(check(data), folder)``, with the configuration ``name`` (see `launch`)."""
 
     name: str
     check: Callable[[dict], object]

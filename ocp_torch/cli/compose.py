@@ -1,4 +1,4 @@
-"""From a command line to a configuration, with Hydra; whatever Hydra has against it becomes one sentence."""
+"""From a command line to a configuration, with Hydra; errors of Hydra become one sentence."""
 
 from functools import cache
 from pathlib import Path
@@ -17,18 +17,18 @@ from ocp_torch.errors import InputError, nearest
 from ocp_torch.runs.configuration import next_subfolder
 from ocp_torch.runs.resume import find_run, resumed_configuration
 
-# No choice of a problem, whose fields would be mixed with those of a user's own class.
+# The override that chooses no problem: fields of one would be mixed with those of a user's own class.
 NO_CHOICE = "~problem"
 
 
 def place(part: str) -> Path:
-    """The folder ``part`` of the checkout wherever a run starts, or, where there is no checkout, of the current folder."""
+    """The folder ``part`` of the checkout, wherever a run starts, or without a checkout of the current folder."""
     return (Path.cwd() if INSTALLED else CHECKOUT) / part
 
 
 def register_resolvers() -> None:
-    """`${checkout:outputs}`: the `place` of outputs; `${problem_name:a.b.Circle}`: circle; `${start_folder:dir}`: where in a
-    run's folder this start's configuration goes."""
+    """Register `${checkout:outputs}`, the `place` of outputs; `${problem_name:a.b.Circle}`, circle; `${start_folder:dir}`,
+    the subfolder of a run's folder for the configuration of this start."""
     resolvers = {
         "checkout": lambda part: str(place(part)),
         "problem_name": lambda target: str(target).rpartition(".")[2].lower(),
@@ -44,13 +44,13 @@ def parsed(overrides: list[str]) -> list[Override]:
         return OverridesParser.create().parse_overrides(overrides)
     except HydraException as error:
         raise InputError(explain(error, "train")) from None
-    except ValueError:  # a number of more digits than Python reads
+    except ValueError:  # such as a number of more digits than Python reads
         raise InputError("the command line holds a number of thousands of digits, which nothing here takes.") from None
 
 
 def with_own_defaults(config_name: str, overrides: list[str]) -> list[str]:
-    """``overrides`` in which a class that ``problem._target_`` names starts from its own defaults: the group's fields,
-    which are another problem's, are left out, and `problem.x=` sets or adds x, whether it was there or not."""
+    """``overrides`` changed so that a class named by ``problem._target_`` starts from its own defaults: fields of the problem
+    group, which belong to another problem, are left out, and `problem.x=` sets or adds x."""
     bare = [o.lstrip("+") for o in overrides]
     if not any(o.startswith("problem._target_=") for o in bare):
         return overrides
@@ -60,21 +60,21 @@ def with_own_defaults(config_name: str, overrides: list[str]) -> list[str]:
         if grouped and (field.startswith("problem=") or given == NO_CHOICE):
             continue
         if grouped and field.startswith("problem._target_="):
-            found.append(NO_CHOICE)  # beside the other overrides, which Hydra wants in one piece
+            found.append(NO_CHOICE)  # here, as Hydra wants all overrides in one piece
         found.append(f"++{field}" if field.startswith("problem.") else given)
     return found
 
 
 @cache
 def _file(config_name: str) -> tuple[list[tuple[str, Any]], list[str]]:
-    """Of a configuration file of ours: the groups with their choices, and the fields at its top."""
+    """The groups of a configuration file with their choices, and its top-level fields."""
     file: Any = OmegaConf.to_container(OmegaConf.load(CONFIGS / f"{config_name}.yaml"), resolve=False)
     chosen = [item for entry in file.pop("defaults", []) if isinstance(entry, dict) for item in entry.items()]
     return chosen, list(file)
 
 
 def composed(config_name: str, overrides: list[str], roots: tuple[Path, ...] = ()) -> dict:
-    """What a command of the configuration ``config_name`` is given: `configuration` and `run_data`, with its ``roots``."""
+    """The data for a command of the configuration ``config_name``: `configuration`, then `run_data` with its ``roots``."""
     overrides = with_own_defaults(config_name, overrides)
     return run_data(configuration(config_name, overrides)[1], overrides, roots)
 
@@ -87,7 +87,7 @@ def configuration(config_name: str, overrides: list[str], whole: bool = True) ->
     own = any(o.key_or_group == "problem._target_" and not o.is_delete() for o in parsed(overrides))
     for override in parsed(overrides):
         name = override.key_or_group
-        # Defaults stand in the configuration alone; only a class of a user's own may do without the problem's.
+        # All groups are needed, as defaults are in the configuration alone; only a user's own class needs no problem group.
         needed = not name.startswith(("hydra", "problem.", "experiment")) and not (own and name == "problem")
         if override.is_delete() and needed:
             raise InputError(f"~{name} leaves out {name}, which is needed; set it to another value instead.")
@@ -102,7 +102,7 @@ def configuration(config_name: str, overrides: list[str], whole: bool = True) ->
     except (
         ValueError,
         TypeError,
-    ) as error:  # for some slips Hydra has no exception of its own, nor says where they are
+    ) as error:  # for some mistakes Hydra raises builtin exceptions, and does not say where they are
         reason = " ".join(str(error).split()).rstrip(".")
         raise InputError(f"{' '.join(overrides)} cannot be composed: {reason}.") from None
     finally:
@@ -121,19 +121,20 @@ def configuration(config_name: str, overrides: list[str], whole: bool = True) ->
 
 
 def resolved(config: DictConfig, whole: bool = True) -> dict:
-    """``config`` without Hydra's part, resolved to plain data; OmegaConf raises where that cannot be, or is not ``whole``."""
+    """``config`` without Hydra's part, resolved to plain data; OmegaConf raises where it cannot be, or for missing values if
+    it must be ``whole``."""
     own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     data: Any = OmegaConf.to_container(own, resolve=True, throw_on_missing=whole)
     return data
 
 
 def run_data(data: dict, overrides: list[str], roots: tuple[Path, ...] = ()) -> dict:
-    """``data`` as a run is built from it: that of the run to go on with, where ``resume`` names one (`auto`: the last of
+    """The configuration a run is built from: ``data``, or that of the run which ``resume`` names (`auto`: the last one with
     this configuration below ``roots`` and `outputs/`)."""
     named = [o.key_or_group for o in parsed(overrides) if not o.key_or_group.startswith("hydra")]
     if "problem._target_" in named:
         named.remove("problem") if "problem" in named else None
-        # What an experiment sets is another problem's as well.
+        # Fields that an experiment sets belong to another problem as well.
         mine = {name.split(".")[1] for name in named if name.startswith("problem.")}
         data = {**data, "problem": {k: v for k, v in data["problem"].items() if k in mine}}
     if data.get("resume") == "":

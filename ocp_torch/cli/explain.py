@@ -1,4 +1,4 @@
-"""Hydra's and OmegaConf's own words as one sentence, with what would be right."""
+"""Errors of Hydra and OmegaConf in one sentence each, with what would be right."""
 
 import re
 from collections.abc import Iterable
@@ -14,13 +14,13 @@ from ocp_torch.errors import nearest
 
 PACKAGE = Path(__file__).resolve().parents[1]
 CHECKOUT = PACKAGE.parent
-# A wheel holds them within the package.
+# A wheel holds the configurations within the package.
 INSTALLED = (PACKAGE / "configs").is_dir()
 CONFIGS = (PACKAGE if INSTALLED else CHECKOUT) / "configs"
 
 
 def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -> str:
-    """What ``error``, of Hydra or OmegaConf, has against the command line; ``overrides`` name the groups that were chosen."""
+    """A sentence on ``error``, of Hydra or OmegaConf, about the command line; ``overrides`` name the chosen groups."""
     text = str(error)
     unknown = re.search(r"Could not find '([\w./-]+)/([^'/]*)'", text)
     if isinstance(error, MissingConfigException) and unknown:
@@ -50,24 +50,24 @@ def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -
 
 
 def is_choice(override: str) -> bool:
-    """Whether it chooses a file of a group, and sets no field."""
+    """Whether ``override`` chooses a file of a group, rather than setting a field."""
     return (CONFIGS / override.lstrip("+~").split("=")[0].partition("@")[0]).is_dir()
 
 
 def choices(group: str) -> list[str]:
-    """The files of a group."""
+    """The names of the files of a ``group``, without suffix."""
     return sorted(p.stem for p in (CONFIGS / group).glob("*.yaml"))
 
 
 def field_hint(field: str, config_name: str, overrides: Iterable[str]) -> str:
-    """A bracket with the nearest field of the chosen groups, or, where none is near, with all that the group has."""
+    """A hint in brackets: the nearest field of the chosen groups, or, where none is near, all fields of the group."""
     known = known_fields(config_name, tuple(o for o in overrides if is_choice(o)))
     group, _, last = field.rpartition(".")
     below = [k.removeprefix(f"{group}.") for k in known if group and k.startswith(f"{group}.")]
     names = sorted(n for n in below if "." not in n and not n.startswith("_"))
     if not names:
         return nearest(field, known)
-    if nearest(last, names):  # names are compared alone: the group before them makes all of them look alike
+    if nearest(last, names):  # compared without their groups, which would make all of them alike
         return nearest(field, [f"{group}.{n}" for n in names])
     return f" ({group} has {', '.join(names)})"
 

@@ -1,4 +1,4 @@
-"""What `--help` prints: what a command is for, examples, and every field with the value it has here and what it means."""
+"""The text of `--help`: purpose and examples of a command, and every field with its value and meaning."""
 
 import inspect
 import json
@@ -18,8 +18,9 @@ from ocp_torch.problems import Problem
 from ocp_torch.problems.problem import shipped
 from ocp_torch.runs.build import problem_class
 
-# Letters in a line, on narrow and on wide terminals, and those of the longest field that has its comment beside it.
-NARROWEST, WIDEST, BESIDE = 60, 120, 40
+NARROWEST = 60  # characters of a line, on a narrow terminal
+WIDEST = 120  # characters of a line, on a wide terminal
+BESIDE = 40  # column of the comments; a longer field has its comment below
 LAST_WORDS = """\
   -m seed=0,1,2 runs several, one after the other; -m hydra/launcher=joblib side by side
   --help terms explains the words; --cfg job prints the configuration as YAML; --hydra-help is about Hydra itself"""
@@ -58,26 +59,26 @@ def help_text(command: str, typed: str, overrides: list[str]) -> str:
 
 
 def arguments(cls: type[Problem]) -> dict[str, Any]:
-    """What a class that the package does not have is made from, with its defaults."""
+    """The arguments of a user's own class ``cls``, with their defaults."""
     kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
     taken = [p for p in inspect.signature(cls).parameters.values() if p.kind in kinds]
     return {p.name: "???" if p.default is p.empty else p.default for p in taken}
 
 
 def first_line(cls: type) -> str:
-    """Of what a class says of itself; empty where that is nothing."""
+    """The first line of the docstring of ``cls``; empty without one."""
     return (cls.__doc__ or "").strip().partition("\n")[0]
 
 
 def header(file: Path) -> str:
-    """The comment that a configuration file begins with: what the command is for, then examples."""
+    """The comment at the top of a configuration file: the purpose of the command, then examples."""
     lines = file.read_text(encoding="utf-8").splitlines()
     first = next(i for i, line in enumerate(lines) if not line.startswith("#"))
     return "\n".join(line.removeprefix("#").removeprefix(" ") for line in lines[:first])
 
 
 def comments(file: Path) -> dict[str, str]:
-    """What a YAML file says of its fields, by their dotted names: on their own line, or in a line of its own before."""
+    """The comments of a YAML file on its fields, by their dotted names: on the field's line, or on a line before it."""
     text = file.read_text(encoding="utf-8")
     lines, found = text.splitlines(), {}
     top = len(header(file).splitlines()) if text.startswith("#") else 0
@@ -99,7 +100,7 @@ def comments(file: Path) -> dict[str, str]:
 
 
 def sections(data: dict, known: dict[str, str]) -> Iterator[str]:
-    """The fields of each section, with what is ``known`` of them; those of no section come last."""
+    """The fields of each section, with their ``known`` comments; fields of no section come last."""
     alone = {key: value for key, value in data.items() if not isinstance(value, dict) or not value}
     for name, section in ((key, value) for key, value in data.items() if key not in alone):
         told = f"  {known[name]}" if name in known else ""
@@ -127,7 +128,7 @@ def rows(section: dict, prefix: str, known: dict[str, str]) -> Iterator[str]:
 
 
 def _written(value: Any) -> str:
-    """As it is written on the command line."""
+    """``value`` as it is written on the command line."""
     if isinstance(value, str):
         return "..." if value == "???" else value
     return json.dumps(value, separators=(",", ":"), default=str).replace('"', "")

@@ -1,4 +1,4 @@
-"""One job, alone or of a sweep: it leaves nothing in the process, and its end is told in a sentence."""
+"""One job, alone or of a sweep: it leaves the process as it was, and its end is told in a sentence."""
 
 import contextlib
 import logging
@@ -34,8 +34,8 @@ log = logging.getLogger(__name__)
 
 
 def job(check: Callable[[dict], object], work: Callable[..., object], config: DictConfig) -> None:
-    """A job that Hydra has started: ``work(check(data), folder)``."""
-    logging.setLogRecordFactory(Record)  # the process may be one that a launcher started
+    """Carry out a job that Hydra has started: ``work(check(data), folder)``."""
+    logging.setLogRecordFactory(Record)  # again here, as a launcher may have started this process
     hydra = HydraConfig.get()
     this = Job(hydra, Path(hydra.runtime.output_dir))
     with this.outcome():
@@ -46,7 +46,7 @@ def job(check: Callable[[dict], object], work: Callable[..., object], config: Di
 
 
 def settled(folder: Path, data: dict) -> Path:
-    """The folder that a job of a sweep works in: Hydra's fresh ``folder``, or that of the run it goes on with."""
+    """The folder that a job of a sweep works in: Hydra's fresh ``folder``, or that of the run it resumes."""
     if data.get("resume") is None:
         require_fresh(folder)
         return folder
@@ -56,7 +56,7 @@ def settled(folder: Path, data: dict) -> Path:
     require_unlinked(own)
     for handler in logging.getLogger().handlers:
         if isinstance(handler, logging.FileHandler):
-            handler.close()  # it opens its file again at the next line
+            handler.close()  # the handler opens its file again at the next line
             handler.baseFilename = str((own / Path(handler.baseFilename).name).absolute())
     adopt(folder, own)
     return own
@@ -72,7 +72,7 @@ def require_fresh(folder: Path) -> None:
 
 @dataclass
 class Job:
-    """A job by Hydra's own part of its configuration, and the folder it works in."""
+    """A job: Hydra's own part of its configuration, and the folder it works in."""
 
     hydra: Any
     folder: Path
@@ -83,7 +83,7 @@ class Job:
 
     @contextlib.contextmanager
     def outcome(self):
-        """What is done within ends the process with a sentence and a status where it fails; in a sweep, its own job only."""
+        """Run the body; where it fails, end the process with a sentence and a status, or in a sweep only this job."""
         try:
             with isolated():
                 yield
@@ -108,10 +108,10 @@ class Job:
             failed(self.hydra, " ".join(reason.split()))
 
     def again(self) -> str:
-        """The command that goes on with what was stopped."""
+        """The command that goes on with this job after it was stopped."""
         if self.sweeping:
             return f"the sweep's own command with hydra.sweep.dir={self.hydra.sweep.dir} resume=auto"
-        # What only the command line may name.
+        # A user's own problem, which only the command line may name.
         task = self.hydra.overrides.task
         mine = "problem." if "problem=callable" in task else "problem._target_="
         own = [o.lstrip("+") for o in task if o == "problem=callable" or o.lstrip("+").startswith(mine)]
@@ -121,7 +121,7 @@ class Job:
 
 @contextlib.contextmanager
 def isolated():
-    """Leave the process as it was: no job of a sweep finds another one's threads, precision or random numbers."""
+    """Restore threads, precision, random numbers and paths after the body, so that jobs of a sweep are independent."""
     dtype, threads = torch.get_default_dtype(), torch.get_num_threads()
     path, folder = list(sys.path), os.getcwd()
     gradients = torch.set_grad_enabled(torch.is_grad_enabled())

@@ -1,4 +1,4 @@
-"""The way in: a command is checked before anything is written, and whatever is wrong with it is told in one sentence."""
+"""The entry of all commands: a command is checked before anything is written, and mistakes are told in one sentence."""
 
 import gc
 import logging
@@ -28,33 +28,33 @@ from ocp_torch.training.stopping import Preempted
 
 HELP = ("--help", "-h")
 ASKS = ("--info", "-i", "--cfg", "-c", "--hydra-help", "--version", "--shell-completion", "-sc")
-# Options of Hydra's that take a value.
+# Options of Hydra that take a value.
 HYDRAS = ("--info", "--cfg", "--package", "--config-path", "--config-name", "--config-dir", "--experimental-rerun")
 SWEEPS = ("-m", "--multirun", "hydra.mode=MULTIRUN")
-SHARED = ("train",)  # what the processes of torchrun can do together
+SHARED = ("train",)  # commands that the processes of torchrun can share
 ONE_RUN = (
     "the processes of torchrun share a single run of train; give no sweep and no other options, or leave torchrun out."
 )
 MOST_TRIED = 8  # jobs of a sweep that are tried for one value
-# The first optimiser of a process imports PyTorch's compiler, to tell it to leave these methods alone: 1.3 s of CPU.
-LEFT_ALONE = ("add_param_group", "state_dict", "load_state_dict", "zero_grad")
-# `pytorch_optimizer` does without tensors that are spread over machines where it finds none: 0.5 s of CPU.
+# Optimiser methods that PyTorch's compiler skips: the first optimiser imports the compiler to tell it so, in 1.3 s of CPU.
+NOT_COMPILED = ("add_param_group", "state_dict", "load_state_dict", "zero_grad")
+# Modules that `pytorch_optimizer` can do without, and whose import takes 0.5 s of CPU.
 DISTRIBUTED = ("torch.distributed.tensor", "torch.distributed._tensor")
 
 
 def launch(entry: Callable, config_name: str, check: Callable[[dict], object], work: Callable[..., object]) -> None:
     """Run the command line: ``work(check(data), folder)``, where ``data`` is the composed configuration ``config_name``.
 
-    ``check`` refuses what is wrong, and builds what the work is done on, before any folder is made; a single run works on
-    just that. Sweeps, and whatever else Hydra has options for, go through the Hydra ``entry``, which calls `job`. A user's
-    mistake ends in one sentence on stderr and exit status 2, a signal in 143 or 130, failed jobs of a sweep in their names
-    and status 2. Of several processes that torchrun started all but the first `assist`.
+    ``check`` refuses mistakes, and builds what ``work`` needs, before any folder is made; a single run works on exactly that.
+    Sweeps, and options of Hydra, go through the Hydra ``entry``, which calls `job`. A user's mistake ends in one sentence on
+    stderr and exit status 2, a signal in 143 or 130, failed jobs of a sweep in their names and status 2. Of several processes
+    that torchrun started all but the first `assist`.
     """
     spare_imports()
     register_resolvers()
     logging.setLogRecordFactory(Record)
-    logging.raiseExceptions = False  # a full disk is told once, not at every line of a log
-    # A user's module is found where the command was given, as `python -m` would find it.
+    logging.raiseExceptions = False  # no traceback for every line of a log where the disk is full
+    # Users' modules are imported from the current folder, as `python -m` would.
     sys.path.insert(0, os.getcwd())
     command = [*typed(sys.argv[0]), *sys.argv[1:]]
     sys.argv[1:] = with_own_defaults(config_name, sys.argv[1:])
@@ -62,7 +62,7 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
     overrides = [a for a in sys.argv[1:] if not a.startswith("-")]
     try:
         ranks = joined()
-    except Left:  # the first process, which tells why
+    except Left:  # the first process has left, and tells why
         sys.exit(0)
     except LostError as error:
         fail(str(error))
@@ -96,7 +96,7 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
 
 
 def sweep(entry: Callable, config_name: str, overrides: list[str], check: Callable[[dict], object]) -> None:
-    """Run the jobs of a sweep, once each of them might run. Raises `InputError` that names those that failed."""
+    """Check a sweep and run its jobs. Raises `InputError` that names the jobs that failed."""
     require_places_to_write(overrides, "hydra.sweep.dir")
     check_sweep(config_name, overrides, check)
     for root in (o.value() for o in parsed(overrides) if o.key_or_group == "hydra.sweep.dir"):
@@ -109,9 +109,8 @@ def sweep(entry: Callable, config_name: str, overrides: list[str], check: Callab
 
 
 def check_sweep(config_name: str, overrides: list[str], check: Callable[[dict], object]) -> None:
-    """Raise `InputError` where a job of the sweep would not even compose, every value of every field, one at a time; or
-    where ``check`` lets none through that has a value of some kind: words are, and numbers by their sign. What the problem
-    makes of numbers, a sweep may be there to find out."""
+    """Raise `InputError` where a value of a swept field does not compose, each tried in one job; or where ``check`` refuses
+    all tried jobs with a value of one kind (see `representatives`). Other numbers of the same kind are left to the jobs."""
     try:
         jobs = BasicSweeper.split_arguments(parsed(overrides), None)[0]
     except HydraException as error:
@@ -136,14 +135,14 @@ def check_sweep(config_name: str, overrides: list[str], check: Callable[[dict], 
                 refusals.append(error)
         if tried and len(refusals) == len(tried):
             raise refusals[0]
-    # Hydra's own settings are the same for every job.
+    # Once for all jobs: Hydra's own settings are the same for each.
     configuration(config_name, [o for o in jobs[0] if is_hydras(o)], whole=False)
 
 
 def representatives(overrides: list[Override]) -> list[str]:
-    """One override for each kind of value that is swept over: each word, and numbers of each type and sign."""
+    """One override for each kind of value that is swept over: for each word, and for numbers of each type and sign."""
     found: dict[tuple, str] = {}
-    for override in overrides:  # but fields of the problem and `resume`, which are left to the jobs
+    for override in overrides:  # except fields of the problem and `resume`, which are left to the jobs
         name = override.key_or_group
         if not override.is_sweep_override() or name.startswith(("hydra", "problem.", "resume")) or is_choice(name):
             continue
@@ -155,7 +154,7 @@ def representatives(overrides: list[Override]) -> list[str]:
 
 
 def require_kinds(data: Any, default: Any, name: str = "") -> None:
-    """Raise `InputError` where a number, a flag or a group of fields of ``default`` is something else in ``data``."""
+    """Raise `InputError` where a number, a flag or a group of fields in ``default`` is of another kind in ``data``."""
     if isinstance(default, dict):
         for key in default.keys() & require_section(name, data).keys():
             require_kinds(data[key], default[key], f"{name}.{key}".lstrip("."))
@@ -166,7 +165,7 @@ def require_kinds(data: Any, default: Any, name: str = "") -> None:
 
 
 def show(text: str) -> None:
-    """Print ``text``, as far as it is read: `head` has enough at some point."""
+    """Print ``text``; leave quietly when the reader, such as `head`, closes the pipe."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
@@ -183,16 +182,16 @@ def require_no_dashes(options: list[str]) -> None:
 
 
 def spare_imports() -> None:
-    """Spare this process, a command's own, PyTorch's compiler, until somebody compiles, and distributed tensors in the
-    optimisers. Where PyTorch is made differently nothing happens, and the process starts as slowly as any other. And what
-    was imported stays: no search for garbage goes through it again, which was .3 of the 12 s of a circle."""
-    for name in LEFT_ALONE:
+    """Make a command start faster: PyTorch's compiler is imported only when something is compiled, and distributed tensors
+    are not for the optimisers. In a PyTorch without these hooks nothing changes. Imported objects are frozen, so that garbage
+    collection skips them, which took .3 of the 12 s of a circle."""
+    for name in NOT_COMPILED:
         method = getattr(getattr(Optimizer, name, None), "__wrapped__", None)
         if method is not None and not hasattr(method, "__dynamo_disable"):
-            method.__dynamo_disable = method  # what `torch._disable_dynamo` looks for before it imports the compiler
+            method.__dynamo_disable = method  # `torch._disable_dynamo` looks for this before it imports the compiler
     hidden = [name for name in DISTRIBUTED if name not in sys.modules]
     modules: dict[str, Any] = sys.modules
-    modules.update(dict.fromkeys(hidden))  # an import of what is None there fails
+    modules.update(dict.fromkeys(hidden))  # an import of a module that is None here fails
     try:
         import pytorch_optimizer  # noqa: F401
     finally:

@@ -1,4 +1,4 @@
-"""How a command ends: in one sentence and a status, or in the names of the jobs of a sweep that failed."""
+"""The end of a command: one sentence and an exit status, or the names of the failed jobs of a sweep."""
 
 import contextlib
 import logging
@@ -13,37 +13,40 @@ from omegaconf import DictConfig
 from ocp_torch.errors import InputError, visible
 
 log = logging.getLogger(__name__)
-FAILED_INPUT, INTERRUPTED, BROKEN_PIPE = 2, 130, 141
-# Jobs of a sweep may run in processes of their own; this file, named in the environment, collects which failed.
+# Exit statuses.
+FAILED_INPUT = 2
+INTERRUPTED = 130
+BROKEN_PIPE = 141
+# Environment variable with the file in which jobs of a sweep, maybe in processes of their own, note that they failed.
 FAILURES = "OCP_TORCH_FAILURES"
-# A table with its warnings has fewer characters.
+# Characters of a message of the log, at most; a table with its warnings has fewer.
 LONGEST_MESSAGE = 2**20
 
 
 def typed(command: str) -> list[str]:
-    """What was typed to start ``command``, the first of `sys.argv`: a script, or a command that was installed."""
+    """The words typed to start ``command``, the first of `sys.argv`: a script, or an installed command."""
     return ["python", command] if command.endswith(".py") else [Path(command).name]
 
 
 class Record(logging.LogRecord):
-    """A message of the log, fit for a terminal whatever names and notes of strangers are in it."""
+    """A message of the log without control characters, which names from untrusted files may contain."""
 
     def getMessage(self) -> str:
         return visible(super().getMessage(), LONGEST_MESSAGE, keep="\n")
 
 
 def fail(sentence: str) -> None:
-    """Print one sentence, on one line and without endless numbers and words, and leave with the status of a wrong input."""
+    """Print an error on one line, with very long numbers and words shortened, and exit with the status of a wrong input."""
     line = re.sub(r"\d{40,}", lambda digits: f"{digits[0][:6]}...({len(digits[0])} digits)", " ".join(sentence.split()))
-    line = re.sub(r"\S{300,}", lambda word: f"{word[0][:80]}...", line)  # a path of thousands of letters
+    line = re.sub(r"\S{300,}", lambda word: f"{word[0][:80]}...", line)  # such as a path of thousands of letters
     print(f"error: {visible(line)}", file=sys.stderr)
     sys.exit(FAILED_INPUT)
 
 
 @contextlib.contextmanager
 def failures(elsewhere: bool = False):
-    """Collect the failed jobs of all processes, of those ``elsewhere`` in the folder one starts from, which machines of a
-    cluster share; yields a function that names them. Raises `InputError` where nothing can be written there."""
+    """Collect the failed jobs of all processes; yields a function that names them. With ``elsewhere`` the jobs run on other
+    machines, and note failures in the current folder, which they share. Raises `InputError` where that is not writable."""
     shared = os.getcwd() if elsewhere else None
     if shared is not None and not os.access(shared, os.W_OK):
         raise InputError(f"jobs on other machines say in {shared} that they failed, but it cannot be written to.")
@@ -58,7 +61,7 @@ def failures(elsewhere: bool = False):
 
 
 def failed(hydra: DictConfig, reason: str) -> None:
-    """Say that a job of a sweep failed, and have it named at the end."""
+    """Print that a job of a sweep failed, and note it for `failures`."""
     name = hydra.job.override_dirname
     sentence = visible(f"error: job {hydra.job.num} ({name}): {reason}")
     print(sentence, file=sys.stderr)

@@ -91,13 +91,13 @@ def train(
     except CallbackFailed as failure:
         raise failure.__cause__ or failure from None
     except Preempted as stop:
-        if stop.number == signal.SIGTERM:  # whoever sent it is answered by the handler that was there before
+        if stop.number == signal.SIGTERM:  # leave it to the handler that was there before
             signal.raise_signal(stop.number)
         raise KeyboardInterrupt(f"stopped by {stop}") from None
 
 
 def _trained(run: TrainingRun, place: Path | None, history: History, watch: Callable[..., Watch]) -> TrainedRun:
-    """``run`` to its end, in ``place`` or nowhere."""
+    """The results of ``run``, trained to its end in the folder ``place``, or with nothing kept."""
     for note in run.notes:
         log.warning("warning: %s", note)
     with _kept(run, place) as where:
@@ -114,7 +114,7 @@ def _trained(run: TrainingRun, place: Path | None, history: History, watch: Call
 
 
 def _place(config: dict, folder: Path | None) -> Path | None:
-    """Where the run of ``config`` is written: ``folder``, or where the run lies that it goes on with. Raises `InputError`."""
+    """The folder for the run of ``config``: ``folder``, or that of the run it resumes. Raises `InputError`."""
     own = None if config["resume"] is None else locate(Path(config["resume"]))[0]
     if own is not None and folder is not None and own.resolve() != folder.resolve():
         raise InputError(f"folder is {shown(str(folder))}, but a resume goes on in {own}; leave folder out.")
@@ -130,7 +130,7 @@ def _place(config: dict, folder: Path | None) -> Path | None:
 
 
 def _finished(run: TrainingRun, place: Path) -> TrainedRun | None:
-    """The run in ``place`` where nothing of it is left to do."""
+    """The results of the run in ``place`` if it is finished already, else `None`."""
     done = None if run.state is None else result_of(place, run.state, run.trainer.config)
     lacking = missing(place, run.trainer, run.settings)
     if done is None or lacking not in (None, REPORT):
@@ -144,7 +144,7 @@ def _finished(run: TrainingRun, place: Path) -> TrainedRun | None:
 
 @contextlib.contextmanager
 def _kept(run: TrainingRun, place: Path | None) -> Iterator[Path]:
-    """The folder that ``run`` is written to: ``place`` with its configuration, or one that is gone afterwards."""
+    """The folder that ``run`` is written to: ``place`` with its configuration, or a temporary one."""
     if place is None:
         with tempfile.TemporaryDirectory(prefix="ocp_torch_") as gone:
             yield Path(gone)

@@ -1,4 +1,4 @@
-"""A single run: checked while nothing is written, and what was built for that is what then runs, in this process."""
+"""A single run: checked before anything is written; the objects that the check built are then run, in this process."""
 
 import contextlib
 import errno
@@ -26,13 +26,13 @@ from ocp_torch.maths.ranks import joined
 from ocp_torch.problems.blame import blamed
 from ocp_torch.runs.configuration import locate
 
-# Where a checkpoint that lies in no run's folder goes on, as in configs/train.yaml, by the name of its problem and method.
+# Folder for a run that resumes a checkpoint in no run's folder, by its problem and method, as in configs/train.yaml.
 FRESH = "${{checkout:outputs}}/{}_{}/${{now:%Y-%m-%d_%H-%M-%S-%f}}"
 
 
 @dataclass(frozen=True)
 class Checked:
-    """A command that nothing is known against: its configuration, with Hydra's part, and what the check ``made``."""
+    """A command that passed its check: its configuration, with Hydra's part, and the objects that the check ``made``."""
 
     config_name: str
     config: DictConfig
@@ -40,9 +40,9 @@ class Checked:
 
 
 def checked(arguments: list[str], config_name: str, check: Callable[[dict], object]) -> Checked:
-    """What ``arguments``, without Hydra's own options, ask for; a resume goes on in the folder of its run.
+    """The checked command of ``arguments``, without Hydra's own options; a resume goes on in the folder of its run.
 
-    Raises `InputError` for anything that can be known to be wrong before a folder is made.
+    Raises `InputError` for every mistake that can be found before a folder is made.
     """
     require_places_to_write(arguments, "hydra.run.dir")
     given = {o.key_or_group: o.value() for o in parsed(arguments) if not o.is_sweep_override() and not o.is_delete()}
@@ -67,29 +67,29 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
 
 @contextlib.contextmanager
 def told():
-    """What goes wrong within for a reason that is a user's becomes one sentence."""
+    """Turn errors in the body that are a user's into an `InputError` of one sentence."""
     try:
         yield
-    except OSError as error:  # a name that no file can have, a device that gives nothing
+    except OSError as error:  # such as a name that no file can have, or a device that cannot be read
         named = f"{shown(str(error.filename))} cannot be used" if error.filename else "a file cannot be used"
         raise blamed(error) or InputError(f"{named}: {error.strerror or error}.") from None
     except (Exception, SystemExit) as error:
         sentence: InputError | None = blamed(error)
-        if sentence is None and isinstance(error, SystemExit):  # somebody's module would end the run without a word
+        if sentence is None and isinstance(error, SystemExit):  # a user's module would end the run without a message
             sentence = InputError(f"the code that the command line names asks Python to exit (status {error.code}).")
         raise sentence or error from None
 
 
 def require_places_to_write(arguments: list[str], name: str) -> None:
-    """`require_writable` of the folders that ``name`` is given as."""
+    """`require_writable` for the folders that the override ``name`` gives."""
     for value in (o.value() for o in parsed(arguments) if o.key_or_group == name and not o.is_sweep_override()):
-        # What is only known later, such as the time, is below what can be looked at now.
+        # The part before an interpolation such as the time, which is only known later.
         require_writable(Path(re.split(r"[^/]*\$\{", str(value))[0]), name)
 
 
 def require_writable(folder: Path, name: str) -> None:
-    """Raise `InputError` unless files can be written to ``folder``, which ``name`` was given as; leaves nothing behind."""
-    if not joined().first:  # who does not write
+    """Raise `InputError`, about the field ``name``, unless files can be written to ``folder``; leaves nothing behind."""
+    if not joined().first:  # only the first process writes
         return
     made: list[Path] = []
     try:
@@ -111,7 +111,7 @@ def require_writable(folder: Path, name: str) -> None:
 
 
 def carry_out(command: Checked, work: Callable[..., object]) -> None:
-    """`Hydra.run` for what is composed already: make the folder, begin its log, and do the ``work`` on what was built."""
+    """`Hydra.run` for a checked command: make the folder, begin its log, and do the ``work`` on what the check made."""
     config = command.config
 
     def task(_: DictConfig) -> None:
@@ -125,4 +125,4 @@ def carry_out(command: Checked, work: Callable[..., object]) -> None:
         with read_write(config):
             config.hydra.mode = RunMode.RUN
         done = run_job(task, config, job_dir_key="hydra.run.dir", job_subdir_key=None, hydra_context=context)
-    _ = done.return_value  # raises what the job did
+    _ = done.return_value  # raises the error of the job, if there was one

@@ -1,4 +1,4 @@
-"""The words of tables, reports and fields, for somebody who has never seen the paper: `--help terms`."""
+"""The glossary of `--help terms`: the words of tables, reports and fields, for readers who do not know the paper."""
 
 TERMS = {
     "control-affine": (

@@ -1,4 +1,4 @@
-"""Functions of the state for where there is no PyTorch: ONNX, C99 and CasADi."""
+"""Functions of the state exported to ONNX, C99 and CasADi, for use without PyTorch."""
 
 from ocp_torch.export.export import CONTROL, FORMATS, export
 from ocp_torch.export.lowering import lowered

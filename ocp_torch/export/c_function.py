@@ -1,4 +1,4 @@
-"""One C99 function: the loops that carry out a `Program`, in one array on the stack."""
+"""One C99 function: loops that carry out a `Program`, with all results in one array on the stack."""
 
 import math
 import textwrap
@@ -19,12 +19,12 @@ ENTRYWISE = {
     "where": "{0} != 0 ? {1} : {2}",
 }  # fmt: skip
 REDUCED = {"sum": "{0} + {1}", "max": "MAX({0}, {1})", "min": "MIN({0}, {1})"}
-# Sums of products are split over so many, so that compilers may use vector instructions without reordering what is written.
+# Sums of products are split into so many partial sums, so that compilers can use vector instructions without reordering.
 LANES = 8
-# The array that all results are in.
+# Number that stands for the array of all results.
 WORK = -1
 
-# A statement from the number of an entry, in C, and the entries of some views there.
+# Function from the C expression of an entry's number, and of the entries of some views there, to a statement.
 Statement = Callable[[str, list[str]], str]
 
 
@@ -39,7 +39,7 @@ class Function:
         self.labels: dict[int, str] = {}  # of constants
 
     def definition(self, pool: dict[bytes, str]) -> str:
-        """The function; the constants it takes are added to ``pool``, with their labels."""
+        """The C function; its constants are added to ``pool``, with their labels."""
         for buffer, numbers in self.program.constants.items():
             self.labels[buffer] = pool.setdefault(numbers.tobytes(), f"c{len(pool)}")
         lines = [f"real x[{self.program.dim}], w[{max(1, self.space)}];"]
@@ -81,7 +81,7 @@ class Function:
         return lines + self._loops([target, rest], lambda at, of: f"{of[0]} = {template.format(*of)};")
 
     def _product(self, left: View, right: View, start: int) -> list[str]:
-        """`out[i, j] = sum_k left[i, k] right[k, j]`, along the numbers of the right matrix as they lie."""
+        """`out[i, j] = sum_k left[i, k] right[k, j]`, with loops in the order in which the right matrix is stored."""
         (rows, inner), columns = left.places.shape, right.places.shape[1]
         lines = []
         for i in range(rows):
@@ -98,7 +98,7 @@ class Function:
         return lines
 
     def _dot(self, a: str, b: str, out: str, inner: int, columns: int) -> list[str]:
-        """Each entry as the sum of `LANES` sums of products."""
+        """Loops for each entry as the sum of `LANES` partial sums of products."""
         whole = inner - inner % LANES
         return [
             f"for (int j = 0; j < {columns}; j++) {{",
@@ -114,7 +114,7 @@ class Function:
         ]
 
     def _loops(self, views: list[View], statement: Statement) -> list[str]:
-        """``statement`` for each entry of ``views``, which have one shape: in loops, unless the entries follow no rule."""
+        """``statement`` for each entry of ``views``, which have one shape: in loops where all places are linear."""
         shape = views[0].places.shape
         axes = [axis for axis, size in enumerate(shape) if size > 1]
         index = [f"i{axis}" for axis in axes]
@@ -129,7 +129,7 @@ class Function:
         return [*lines, ("    " if lines else "") + statement(rules[0], read(rules[1:]))]
 
     def _entry(self, buffer: int, place: str) -> str:
-        """A number of ``buffer``, in the precision that is computed in."""
+        """A number of ``buffer`` as a C expression, in the precision of the computation."""
         if buffer in self.labels:
             return f"R({self.labels[buffer]}[{place}])"
         if buffer in (WORK, STATE):
@@ -138,7 +138,7 @@ class Function:
 
 
 def layout(program: Program) -> tuple[dict[int, int], int]:
-    """Where in one array each result is, so that those share room that are not needed at the same time; and its size."""
+    """The start of each result in one array, and the array's size: results needed at different times share room."""
     last: dict[int, int] = {}
     for number, operation in enumerate(program.operations):
         last |= {o.buffer: number for o in operation.operands if isinstance(o, View)}
@@ -158,7 +158,7 @@ def layout(program: Program) -> tuple[dict[int, int], int]:
 
 
 def _linear(places: Tensor, index: list[str]) -> str | None:
-    """``places`` as a linear function of the loops' ``index``, one for each axis, if they are one."""
+    """``places`` as a linear function of the loops' ``index``, one for each axis; `None` where they are not linear."""
     start = int(places.flatten()[0])
     linear, terms = torch.full_like(places, start), []
     for axis, size in enumerate(places.shape):
@@ -172,7 +172,7 @@ def _linear(places: Tensor, index: list[str]) -> str | None:
 
 
 def number(value: float) -> str:
-    """``value`` as a literal of the precision that is compiled for."""
+    """``value`` as a C literal, in the precision of the compilation."""
     if math.isinf(value):
         return "R(INFINITY)" if value > 0 else "R(-INFINITY)"
     return f"R({value!r})"

@@ -1,7 +1,7 @@
 """A `Program` as C99: a header and a source without dependencies or allocation, in double or in float.
 
-Numbers that single precision holds exactly, as the weights of a network, are kept in it: half of the memory, and the same
-function.
+Numbers that single precision holds exactly, such as the weights of a network, are stored in it: half of the memory, and the
+same function.
 """
 
 import json
@@ -14,8 +14,10 @@ import numpy as np
 from ocp_torch.export.c_function import Function, number
 from ocp_torch.export.program import Program
 
-# Numbers a line, and characters of a string.
-NUMBERS, CHARACTERS = 8, 100
+# Numbers in a line of an array.
+NUMBERS = 8
+# Characters in a line of a string.
+CHARACTERS = 100
 
 HEADER = Template("""\
 /* $name: exported by ocp_torch.
@@ -72,8 +74,8 @@ $metadata;
 
 
 def c_source(programs: dict[str, Program], name: str, about: str, metadata: dict) -> tuple[str, str]:
-    """Header and source of a function for each of ``programs``, which writes its outputs. ``name`` begins every name in them,
-    ``about`` is for people, ``metadata`` is kept as a string."""
+    """Header and source, with a function for each of ``programs``, which writes its outputs. All names in them begin with
+    ``name``; ``about`` is a text for readers, ``metadata`` is kept as a string."""
     functions = [Function(program, name, function) for function, program in programs.items()]
     pool: dict[bytes, str] = {}
     bodies = [function.definition(pool) for function in functions]
@@ -101,7 +103,7 @@ def _array(label: str, numbers: np.ndarray) -> str:
 
 
 def _exactly(value: float) -> str:
-    """In hexadecimal: shorter than all decimals of a weight in single precision, and exact in both."""
+    """``value`` as a hexadecimal literal: shorter than all decimals of a number in single precision, and exact."""
     if not math.isfinite(value):
         return number(value)
     digits, exponent = value.hex().split("p")

@@ -1,4 +1,4 @@
-"""A `Program` as a CasADi function of one state: its derivatives of any order are CasADi's own, and exact."""
+"""A `Program` as a CasADi function of one state, of which CasADi has exact derivatives of any order."""
 
 from typing import Any
 
@@ -43,7 +43,7 @@ class Writer:
 
     def _matrix(self, view: View) -> Any:
         rows, columns = view.places.shape
-        # CasADi keeps columns together, a view rows.
+        # CasADi stores matrices by columns, a view by rows.
         return self.casadi.reshape(self.entries(View(view.buffer, view.places.T.contiguous())), rows, columns)
 
     def _result(self, operation: Operation) -> Any:
@@ -68,9 +68,9 @@ class Writer:
         return first
 
     def _picked(self, first: Any, second: Any, above: Any, below: Any) -> Any:
-        """``first`` where it is ``above``, ``second`` where it is ``below``, NaN where neither holds, as one of them is NaN.
+        """``first`` where ``above`` holds, ``second`` where ``below`` holds, NaN where neither does: one of them is then NaN.
 
-        CasADi's own `fmax` and `fmin` drop it, and it takes `x != x` for 0."""
+        CasADi's own `fmax` and `fmin` drop NaN, and it simplifies `x != x` to 0."""
         casadi = self.casadi
         return casadi.if_else(above, first, casadi.if_else(below, second, first + second))
 

@@ -1,4 +1,4 @@
-"""A function of the state as a file for where there is no PyTorch, with what it is and where it comes from inside."""
+"""Export of a function of the state to files that need no PyTorch, with a description and its origin inside."""
 
 import json
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from ocp_torch.export.onnx_model import onnx_model
 from ocp_torch.export.program import Program
 from ocp_torch.files.storage import write_atomically
 
-# The output that C has a function of its own for.
+# The output for which the C source has a function of its own.
 CONTROL = "control"
 
 
@@ -30,8 +30,8 @@ def export(
 ) -> list[Path]:
     """Write ``function``, of states ``(N, d)`` to a batch for each name, to ``out``, and return the files.
 
-    It is traced on the first of ``examples`` ``(K, d)``, float64, and held against the others. ``format`` is one of
-    `FORMATS`, by default what the ending of ``out`` says. ``about`` is for people, ``metadata`` goes inside as JSON. Raises
+    The function is traced on the first of ``examples`` ``(K, d)``, float64, and checked at the others. ``format`` is one of
+    `FORMATS`, by default by the suffix of ``out``. ``about`` is a text for readers, ``metadata`` goes inside as JSON. Raises
     `InputError` for a wrong choice, a library that is missing, and a function that cannot be traced.
     """
     known = [name for name, (ending, _) in FORMATS.items() if out.suffix == ending]
@@ -79,7 +79,7 @@ def _casadi(program: Program, out: Path, about: str, metadata: dict) -> list[Pat
     return [out]
 
 
-# The ending of each format's files, and what writes them.
+# Format -> suffix of its files, and the function that writes them.
 FORMATS: dict[str, tuple[str, Callable[[Program, Path, str, dict], Any]]] = {
     "onnx": (".onnx", _onnx),
     "c": (".c", _c),

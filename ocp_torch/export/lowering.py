@@ -1,7 +1,7 @@
 """From the graph of a PyTorch function of a batch of states to the `Program` of one state.
 
-The operations of the graph are few, as PyTorch has taken the others apart. What moves numbers about is applied to the places
-of a view instead.
+The operations of the graph are few, as PyTorch has decomposed the others. Operations that only move entries are applied to
+the places of a view instead.
 """
 
 import math
@@ -16,13 +16,13 @@ from ocp_torch.errors import InputError
 from ocp_torch.export.program import Operand, Program, View
 from ocp_torch.export.tracing import traced
 
-# Move entries about.
+# Operations that move entries.
 MOVES = """view _unsafe_view reshape permute transpose t expand unsqueeze squeeze slice select flip repeat diagonal index
     index_select split split_with_sizes unbind gather""".split()
-# Copies; numbers have the precision of the format, and truth values are numbers.
+# Operations that copy; conversions are copies too: numbers have the precision of the format, and truth values are numbers.
 COPIES = ("alias", "detach", "clone", "lift_fresh", "contiguous", "_to")
 WHOLE = (torch.int8, torch.int16, torch.int32, torch.int64, torch.uint8)
-# Act on each entry, or on the entries of operands brought to one shape.
+# Operations on each entry, or on the entries of operands broadcast to one shape.
 ENTRYWISE = """neg sin cos exp log tanh erf sqrt abs floor atan2 add sub mul div maximum minimum eq ne lt le gt ge where
     tan atan asin acos sinh cosh""".split()
 REDUCTIONS = {"sum": "sum", "amax": "max", "amin": "min"}
@@ -40,7 +40,7 @@ def lowered(function: Callable[[Tensor], dict[str, Tensor]], examples: Tensor) -
 
 
 class Lowering:
-    """The walk through the graph: every node becomes a view, or a plain value."""
+    """Translates a graph node by node: each node becomes a view, or a plain value."""
 
     def __init__(self, graph: fx.GraphModule, program: Program) -> None:
         self.graph, self.program = graph, program
@@ -62,7 +62,7 @@ class Lowering:
         return fx.node.map_arg(value, lambda node: self.known[node])
 
     def view(self, value: Any) -> View:
-        """A tensor that does not depend on the state, as a constant of the program."""
+        """``value`` as a view; a tensor that does not depend on the state becomes a constant of the program."""
         return value if isinstance(value, View) else self.program.constant(torch.as_tensor(value))
 
     def _result(self, node: fx.Node) -> Any:
@@ -91,7 +91,7 @@ class Lowering:
 
     def _moved(self, node: fx.Node, args: tuple, options: dict) -> Any:
         source = self.view(args[0])
-        # A copy that PyTorch made has its entries in order, its places need not be.
+        # Where PyTorch made a contiguous copy, the places may still be in another order.
         moved = node.target(source.places.contiguous(), *args[1:], **options)  # type: ignore[operator]
         part = lambda places: View(source.buffer, places)
         return part(moved) if isinstance(moved, Tensor) else [part(places) for places in moved]
@@ -108,7 +108,7 @@ class Lowering:
         return self.program.add(name, same, shape)
 
     def _number(self, operand: Operand) -> Operand:
-        """A constant of one entry as a number."""
+        """``operand``, or the number itself if it is a constant of one entry."""
         single = isinstance(operand, View) and operand.buffer in self.program.constants and operand.places.dim() == 0
         return float(self.program.constants[operand.buffer][int(operand.places)]) if single else operand  # type: ignore
 
@@ -143,7 +143,7 @@ class Lowering:
         views = [v for v in map(self.view, parts) if v.places.numel()]
         shape = torch.cat([v.places for v in views], dim).shape
         outer = int(shape[: dim % len(shape)].numel())
-        # Row by row: a result in row-major order has evenly spaced rows, which loops can run along.
+        # Row by row: the evenly spaced rows of a result in row-major order become loops.
         flat = [(v.buffer, v.places.reshape(outer, -1)) for v in views]
         rows = [View(buffer, places[row]) for row in range(outer) for buffer, places in flat]
         return self.program.add("cat", tuple(rows), shape)

@@ -1,4 +1,4 @@
-"""Functions that runtimes have no kernel for in double precision, made of those that they have."""
+"""Functions that ONNX runtimes lack in double precision, composed of those that they have."""
 
 import math
 from collections.abc import Callable
@@ -6,14 +6,16 @@ from typing import Protocol
 
 import numpy as np
 
-# The error function is tabulated at so many places a unit, up to where it is 1 in double precision; from there on to `x`
-# follows Gauss's rule of two points, off by less than 3e-12 on so short a way.
-PLACES, FAR = 32, 6.0
+# Entries per unit of the table of the error function: from an entry to `x` Gauss's rule is off by less than 3e-12.
+PLACES = 32
+# End of the table: the error function is 1 in double precision there.
+FAR = 6.0
+# Offset of the two points of Gauss's rule from the middle of an interval, as a part of its length.
 GAUSS = 0.5 / math.sqrt(3.0)
 
 
 class Nodes(Protocol):
-    """What a graph is written with: ``node`` adds one, ``number`` and ``table`` a constant; all give names."""
+    """The writer of a graph: ``node`` adds a node, ``number`` and ``table`` a constant; each returns its name."""
 
     def node(self, kind: str, inputs: list[str], output: str | None = None, **options: object) -> str: ...
 
@@ -48,14 +50,14 @@ def _table() -> np.ndarray:
 
 
 def cos(graph: Nodes, x: str) -> str:
-    """`1 - 2 sin^2(x / 2)`: some runtimes have the sine in double precision, but not the cosine."""
+    """`cos x = 1 - 2 sin^2(x / 2)`: some runtimes have the sine in double precision, but not the cosine."""
     half = graph.node("Sin", [graph.node("Mul", [x, graph.number(0.5)])])
     twice = graph.node("Mul", [graph.node("Mul", [half, half]), graph.number(2.0)])
     return graph.node("Sub", [graph.number(1.0), twice])
 
 
 def atan(graph: Nodes, x: str) -> str:
-    """In single precision first, and a Newton step, `y - (tan y - x) cos^2 y`."""
+    """`atan x`: in single precision first, then a Newton step `y - (tan y - x) cos^2 y`."""
     node = graph.node
     y = _single(graph, "Atan", x)
     sine, cosine = node("Sin", [y]), cos(graph, y)
@@ -64,7 +66,7 @@ def atan(graph: Nodes, x: str) -> str:
 
 
 def asin(graph: Nodes, x: str) -> str:
-    """`2 atan(x / (1 + sqrt((1 - x) (1 + x))))`, which loses no digits beside 1 and -1."""
+    """`asin x = 2 atan(x / (1 + sqrt((1 - x) (1 + x))))`, which loses no digits near 1 and -1."""
     node, one = graph.node, graph.number(1.0)
     root = node("Sqrt", [node("Mul", [node("Sub", [one, x]), node("Add", [one, x])])])
     return node("Mul", [graph.number(2.0), atan(graph, node("Div", [x, node("Add", [one, root])]))])

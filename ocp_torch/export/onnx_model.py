@@ -1,7 +1,7 @@
 """A `Program` as an ONNX model of a batch of states, by operators of the standard set alone.
 
-States and results are in single precision, as most runtimes want them; what is between is in double, so that they are off by
-no more than their own rounding.
+States and results are in single precision, as most runtimes want them; the computation is in double, so that results are off
+by no more than their own rounding.
 """
 
 import json
@@ -13,15 +13,17 @@ from ocp_torch.errors import InputError
 from ocp_torch.export.onnx_functions import COMPOSED
 from ocp_torch.export.program import STATE, Operand, Operation, Program, View
 
-# The operator set: that of ONNX 1.13, which runtimes have had since 2022; and the version of the file that goes with it.
-OPSET, FILE = 18, 8
+# The operator set of ONNX 1.13, which runtimes have had since 2022.
+OPSET = 18
+# The version of the file format that goes with it.
+FILE = 8
 ENTRYWISE = dict(
     neg="Neg", sin="Sin", exp="Exp", log="Log", tanh="Tanh", sqrt="Sqrt", abs="Abs", floor="Floor", add="Add",
     sub="Sub", mul="Mul", div="Div", pow="Pow", maximum="Max", minimum="Min",
 )  # fmt: skip
-# Give truth values, which become numbers.
+# Operators with truth values, which are cast to numbers.
 COMPARED = dict(eq="Equal", lt="Less", le="LessOrEqual", gt="Greater", ge="GreaterOrEqual")
-# The input.
+# Name of the input.
 GIVEN = "state"
 REDUCED = dict(sum="ReduceSum", max="ReduceMax", min="ReduceMin")
 
@@ -56,7 +58,7 @@ def onnx_model(program: Program, name: str, about: str, metadata: dict) -> Any:
 
 
 class Writer:
-    """The nodes of the graph; each buffer is a tensor ``(N, size)``, a constant one ``(1, size)``."""
+    """Writes the nodes of the graph; each buffer is a tensor ``(N, size)``, a constant ``(1, size)``."""
 
     def __init__(self, onnx: Any, program: Program) -> None:
         self.onnx, self.program = onnx, program
@@ -68,13 +70,13 @@ class Writer:
             self.names[operation.buffer] = self._result(operation)
 
     def node(self, kind: str, inputs: list[str], output: str | None = None, **options: Any) -> str:
-        """One more node; the name of its output."""
+        """Add a node; the name of its output."""
         output = f"t{len(self.nodes)}" if output is None else output
         self.nodes.append(self.onnx.helper.make_node(kind, inputs, [output], **options))
         return output
 
     def cast(self, name: str, kind: str) -> str:
-        """What ``name`` holds as numbers of another ``kind``, as ONNX calls it."""
+        """The tensor ``name`` cast to another ``kind`` of numbers, by ONNX's name of it."""
         return self.node("Cast", [name], to=getattr(self.onnx.TensorProto, kind))
 
     def number(self, value: float) -> str:
@@ -109,7 +111,7 @@ class Writer:
         return self.entries(operand) if isinstance(operand, View) else self.number(operand)
 
     def _matrix(self, view: View) -> str:
-        """A view ``(n, k)`` as ``(N, n, k)``; a constant one as it is, ready for a product."""
+        """A view ``(n, k)`` as ``(N, n, k)``, ready for a product; a constant without the batch."""
         if view.buffer in self.program.constants:
             return self._constant(self.program.constants[view.buffer][view.places.numpy()])
         return self.node("Reshape", [self.entries(view), self.integers([0, *view.places.shape])])
@@ -138,10 +140,10 @@ class Writer:
         raise InputError(f"format=onnx has no operator for {name}; choose c or casadi.")
 
     def _batched(self, inputs: list[str], operands: tuple[Operand, ...]) -> list[str]:
-        """Constants among ``inputs`` repeated for each state: parts of one tensor must be of one length."""
+        """``inputs`` with constants repeated for each state, as all parts of a concatenation must have one length."""
         constant = [isinstance(o, View) and o.buffer in self.program.constants for o in operands]
         if not any(constant):
             return inputs
         first = self.node("Gather", [self.names[STATE], self.integers([0])], axis=1)
-        zeros = self.cast(self.node("Less", [first, first]), "DOUBLE")  # of a state that is not finite too
+        zeros = self.cast(self.node("Less", [first, first]), "DOUBLE")  # 0 also for a state that is not finite
         return [self.node("Add", [name, zeros]) if c else name for name, c in zip(inputs, constant, strict=True)]

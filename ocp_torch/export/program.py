@@ -1,6 +1,6 @@
 """A function of one state as a list of operations on flat buffers of numbers: what each exported format is written from.
 
-A tensor is a `View`: a buffer, and which of its numbers each entry is. Reshaping, transposing, slicing and broadcasting only
+A tensor is a `View`: a buffer, and the place in it of each entry. Reshaping, transposing, slicing and broadcasting only
 change the places of a view, so that no format has to know of them.
 """
 
@@ -28,7 +28,7 @@ class View:
 
     @property
     def key(self) -> tuple[int, tuple[int, ...], bytes]:
-        """The same for views of the same numbers."""
+        """A key that is equal for views of the same numbers."""
         return self.buffer, tuple(self.places.shape), self.places.contiguous().numpy().tobytes()
 
     def whole(self, size: int) -> bool:
@@ -85,7 +85,7 @@ class Program:
         return View(self._known[key], places.permute([order.index(axis) for axis in range(value.dim())]))
 
     def add(self, name: str, operands: tuple[Operand, ...], shape: Sequence[int]) -> View:
-        """The result of one more operation, in ``shape``; of the same one on the same numbers, what it gave before."""
+        """The result of one more operation, in ``shape``; the old result for an operation that is there already."""
         places = torch.arange(int(np.prod(shape))).view(shape)
         key = repr((name, *(o.key if isinstance(o, View) else o for o in operands))).encode()
         if key not in self._known:
@@ -94,7 +94,7 @@ class Program:
         return View(self._known[key], places)
 
     def pruned(self) -> "Program":
-        """Without operations that no output needs."""
+        """The program without operations that no output needs."""
         needed = {view.buffer for view in self.outputs.values()}
         kept = []
         for operation in reversed(self.operations):

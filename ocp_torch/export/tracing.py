@@ -1,4 +1,4 @@
-"""A PyTorch function as a graph of ATen operations, derivatives by autograd included, held against the function itself."""
+"""A PyTorch function as a graph of ATen operations, autograd's derivatives included, checked against the function itself."""
 
 from collections.abc import Callable
 
@@ -9,21 +9,21 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 from ocp_torch.errors import InputError, first_line
 
-# How far the graph may be off the function at other states, relative to its largest number: both compute in float64.
+# Largest difference of graph and function at other states, relative to the largest number: both compute in float64.
 ROUNDING = 1e-9
 
 
 def traced(function: Callable[[Tensor], dict[str, Tensor]], examples: Tensor) -> tuple[fx.GraphModule, list[str]]:
     """The graph of ``function`` from states to a result for each name, and the names, in the order of its results.
 
-    It is traced on the first of ``examples`` ``(K, d)``. Raises `InputError` for what is not of PyTorch's operations alone,
-    as NumPy or a branch: a number that went another way would stand in the graph as it was at that one state.
+    It is traced on the first of ``examples`` ``(K, d)`` and compared at all of them. Raises `InputError` for functions that
+    use NumPy or branch on numbers: the graph would keep the result at that one state.
     """
-    wanted = function(examples)  # what a problem computes once is no part of it
+    wanted = function(examples)  # before tracing, so that results which a problem caches are not traced
     listed = lambda x: tuple(function(x).values())
     try:
         graph = make_fx(listed, decomposition_table=dict(core_aten_decompositions().items()))(examples[:1])
-    except Exception as error:  # whatever the functions of a problem do that a tracer does not follow
+    except Exception as error:  # a problem's functions may do anything that a tracer does not follow
         raise InputError(f"this controller cannot be exported, as it cannot be traced: {first_line(error)}.") from None
     graph.graph.eliminate_dead_code()
     found = zip(*(graph(x) for x in examples.split(1)), strict=True)

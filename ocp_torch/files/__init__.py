@@ -1,1 +1,1 @@
-"""Reading files that a stranger may have written, and writing files that survive a crash. Imports `errors` alone."""
+"""Reading untrusted files, and writing files that survive a crash. Imports `errors` alone."""

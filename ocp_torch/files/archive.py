@@ -1,4 +1,4 @@
-"""Archives that `torch.save` wrote, or that a stranger made to look so: checked before and after they are unpacked."""
+"""Archives of `torch.save`, maybe forged: checked before and after they are unpacked."""
 
 import math
 import os
@@ -13,16 +13,18 @@ import torch
 from ocp_torch.files.plain import require_plain
 from ocp_torch.files.reading import zip_file
 
-# An archive lists its contents as a pickle. Bytes and instructions of that list at most: a thousand times a run's.
-LARGEST_LIST, MOST_INSTRUCTIONS = 2**22, 2**20
-# What such a list may name, besides numbers, words and containers. PyTorch's own choice has functions that take memory.
+# An archive lists its contents as a pickle: bytes of that list, at most, a thousand times those of a run's.
+LARGEST_LIST = 2**22
+# Instructions of that list, at most, a thousand times those of a run's.
+MOST_INSTRUCTIONS = 2**20
+# Globals that the list may name. PyTorch's own choice also has functions that allocate memory.
 MADE_OF = re.compile(r"collections (OrderedDict|Counter)|torch \w+Storage|torch\._utils _rebuild_(tensor_v2|parameter)")
 # All tensors together may have this many times as many bytes as the file: several may share the same numbers.
 SHARED = 4
 
 
 class After:
-    """What follows the first ``start`` bytes of an open file, as a file of its own that is never in memory as a whole."""
+    """The rest of an open file after its first ``start`` bytes, as a file of its own that is never in memory as a whole."""
 
     def __init__(self, file: BinaryIO, start: int) -> None:
         self.file, self.start = file, start

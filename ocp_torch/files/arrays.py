@@ -1,4 +1,4 @@
-"""NumPy's files, `.npy` and `.npz`, from strangers: the size that an array claims is checked before its numbers are read."""
+"""Untrusted NumPy files, `.npy` and `.npz`: the size that an array claims is checked before its numbers are read."""
 
 import io
 import math
@@ -15,16 +15,19 @@ from ocp_torch.files.reading import opened, zip_file
 
 # Bytes of the header of an array of numbers at most; NumPy itself writes 118.
 LONGEST_HEADER = 1024
-# NumPy's letters for the kinds of numbers that are read: floats and integers; and flags.
-REAL, FLAGS = "fiu", "b"
-# A file may unpack to this many bytes, or to this many times its own size. Of a recording at least one part in `3 + m`,
-# the random states, hardly compresses; the other columns may be constant.
-FREELY, MOST_TIMES = 2**27, 64
+# NumPy's letters for kinds of numbers: floats and integers, and flags.
+REAL = "fiu"
+FLAGS = "b"
+# Any file may unpack to this many bytes.
+FREELY = 2**27
+# A file may unpack to more, up to this many times its own size: of a recording at least one part in `3 + m`, the random
+# states, hardly compresses.
+MOST_TIMES = 64
 
 
 @dataclass(frozen=True)
 class Form:
-    """What the header of an array claims."""
+    """Shape and size of an array, as its header claims."""
 
     shape: tuple[int, ...]
     size: int  # bytes in memory, as it comes or as float64, whichever is more
@@ -32,7 +35,7 @@ class Form:
 
 
 def form_of(file: BinaryIO, kinds: str = REAL) -> Form:
-    """The form of the array that begins in ``file``; `ValueError` where there is none, or its numbers are of no such kind."""
+    """The form of the array at the start of ``file``; `ValueError` where there is none, or it is not of ``kinds``."""
     begin = file.read(8)
     if len(begin) < 8 or begin[:6] != b"\x93NUMPY" or begin[6] not in (1, 2):
         raise ValueError("is damaged: it is no array of NumPy's")
@@ -63,7 +66,7 @@ def _numbers(file) -> np.ndarray:
 
 def read_npy(path: Path, most: int) -> np.ndarray:
     """The array in the file ``path``, in float64. Raises `InputError` where the file cannot be read, and `ValueError`, whose
-    words follow the file's name, where it holds no array of numbers or one of more than ``most`` bytes."""
+    message follows the file's name, where it holds no array of numbers or one of more than ``most`` bytes."""
     with opened(path) as file:
         form = form_of(file, REAL + FLAGS)
         if form.size > most:

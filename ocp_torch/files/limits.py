@@ -1,4 +1,4 @@
-"""How much a file may ask of the machine, more than which only the user may; and what fits into its memory at all."""
+"""Limits on what an untrusted file may ask of the machine, which only the user may exceed; and the machine's memory."""
 
 import os
 from collections.abc import Collection
@@ -7,8 +7,10 @@ from pathlib import Path
 from ocp_torch.errors import InputError
 from ocp_torch.files.plain import value_at
 
-# The largest whole number and the longest list that a file may give as an argument of a problem; a `seed` may be any number.
-MOST_OF_A_PROBLEM, LONGEST_LIST = 128, 256
+# The largest whole number that a file may give as an argument of a problem; a `seed` may be any number.
+MOST_OF_A_PROBLEM = 128
+# The longest list that a file may give as an argument of a problem.
+LONGEST_LIST = 256
 # Dotted field of a run -> the largest value that a file may give it: some sixteen times a default.
 MOST = {
     "trainer.steps": 2**24,
@@ -27,12 +29,12 @@ MOST = {
 }
 LEAST = {"certificate.tolerance": 1e-9}
 GIGABYTE = 1e9
-# Where Linux says how much memory a container may use, in both generations of control groups.
+# Files with the memory that a Linux container may use, in both generations of control groups.
 CONTAINER_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 
 
 def require_modest_problem(source: object, parameters: dict, remedy: str) -> None:
-    """Raise `InputError`, which ends with ``remedy``, where the file ``source`` gives a problem too large an argument."""
+    """Raise `InputError`, which ends with ``remedy``, where a problem's argument from the file ``source`` is too large."""
     for name, parameter in parameters.items():
         waiting = [parameter]
         while waiting:
@@ -47,8 +49,8 @@ def require_modest_problem(source: object, parameters: dict, remedy: str) -> Non
 
 
 def require_modest_run(source: object, config: dict, named: Collection[str] = frozenset()) -> None:
-    """Raise `InputError` where a field of ``config``, as the file ``source`` has it, is beyond its limit in `MOST` or `LEAST`
-    and is not one that the command line ``named``."""
+    """Raise `InputError` where a field of ``config``, from the file ``source``, is beyond its limit in `MOST` or `LEAST`;
+    fields that the command line ``named`` have no limit."""
     for field, limit in {**MOST, **LEAST}.items():
         value = value_at(config, field)
         if not isinstance(value, int | float) or field in named:
@@ -72,20 +74,20 @@ def require_held(source: object, model: object, numbers: int) -> None:
 
 
 def memory() -> float:
-    """Bytes that this process could ever have: the machine's, or its container's; infinite where neither is known."""
+    """Bytes of memory of the machine, or of its container; infinite where neither is known."""
     found = []
     if {"SC_PHYS_PAGES", "SC_PAGE_SIZE"} <= os.sysconf_names.keys():
         found.append(float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE"))
     for limit in CONTAINER_LIMITS:
         try:
             found.append(float(limit.read_text()))
-        except (OSError, ValueError):  # there is no such file, or it holds the word max
+        except (OSError, ValueError):  # no such file, or it holds the word max
             continue
     return min((size for size in found if size > 0.0), default=float("inf"))
 
 
 def require_memory(name: str, value: int, each: float) -> None:
-    """Raise `InputError` when ``value`` things of at least ``each`` bytes do not fit into the memory of the machine."""
+    """Raise `InputError`, about the field ``name``, when ``value`` items of ``each`` bytes or more exceed the memory."""
     most = memory()
     if value * each > most:
         raise InputError(

@@ -1,4 +1,4 @@
-"""JSON and YAML from strangers as plain data of a bounded size, words, numbers, lists and groups: nothing in them is run."""
+"""JSON and YAML from untrusted files as plain data of bounded size: words, numbers, lists and groups. No code is run."""
 
 import json
 import math
@@ -8,18 +8,23 @@ from typing import Any
 import yaml
 from torch import Tensor
 
-# No certificate, controller or configuration holds more values; of these in YAML, more; or deeper nested ones.
-MOST_VALUES, MOST_OF_YAML, DEEPEST = 2**21, 2**17, 32
-# Signs of a number in JSON, bits of a whole number, and characters of a value in YAML, at most.
-LONGEST_NUMBER, MOST_BITS, LONGEST_SCALAR = 64, 128, 2**13
-# `${a.b}`, a value that stands for the one at a.b of the same file; such a value may stand for a third one, and so on.
-REFERENCE, MOST_STEPS = re.compile(r"\$\{([A-Za-z_]\w*(?:\.\w+)*)\}"), 8
+# Limits that no certificate, controller or configuration reaches.
+MOST_VALUES = 2**21  # values in a file
+MOST_OF_YAML = 2**17  # values in YAML
+DEEPEST = 32  # levels of nesting
+LONGEST_NUMBER = 64  # characters of a number in JSON
+MOST_BITS = 128  # of a whole number
+LONGEST_SCALAR = 2**13  # characters of a value in YAML
+# `${a.b}` stands for the value at a.b of the same file.
+REFERENCE = re.compile(r"\$\{([A-Za-z_]\w*(?:\.\w+)*)\}")
+# References that lead to references, at most.
+MOST_STEPS = 8
 # The parser of the C library, where PyYAML has it, is ten times as fast.
 YAML = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class NotPlain(ValueError):
-    """What a file holds is not the plain data it should be; the message is to follow the name of the file and a colon."""
+    """A file does not hold the plain data it should; the message is to follow the name of the file and a colon."""
 
 
 def json_object(text: str) -> dict:
@@ -76,9 +81,9 @@ def _float(digits: str) -> float:
 
 
 def require_plain(data: object, tensors: bool = False) -> list[Tensor]:
-    """Raise `NotPlain` unless ``data`` is made of `None`, flags, numbers and words in lists, tuples and dicts, and, where
-    ``tensors`` are allowed, of tensors, which are returned; or where there are too many of them (one that stands in several
-    places counts each time), one lies too deep inside others, or a number is too long."""
+    """Raise `NotPlain` unless ``data`` is made of `None`, flags, numbers and words in lists, tuples and dicts, or where it
+    has too many values (one in several places counts each time), too deep ones or a too long number. Where ``tensors`` are
+    allowed, they are returned."""
     found, waiting, count = [], [(data, 0)], 0
     while waiting:
         value, depth = waiting.pop()
@@ -110,8 +115,8 @@ def value_at(data: object, field: str) -> Any:
 
 
 def looked_up(value: Any, data: dict | None = None) -> Any:
-    """``value``, the whole of a file or a part of its ``data``, in which what stands at a.b takes the place of each `${a.b}`,
-    where that is a word or a number; raises `NotPlain` for any other `${`. (OmegaConf's may call functions.)"""
+    """``value``, the whole of a file or a part of its ``data``, with each `${a.b}` replaced by the word or number at a.b.
+    Raises `NotPlain` for any other `${`, as OmegaConf's resolvers may call functions."""
     data = value if data is None else data
     if isinstance(value, dict):
         return {_literal(key): looked_up(one, data) for key, one in value.items()}

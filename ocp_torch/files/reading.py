@@ -1,4 +1,4 @@
-"""Reading ordinary files, whatever a stranger put there, in little memory; and checking that a run writes to such alone."""
+"""Reading ordinary files, also untrusted ones, in little memory; and checking that a run writes to ordinary files only."""
 
 import errno
 import os
@@ -12,20 +12,25 @@ from zipfile import ZipFile
 from ocp_torch.errors import InputError
 from ocp_torch.files.plain import NotPlain, json_object, looked_up, yaml_mapping
 
-FILE, FOLDER, OTHER = "file", "folder", "other"
-# No run writes a larger file; a larger one is not read into memory.
+# Kinds of paths.
+FILE = "file"
+FOLDER = "folder"
+OTHER = "other"
+# Bytes of a file that is read, at most; no run writes a larger one.
 LARGEST_FILE = 2**31
-# More bytes of text than any certificate, controller or configuration has.
-LARGEST_JSON, LARGEST_YAML = 2**26, 2**20
-# Bytes of a ZIP archive that are read at once, at most; its list of parts, which is read at once, has 50 or more for each.
+# Bytes of JSON that is read, at most: more than any certificate or controller has.
+LARGEST_JSON = 2**26
+# Bytes of YAML that is read, at most: more than any configuration has.
+LARGEST_YAML = 2**20
+# Bytes of a ZIP archive that are read at once, at most. Its list of parts is read at once, with 50 bytes or more for each.
 LARGEST_PIECE = 2**20
-# What a run writes in its folder.
+# Names of what a run writes in its folder.
 WRITTEN = (".hydra", "checkpoints", "figures", "*.log", "*.json", "*.html", "*.safetensors", "events.*")
 
 
 def kind(path: str | Path) -> str | None:
-    """``FILE``, ``FOLDER`` or ``OTHER`` (a pipe, a device, a socket), links followed; `None` where there is nothing, and
-    `InputError` where nobody can say: the path is too long, in a folder that may not be entered, or a circle of links."""
+    """``FILE``, ``FOLDER`` or ``OTHER`` (a pipe, a device, a socket), links followed; `None` where there is nothing. Raises
+    `InputError` where the path is too long, in a folder that may not be entered, or a circle of links."""
     try:
         mode = os.stat(path).st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -53,7 +58,7 @@ def opened(path: str | Path, most: int = LARGEST_FILE) -> BinaryIO:
     """The ordinary file ``path``, of at most ``most`` bytes, open for reading. Raises `InputError` for anything else."""
     require_file(path, most)
     try:
-        # Should a pipe have taken the file's place meanwhile, opening it does not wait.
+        # Non-blocking, in case a pipe has taken the file's place meanwhile.
         file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from None
@@ -91,7 +96,7 @@ def read_yaml(path: str | Path) -> dict:
 
 
 class _Frugal:
-    """An open file that refuses to have more than `LARGEST_PIECE` bytes read at once."""
+    """An open file that raises `ValueError` where more than `LARGEST_PIECE` bytes are read at once."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -111,8 +116,8 @@ def zip_file(file: BinaryIO) -> ZipFile:
 
 def require_unlinked(folder: Path, names: Iterable[str] = WRITTEN) -> None:
     """Raise `InputError` where anything in ``folder`` that the patterns ``names`` match, or below a folder that they match,
-    is a link, which would lead what is written somewhere else, a pipe, which would keep the run waiting, or a device.
-    ``folder`` itself may be a link: it is the user who named it."""
+    is a link, through which a run would write elsewhere, a pipe, on which it would wait, or a device. ``folder`` itself may
+    be a link, as the user named it."""
     entries = [entry for entry in _entries(str(folder)) if any(fnmatch(entry.name, name) for name in names)]
     while entries:
         entry = entries.pop()
@@ -120,7 +125,7 @@ def require_unlinked(folder: Path, names: Iterable[str] = WRITTEN) -> None:
         if stat.S_ISDIR(status.st_mode):
             entries += _entries(entry.path)
             continue
-        # Logs are continued in place, also where the file has a second name; everything else is replaced as a whole.
+        # Logs are appended to, so that a second hard link would change too; all other files are replaced as a whole.
         second = status.st_nlink > 1 and entry.name.endswith(".log")
         if stat.S_ISREG(status.st_mode) and not second:
             continue

@@ -20,20 +20,24 @@ from ocp_torch.errors import InputError, StorageError
 from ocp_torch.files.plain import NotPlain, json_object
 from ocp_torch.files.reading import LARGEST_FILE, kind, opened
 
-METADATA_KEY, DIGEST_KEY = "ocp_torch", "sha256"
-# Bytes of the header of a safetensors file, and tensors in it, at most: more than any controller or recording has.
-LARGEST_HEADER, MOST_TENSORS = 2**24, 2**14
-# How the names of temporary files end, whatever they are to become.
+# Keys of the header of our safetensors files: the metadata as JSON, and a digest of metadata and tensors.
+METADATA_KEY = "ocp_torch"
+DIGEST_KEY = "sha256"
+# Bytes of the header of a safetensors file, at most: more than any controller or recording has.
+LARGEST_HEADER = 2**24
+# Tensors in such a file, at most.
+MOST_TENSORS = 2**14
+# Suffix of temporary files.
 PART = ".part"
-# What the user wants new files not to permit; it can only be read by setting it, which threads must not see.
+# The user's umask. Reading it means setting it for a moment, so it is done here, before there are threads.
 os.umask(_UMASK := os.umask(0o077))
 
 
 def write_atomically(path: Path, write: Callable[[Path], object], make_room: Callable[[], None] | None = None) -> None:
-    """Let ``write`` fill a temporary file beside ``path``, then put it in the place of ``path`` in one step, for good.
+    """Let ``write`` fill a temporary file beside ``path``, then rename it to ``path`` in one step that survives a crash.
 
     ``make_room`` is called in between, once the new file is whole and on the disk. Raises `StorageError` when there is no
-    room or no permission; what was there before is then untouched.
+    room or no permission; the old file is then untouched.
     """
     temporary = None
     if os.path.lexists(path) and not path.is_file():
@@ -59,7 +63,7 @@ def write_atomically(path: Path, write: Callable[[Path], object], make_room: Cal
 
 
 def sync(path: Path) -> None:
-    """Make the contents of a file, or the names in a folder, survive a loss of power."""
+    """Force the contents of a file, or the names in a folder, onto the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -95,7 +99,7 @@ def only_writer(folder: Path) -> Iterator[None]:
 
 
 def finite(data):
-    """``data`` with infinities and NaN, which JSON cannot hold, as the words inf, -inf and nan."""
+    """``data`` with infinities and NaN, which JSON does not have, as the words inf, -inf and nan."""
     if isinstance(data, dict):
         return {key: finite(value) for key, value in data.items()}
     if isinstance(data, list | tuple):

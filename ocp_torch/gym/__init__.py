@@ -36,7 +36,7 @@ def make(problem: str | Problem | None = None, **options):
 
 
 def register() -> None:
-    """Put all of them into Gymnasium's registry. Raises `InputError` where it is not installed."""
+    """Register the environments of all problems with Gymnasium. Raises `InputError` where it is not installed."""
     gymnasium = require_gymnasium()
     given = {f"ocp_torch/{c.__name__}-v0": {"problem": name} for name, c in PROBLEMS.items() if c.has_simulator}
     for environment, arguments in (given | {"ocp_torch/Problem-v0": {}}).items():

@@ -14,15 +14,17 @@ from ocp_torch.problems.problem import MARGIN, Problem
 from ocp_torch.problems.starts import drawn_starts, starts_narrowly
 from ocp_torch.runs.canvas import blank_figure, drawn
 
-# Rejections at most for one start: `mu0` has mean 1, so that a bound of its supremum is met soon.
+# Tries of the rejection sampling of a start, at most; `mu0` has mean 1 and is not narrow, so that few are needed.
 MOST_TRIES = 10_000
-# Where `mu0` is narrow episodes start at one of so many draws from it.
+# Where `mu0` is narrow, episodes start at one of so many draws from it.
 DRAWN_STARTS = 4096
-# States among which the largest value of `mu0` is sought, elsewhere.
+# Elsewhere, states among which the largest value of `mu0` is sought.
 CANDIDATES = 4096
-# By default a control is held for this part of the discount time `1 / rho`, and an episode takes so many of them.
-HELD, LENGTH = 0.1, 5.0
-# Coordinates drawn, as hands of clocks.
+# Default time for which a control is held, in units of 1 / rho.
+HELD = 0.1
+# Default length of an episode, in units of 1 / rho.
+LENGTH = 5.0
+# Coordinates that are drawn as hands of clocks, at most.
 MOST_CLOCKS = 12
 
 
@@ -101,7 +103,7 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
         return observe(self.x), self._info()
 
     def _info(self, u: torch.Tensor | None = None) -> dict:
-        """The state, and that and the control ``u`` ``(1, m)`` that led to it in physical units where there are some."""
+        """The state; for a `System` also in physical units, with the control ``u`` ``(1, m)`` that led to it."""
         found = {"state": self.x[0].numpy()}
         if isinstance(problem := self.problem, System):
             found["physical_state"] = problem.from_torus(self.x)[0].numpy()
@@ -140,7 +142,7 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
     def render(self):
         return clocks(self.x[0]) if self.render_mode == "rgb_array" else None
 
-    # What an agent made for the problem needs to know of its environment.
+    # The translation that an agent made for the problem needs.
     def from_observation(self, observation: np.ndarray) -> np.ndarray:
         return state_of(observation)
 
@@ -155,7 +157,7 @@ def observe(x: torch.Tensor) -> np.ndarray:
 
 
 def state_of(observation: np.ndarray) -> np.ndarray:
-    """The state in `[0, 1)^d` that `observe` turned into ``observation`` ``(..., 2 d)``."""
+    """The state in `[0, 1)^d` of an ``observation`` ``(..., 2 d)``: the inverse of `observe`."""
     cosine, sine = np.split(np.asarray(observation, dtype=np.float64), 2, axis=-1)
     return np.arctan2(sine, cosine) / (2.0 * np.pi) % 1.0
 

@@ -1,4 +1,4 @@
-"""A saved controller as an agent in a Gymnasium environment, ours or anybody's: its episodes played, printed and filmed."""
+"""A saved controller as an agent in any Gymnasium environment: episodes are played, printed and filmed."""
 
 import logging
 import math
@@ -21,21 +21,23 @@ from ocp_torch.runs.evaluate import load_run
 
 log = logging.getLogger(__name__)
 
-# Frames of a video at most, and steps of an episode: an environment may have no end.
-MOST_FRAMES, MOST_STEPS = 600, 100_000
-# Of an action at the limit of an environment, in single precision.
+# Frames of a video, at most.
+MOST_FRAMES = 600
+# Steps of an episode, at most: an environment may have no end.
+MOST_STEPS = 100_000
+# Rounding of an action at the limit of an environment, in single precision.
 ROUNDING = 1e-6
-# The environment of a problem of one's own.
+# The environment of a user's own problem.
 OWN = "ocp_torch/Problem-v0"
-# What environments call the time of a step: ours, Pendulum-v1, MuJoCo's and Acrobot-v1, CartPole-v1.
+# Attributes with the time of a step: in our environments; in Pendulum-v1, MuJoCo's and Acrobot-v1; in CartPole-v1.
 STEP_NAMES = ("time_step", "dt", "tau")
 
 
 class Agent:
     """``controller`` in the environment ``env`` (its id is ``name``): observations to states, controls to actions.
 
-    An environment of ours says how itself; for any other the controller's problem does, by `Problem.from_observation` and
-    `Problem.to_action`. Raises `InputError` where neither does, or what they give does not fit.
+    An environment of ours translates itself; for any other the controller's problem does, by `Problem.from_observation` and
+    `Problem.to_action`. Raises `InputError` where neither can, or the result does not fit.
     """
 
     def __init__(self, controller: Controller, env, name: str) -> None:
@@ -81,7 +83,7 @@ class Agent:
 
 
 def step_of(env) -> float | None:
-    """For how long ``env`` holds an action, in its unit of time, where it says so under one of the names in use."""
+    """The time for which ``env`` holds an action, in its unit, from one of the attributes `STEP_NAMES`; `None` without."""
     told = (getattr(env, name, None) for name in STEP_NAMES)
     return next((float(t) for t in told if isinstance(t, int | float) and 0.0 < t < math.inf), None)
 
@@ -103,7 +105,7 @@ class Rollouts:
 
 
 class RolloutJob:
-    """What was asked for: a saved controller and an environment it can act in. Raises `InputError` for a wrong field."""
+    """A job of the command: a saved controller and an environment it can act in. Raises `InputError` for a wrong field."""
 
     def __init__(self, config: dict) -> None:
         self.controller = load_run(config)
@@ -117,7 +119,7 @@ class RolloutJob:
         self.seed = require_integer("seed", config["seed"], 0)
 
     def run(self) -> Rollouts:
-        """Play and print; then film the first episode again, if asked to."""
+        """Play the episodes and print their returns; film the first one again, if asked to."""
         mine = self.controller.problem
         with closing(self.environment()) as env:
             theirs = getattr(env.unwrapped, "problem", mine)
@@ -135,7 +137,7 @@ class RolloutJob:
         return found
 
     def environment(self, **options):
-        """The environment; `Problem-v0` and that of the class of the controller's problem are of this very problem."""
+        """The environment; `Problem-v0`, and that of the class of the controller's problem, are made of this very problem."""
         problem = self.controller.problem
         own = (f"ocp_torch/{type(problem).__name__}-v0", OWN)
         return made(self.env, **({"problem": problem} if self.env in own else {}), **options)
@@ -153,7 +155,7 @@ def made(name: str, **options):
 
 
 def play(controller: Controller, env, name: str, episodes: int, seed: int, frames: list | None = None) -> Rollouts:
-    """``episodes`` of them, seeded ``seed``, ``seed + 1``, ...; pictures of all states are put into ``frames``."""
+    """Play ``episodes`` seeded ``seed``, ``seed + 1``, ...; pictures of all states are put into ``frames``."""
     agent = Agent(controller, env, name)
     returns, lengths, endless = [], [], 0
     for k in range(episodes):

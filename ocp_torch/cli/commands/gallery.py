@@ -23,13 +23,13 @@ from ocp_torch.training.checkpoint import LAST
 
 log = logging.getLogger(__name__)
 TRAIN = ["ocp-train"] if INSTALLED else ["python", "scripts/train.py"]
-# What the gallery sets itself.
+# Fields that the gallery sets itself.
 OWN = {"problem", "problem._target_", "resume"}
 
 
 @dataclass(frozen=True)
 class Planned:
-    """A system that nothing is known against: ``fields`` of its run by dotted names, and the ``problem`` they make."""
+    """A system that passed its check: the ``fields`` of its run by dotted names, and the ``problem`` they make."""
 
     name: str
     fields: dict[str, Any]
@@ -37,7 +37,7 @@ class Planned:
 
     @property
     def command(self) -> str:
-        """What trains it alone."""
+        """The command that trains this system alone."""
         given = {"problem": self.name, **self.fields}
         return shlex.join([*TRAIN, *(f"{name}={as_typed(plain(name, value))}" for name, value in given.items())])
 
@@ -58,7 +58,7 @@ def planned(data: dict) -> list[Planned]:
 
 
 def fields(name: str, section: object) -> dict[str, Any]:
-    """What the ``section``, of the field ``name``, sets, by dotted names. Raises `InputError`."""
+    """The fields that the ``section`` ``name`` of the gallery sets, by dotted names. Raises `InputError`."""
     found = flat(require_section(name, section))
     for field in found.keys() & OWN:
         raise InputError(f"{name}.{field} is set, but the gallery does that itself; leave it out.")
@@ -79,7 +79,7 @@ def _begun(place: Path) -> bool:
 
 
 def shown_all(systems: list[Planned], folder: Path) -> None:
-    """Train ``systems``, each in a folder of its own in ``folder``, or go on with what is there; `gallery.html` is written
+    """Train ``systems``, each in a folder of its own in ``folder``, or resume the runs there; `gallery.html` is written
     before the first and after each. Raises `InputError` at the end where some failed."""
     seconds, failed, page = seconds_in(folder), dict[str, str](), folder / "gallery.html"
     log.info("to look at: %s; where this is stopped, folder=%s goes on", page, folder)
@@ -95,12 +95,12 @@ def shown_all(systems: list[Planned], folder: Path) -> None:
         where: dict[str, Any] = {"resume": place} if _begun(place) else {"folder": place}
         try:
             worked = bool(train(system.name, settings=system.fields, **where).history.looks)
-        except Exception as error:  # the others go on, whatever it is
+        except Exception as error:  # whatever failed, go on with the other systems
             log.debug("%s", traceback.format_exc())
             failed[system.name] = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
             log.warning("error: %s: %s", system.name, failed[system.name])
         finally:
-            if worked:  # a run that was finished before took what it took then
+            if worked:  # a run that was finished before keeps its time
                 seconds[system.name] = seconds.get(system.name, 0.0) + time.perf_counter() - started
             save()
     log.info("\nto look at: %s", page)

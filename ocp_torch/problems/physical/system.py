@@ -169,7 +169,7 @@ class System(Disturbed):
         return self.from_torus(x) if self.chart.boxed else x * self.chart.lengths(x)
 
     def vector_fields(self, x: Tensor, divergences: bool = True) -> VectorFields:
-        """`Problem.vector_fields` from one evaluation of `dynamics`, unless a function of one's own replaces one of its parts."""
+        """`Problem.vector_fields` from one evaluation of `dynamics`, unless one of its parts is replaced."""
         if any(replaced(self, name, System) for name in TOGETHER):
             return super().vector_fields(x, divergences)
         return self._together(x, divergences)
