@@ -1,1 +1,1 @@
-"""Whole comparisons: grids, the paper's kernels and figures, benchmarks. Imports anything but the command line."""
+"""Studies: reference solutions on grids, the paper's kernels and figures, benchmarks. Imports all but the command line."""

@@ -1,4 +1,4 @@
-"""A short horizon with `V` at its end against a long one without: what each costs from the same starts, and takes."""
+"""Receding horizons: a short one with `V` at its end against a long one without, by cost from the same starts and by time."""
 
 import logging
 import math
@@ -22,9 +22,10 @@ from ocp_torch.runs.evaluate import load_run
 
 log = logging.getLogger(__name__)
 
-# A control is held for that part of a discount time, and the closed loop is followed for so many discount times, unless asked
-# otherwise; integration takes so many steps while it is held, and there are so many controls at most.
-STEP, TIME, WITHIN, MOST = 0.05, 6.0, 5, 10_000
+STEP = 0.05  # default time for which a control is held, in units of 1 / rho
+TIME = 6.0  # default time that the closed loop is followed, in units of 1 / rho
+SUBSTEPS = 5  # steps of the integration while a control is held
+MOST = 10_000  # controls, at most
 
 
 Control = Callable[[np.ndarray], np.ndarray]  # of one state
@@ -32,14 +33,14 @@ Control = Callable[[np.ndarray], np.ndarray]  # of one state
 
 @dataclass(frozen=True)
 class Played:
-    """What a controller cost from each start ``(n,)``, and the seconds it took for a control."""
+    """The costs of a controller from each start ``(n,)``, and the seconds it took for a control."""
 
     costs: np.ndarray
     seconds: float
 
 
 def play(problem: Problem, control: Control, x0: np.ndarray, step: float, steps: int) -> Played:
-    """``control``, held for ``step`` and asked ``steps`` times, from each of ``x0`` ``(n, d)``."""
+    """Play ``control``, asked ``steps`` times and held for ``step`` each time, from each of ``x0`` ``(n, d)``."""
     costs, spent = [], 0.0
     for start in torch.as_tensor(x0):
         if isinstance(control, RecedingHorizon):
@@ -50,15 +51,15 @@ def play(problem: Problem, control: Control, x0: np.ndarray, step: float, steps:
             u = torch.as_tensor(control(x[0].numpy())).unsqueeze(0)
             spent += time.perf_counter() - began
             held = lambda y, u=u: problem.motion(y, u)
-            part, x = discounted_integral(held, x, problem.discount, step, WITHIN, wrap=False)
+            part, x = discounted_integral(held, x, problem.discount, step, SUBSTEPS, wrap=False)
             total += math.exp(-problem.discount * k * step) * float(part)
         costs.append(total)
     return Played(np.array(costs), spent / (len(x0) * steps))
 
 
 def horizons(config: dict) -> Callable[[], dict[str, Played]]:
-    """What ``config`` asks for, checked: `play` of a saved controller, of a receding horizon with its `V` at the end, and
-    of one ``longer`` times as long without. Raises `InputError` for a wrong field, and for a run without a `V`."""
+    """A function that plays a saved controller, a receding horizon with its `V` at the end, and one ``longer`` times as long
+    without. Checks ``config`` first: `InputError` for a wrong field, and for a run without a `V`."""
     controller, casadi = load_run(config), require_casadi()
     problem = controller.problem
     if controller.fields.value is None:
@@ -68,7 +69,7 @@ def horizons(config: dict) -> Callable[[], dict[str, Played]]:
         hint = f" ({idle})" if idle else ""
         raise InputError(f"a receding horizon needs a problem that can be simulated, without noise{hint}.")
     sizes = {name: require_integer(name, config[name], 1, maximum=MOST) for name in ("steps", "longer", "starts")}
-    longest = 1.0 / problem.discount  # what a few steps of the integration can follow
+    longest = 1.0 / problem.discount  # a few steps of the integration can follow the system for no longer
     step = STEP * longest if config["step"] is None else config["step"]
     step = require_number("step", step, above=0.0, at_most=longest)
     lasts = TIME * longest if config["time"] is None else config["time"]
@@ -99,7 +100,7 @@ def horizons(config: dict) -> Callable[[], dict[str, Played]]:
 
 
 def table(found: dict[str, Played]) -> str:
-    """Mean costs, what each is over the last one with the standard error of that, and milliseconds a control."""
+    """A table of mean costs, their excess over the last one with its standard error, and milliseconds a control."""
     *_, last = found.values()
     width = max(map(len, found))
     lines = [f"{'':{width}}  {'cost':>10}  {'over the last, %':>18}  {'ms':>8}"]

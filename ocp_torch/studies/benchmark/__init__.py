@@ -1,1 +1,1 @@
-"""Methods and models against each other: what each reaches after how many samples and how many seconds."""
+"""Benchmarks of methods and models: what each reaches after how many samples and how many seconds."""

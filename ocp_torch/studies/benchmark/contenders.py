@@ -24,7 +24,7 @@ from ocp_torch.studies.kernel.iterations import Iteration, step_sizes
 from ocp_torch.training.monitor import Silent
 
 OCCUPATION = {"dual": None, "primal": policies.CLOSED, "pd": policies.SADDLE}
-# The paper's: constant for one player, 25 % less every 20,000 steps for two.
+# The paper's schedules: constant for one player, 25 % less every 20,000 steps for two.
 SCHEDULE = {"dual": "constant", "primal": "constant", "pd": "decay"}
 
 
@@ -76,7 +76,7 @@ class KernelContender:
             if spent >= most or iteration.n >= self.longest:
                 break
         started = time.process_time()
-        # Policy evaluation in the certificate is done with a network: a kernel method gets the same help as the others.
+        # A network for policy evaluation in the certificate, so that a kernel method gets the same help as the others.
         trained = Trained(fields, OCCUPATION[self.method], lambda **form: PeriodicMLP(modes=6, **form))
         run = Run(type(self.problem).__name__.lower(), self.method, seed, iteration.n, iteration.samples)
         certified = certify_fields(self.problem, trained, self.constants, settings, run)
@@ -84,7 +84,7 @@ class KernelContender:
 
 
 class Recorder(Silent):
-    """Keeps the averaged fields at growing sample counts, with the CPU seconds until then, without what keeping them took."""
+    """Keeps the averaged fields at growing sample counts, with the CPU seconds of training until then."""
 
     def __init__(self) -> None:
         self.due = due(10_000)
@@ -110,7 +110,7 @@ class Recorder(Silent):
 
 @dataclass(frozen=True)
 class NetworkContender:
-    """``config`` is a resolved training configuration; the method and the model are read from it."""
+    """A trained run of the package; ``config`` is its resolved training configuration, with method and model."""
 
     config: dict
 
@@ -145,7 +145,7 @@ def require_rl() -> tuple:
 
 @dataclass(frozen=True)
 class RLContender:
-    """``name`` is sac or ppo with the library's defaults; actions reach ``control_bound``, as all methods may know."""
+    """SAC or PPO by ``name``, with the library's defaults; actions reach ``control_bound``, which all methods may know."""
 
     name: str
     problem: Problem

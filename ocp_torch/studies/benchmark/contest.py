@@ -1,4 +1,4 @@
-"""From a resolved configuration to contenders, and all of them run one after the other."""
+"""Contests: contenders from a resolved configuration, run one after the other."""
 
 import logging
 from dataclasses import replace
@@ -23,10 +23,10 @@ from ocp_torch.training.budgets import fill
 log = logging.getLogger(__name__)
 
 METHODS = ("dual", "primal", "pd")
-# The groups of a training configuration, beside its problem and its method.
+# Groups of a training configuration, except for its problem and its method.
 TRAINING = ("model", "optimizer", "schedule", "stepper", "averaging", "sampler", "trainer", "certificate")
 EVERYONE = tuple(f"{kind}_{m}" for kind in ("kernel", "network") for m in METHODS) + ("sac", "ppo")
-# CPU seconds of a kernel method where no time is given, and nobody ran before it.
+# CPU seconds of a kernel method where no time is given, and no contender ran before it.
 UNHURRIED = 30.0
 
 
@@ -51,8 +51,8 @@ def contender(name: str, config: dict, problem: Problem, constants: Constants):
 
 
 class Contest:
-    """Who runs on what, and how the end of each is certified; kernel methods and judge use the bounds a run with null bounds
-    would. Raises `InputError` for a wrong field."""
+    """A contest: its contenders, their problem, and the settings of the final certificates. Kernel methods and judge use the
+    constants of a run whose bounds are null. Raises `InputError` for a wrong field."""
 
     def __init__(self, config: dict) -> None:
         self.problem = build_problem(config["problem"])
@@ -77,10 +77,10 @@ class Contest:
         require_possible(self.problem, self.certificate)
 
     def run(self, folder: Path) -> list[Curve]:
-        """Run everyone with every seed; what is there so far is saved after each run. The pictures have the families beside,
-        if there are any; of no contender nothing but these is drawn.
+        """Run every contender with every seed, and save the results so far after each run. The pictures also show the
+        families of `beside`, alone if there is no contender.
 
-        A kernel method without a time of its own gets that of the longest run before it: they are compared at equal time.
+        A kernel method without a time of its own gets that of the longest run before it, for a comparison at equal time.
         """
         folder.mkdir(parents=True, exist_ok=True)
         judge = Judge(self.problem, self.constants)
@@ -107,7 +107,7 @@ class Contest:
 
 
 def _require_numbers(config: dict) -> None:
-    """Check the fields of all contenders: a wrong one is refused whoever is named."""
+    """Check the fields of all contenders, also of those that do not run."""
     kernel, rl = (require_section(name, config[name]) for name in ("kernel", "rl"))
     for method, step in require_section("kernel.step", kernel.get("step")).items():
         require_number(f"kernel.step.{require_choice('kernel.step', method, METHODS)}", step, above=0.0)

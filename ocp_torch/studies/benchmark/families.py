@@ -1,4 +1,4 @@
-"""Problems beside each other: a benchmark's file of curves, read again, and the pictures of several of them."""
+"""Benchmarks of several problems beside each other: files of curves, and pictures of several of them."""
 
 import json
 import math
@@ -19,16 +19,16 @@ from ocp_torch.studies.benchmark.measure import Curve, Point
 from ocp_torch.studies.benchmark.report import by_contender, contest_table, draw, plot, reference
 
 CURVES = "curves.json"
-# Whose numbers may differ from version to version.
+# Packages whose version is saved, as numbers may depend on it.
 PACKAGES = ("torch", "stable_baselines3")
-# Dimensions from which on an exponent of the cost is more than a line through two points.
+# Dimensions needed for an exponent of the cost: two points always lie on a line.
 FEWEST = 3
 
 
 @dataclass(frozen=True)
 class Family:
-    """The curves of one problem, made of ``fields``; ``exact`` is its `OPT`, `None` where it is not known, ``versions`` are
-    those of what ran."""
+    """The curves of one problem, which ``fields`` describe; ``exact`` is its `OPT`, `None` where it is unknown, ``versions``
+    are those of the packages that ran."""
 
     problem: str
     dim: int
@@ -39,7 +39,7 @@ class Family:
 
     @property
     def kind(self) -> str:
-        """The problem in whatever dimension."""
+        """The problem apart from its dimension."""
         return f"{self.problem} {json.dumps({k: v for k, v in self.fields.items() if k != 'dim'}, sort_keys=True)}"
 
     @property
@@ -54,7 +54,7 @@ class Family:
 
     @classmethod
     def read(cls, path: Path) -> "Family":
-        """From a file of `write`. Raises `InputError` for any other."""
+        """The family in a file of `write`. Raises `InputError` for any other file."""
         data = read_json(path)
         try:
             curves = [Curve(**{**c, "points": list(map(_point, c["points"]))}) for c in data.pop("curves")]
@@ -66,19 +66,19 @@ class Family:
             raise InputError(f"{path} is no file of curves that scripts/benchmark.py wrote.") from None
 
     def with_those_of(self, other: "Family") -> "Family":
-        """These curves, and the other's of whoever is not among them with that seed."""
+        """This family with the curves of ``other`` whose contender and seed are not in it."""
         own = {(c.contender, c.seed) for c in self.curves}
         more = [c for c in other.curves if (c.contender, c.seed) not in own]
         return replace(self, curves=self.curves + more, versions={**other.versions, **self.versions})
 
 
 def _point(saved: dict) -> Point:
-    """A point as it was saved, where a number that was not finite is a word."""
+    """The point ``saved`` in a file, in which numbers that are not finite are words."""
     return Point(**{**saved, "numbers": {name: n for name, n in saved["numbers"].items() if not isinstance(n, str)}})
 
 
 def versions() -> dict[str, str]:
-    """Of this package, and of `PACKAGES` as far as they are installed."""
+    """The versions of this package, and of `PACKAGES` as far as they are installed."""
     found = {"ocp_torch": __version__}
     for name in PACKAGES:
         try:
@@ -102,7 +102,7 @@ def read_beside(beside: object) -> list[Family]:
 
 
 def joined(families: Sequence[Family]) -> list[Family]:
-    """One family for each problem, those of a kind in order of dimension; the first ones' curves come first."""
+    """One family for each problem, those of a kind in order of dimension; of equal curves the first one counts."""
     found: dict[tuple, Family] = {}
     for one in families:
         key = (one.kind, one.dim)
@@ -112,7 +112,7 @@ def joined(families: Sequence[Family]) -> list[Family]:
 
 
 def titles(families: list[Family]) -> list[str]:
-    """The problem of each and its dimension, and the fields in which it differs from others of that name."""
+    """A title for each family: its problem and dimension, and the fields in which it differs from others of that name."""
     found = []
     for one in families:
         others = [f.fields for f in families if f.problem == one.problem]
@@ -161,8 +161,8 @@ def side_by_side(families: list[Family]):
 
 
 def seconds_until(curve: Curve, gap: float) -> float:
-    """CPU seconds of training until the simulated gap is at most ``gap`` for good, between points along a power law;
-    infinite where that never happens."""
+    """CPU seconds of training from which on the simulated gap is at most ``gap``, between points by a power law; infinite
+    where that never happens."""
     within = len(curve.points)
     while within and curve.points[within - 1].simulated <= gap:
         within -= 1
@@ -176,8 +176,8 @@ def seconds_until(curve: Curve, gap: float) -> float:
 
 
 def by_dimension(families: list[Family], gap: float) -> dict[str, list[tuple[int, float]]]:
-    """For each contender on each problem of three dimensions or more: pairs of a dimension and the median over seeds of the
-    `seconds_until` the simulated gap is at most ``gap``, where each seed comes to that."""
+    """For each contender on each problem with three dimensions or more: pairs of a dimension and the median over seeds of
+    `seconds_until` the simulated gap is at most ``gap``, where every seed reaches that."""
     found: dict[tuple[str, str], list[tuple[int, float]]] = {}
     for family in families:
         for name, own in by_contender(family.curves).items():
@@ -188,13 +188,13 @@ def by_dimension(families: list[Family], gap: float) -> dict[str, list[tuple[int
 
 
 def exponent(pairs: list[tuple[int, float]]) -> float:
-    """Of the power law that is nearest to ``pairs``, in the logarithm."""
+    """The exponent of the power law that fits ``pairs`` best, in logarithms."""
     d, seconds = np.log(np.array(pairs)).T
     return float(np.polyfit(d, seconds, 1)[0])
 
 
 def cost_figure(costs: dict[str, list[tuple[int, float]]], gap: float):
-    """What `by_dimension` found, with the exponent of each."""
+    """A figure of the result of `by_dimension`, with the exponent of each curve."""
     figure = blank_figure(5.0, 4.0)
     axis = figure.subplots()
     for name, pairs in costs.items():

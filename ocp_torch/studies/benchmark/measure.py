@@ -1,5 +1,4 @@
-"""What a contender reached, and when: points along its runs, whose numbers are bounds and performances of its fields at that
-moment, as certificates compute them."""
+"""Points along the runs of contenders: bounds and performances of their fields at that moment, as in certificates."""
 
 import math
 import statistics
@@ -25,12 +24,14 @@ from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# Integrals and simulations of one measurement: enough for 0.02 % on a curve, and beyond one dimension where there is a V.
-POINTS, TRAJECTORIES, REPLICATES, TOLERANCE = 2048, 256, 2, 2e-4
+POINTS = 2048  # states of an integral of one measurement
+TRAJECTORIES = 256  # of a simulation with V as control variate: enough for 0.02 % on a curve
+REPLICATES = 2  # of both
+TOLERANCE = 2e-4  # of a simulation
 ASCENTS = 8  # from the worst states, in search of a supremum: a quarter of what a certificate takes
-# In one dimension a policy is simulated from a table of so many states, with straight lines between them. There, and where no
-# V takes the noise of the starts off, it needs so many trajectories: from 256 SAC seemed .07 % better than a torus allows.
-TABLE, ALONE = 2**14, 2048
+TABLE = 2**14  # states of the table from which a policy in one dimension is simulated
+# Trajectories without a control variate: from 256 of them SAC seemed .07 % better than a torus allows.
+ALONE = 2048
 # The keys of a `Judge` that are performances of controllers.
 PERFORMANCES = ("value", "density", "policy")
 
@@ -51,15 +52,15 @@ class Point:
 
     @property
     def gap(self) -> float:
-        """From the highest lower bound to the lowest upper one, relative to the former: infinite where one is missing, or the
-        lower is not positive."""
+        """The gap from the highest lower to the lowest upper bound, relative to the former: infinite where one is missing, or
+        the lower is not positive."""
         return self._above_the_lower(
             min((self.numbers[n] for n in bounds.on(UPPER) if n in self.numbers), default=math.inf)
         )
 
     @property
     def simulated(self) -> float:
-        """The same, from the highest lower bound to the better controller's performance."""
+        """The gap from the highest lower bound to the better controller's performance, relative to the former."""
         return self._above_the_lower(self.perf)
 
     def _above_the_lower(self, upper: float) -> float:
@@ -69,7 +70,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Curve:
-    """One run of one contender; ``certified`` is the gap of the full certificate of its end, `None` where it has none."""
+    """One run of one contender; ``certified`` is the gap of its final full certificate, `None` where that has none."""
 
     contender: str
     seed: int
@@ -100,8 +101,8 @@ def median_and_spread(values: Sequence[float]) -> tuple[float, float, float]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Measured(TrainedContext):
-    """A context as cheap as can be: the same ``sets`` for every bound, which are not drawn anew where few states carry a
-    mean, no simulation, and none of the checks."""
+    """A context for cheap bounds: the same ``sets`` of states for all of them, also where few states carry a mean, no
+    simulation, and no checks."""
 
     sets: list[Samples]
     settings: CertificateSettings = CertificateSettings(
@@ -133,9 +134,9 @@ class Judge:
 
     @torch.no_grad()
     def __call__(self, fields: Fields, occupation: str | None, perf: bool = True) -> dict[str, float]:
-        """The values of the listed bounds on `OPT` that ``fields`` give, `F_M`, `shifted`, `J` and `G` among them, and with
-        ``perf`` of the controllers' performances, `value` and `density`, all by their keys in `certificate.json`. `F_M` is
-        left out where its `M` is guessed or none is large enough: it would be no bound."""
+        """The values of the bounds on `OPT` that ``fields`` give, `F_M`, `shifted`, `J` and `G` among them, and with ``perf``
+        the controllers' performances, `value` and `density`, by their keys in `certificate.json`. `F_M` is left out where its
+        `M` is guessed or none is large enough: it would be no bound."""
         trained = Trained(fields, occupation, nn.Identity)  # nothing is fitted, so that no network is made
         context = Measured(problem=self.problem, constants=self.constants, trained=trained, sets=self.sets)
         listed = [bound for bound in BOUNDS if bound.side in (LOWER, UPPER) and bound.applies(context)]
@@ -158,7 +159,7 @@ class Judge:
 
 
 def tabulated(policy: Policy, count: int) -> Policy:
-    """``policy`` on the circle at ``count`` equidistant states, periodic and linear between them: as cheap as it gets."""
+    """``policy`` on the circle from a table at ``count`` equidistant states, periodic and linear in between."""
     table = policy(torch.arange(count, dtype=torch.float64).unsqueeze(-1) / count)
 
     def look_up(x: Tensor) -> Tensor:

@@ -10,14 +10,14 @@ from ocp_torch.certificate import LOWER, UPPER, bounds
 from ocp_torch.runs.canvas import blank_figure
 from ocp_torch.studies.benchmark.measure import Curve, median_and_spread
 
-# The certified gaps of all are held against that of the paper's primal-dual.
+# The contender whose certified gap all others are compared with: the paper's primal-dual.
 BASELINE = "kernel pd"
-# "Reaches 1 %" in the table: the performance stays within so much of the optimum.
+# "Reaches 1 %" in the table: the performance stays within this part of the optimum.
 TOLERANCE = 0.01
 
 
 def reference(curves: list[Curve], exact: float | None) -> tuple[float, str]:
-    """What sub-optimality is relative to: `OPT`, or where it is unknown the best lower bound any run certified."""
+    """The number that sub-optimality is relative to, and its name: `OPT`, or where it is unknown the best lower bound."""
     if exact is not None:
         return exact, "OPT"
     found = [p.numbers[n] for c in curves for p in c.points for n in bounds.on(LOWER) if n in p.numbers]
@@ -67,7 +67,7 @@ def contest_table(curves: list[Curve], exact: float | None) -> str:
         ]
         lines.append("| " + " | ".join(cells) + " |")
     lines.append("")
-    # Who reaches the tolerance first with every seed, by the median over seeds.
+    # The contender that reaches the tolerance first, by the median over seeds, among those that do so with every seed.
     sure = {name: reached for name, reached in hits.items() if len(reached) == len(groups[name])}
     for unit in ("samples", "seconds") if sure else ():
         medians = {name: median(getattr(hit, unit) for hit in reached) for name, reached in sure.items()}
@@ -77,7 +77,7 @@ def contest_table(curves: list[Curve], exact: float | None) -> str:
 
 
 def gaps(curves: list[Curve]) -> list[float]:
-    """The certified gaps, in per cent; where a certificate has none, that of the bounds themselves, if there is one."""
+    """The certified gaps, in per cent; where a certificate has none, the gap of the bounds themselves, if there is one."""
     found = [c.certified if c.certified is not None else c.points[-1].gap for c in curves]
     return [100.0 * gap for gap in found if math.isfinite(gap)]
 
@@ -111,7 +111,7 @@ def plot(curves: list[Curve], exact: float | None):
 
 
 def draw(axis, curves: list[Curve], place, height, color: str, name: str) -> None:
-    """The median over seeds at each point, and the range between seeds."""
+    """Draw the median over seeds at each point, and the range of all seeds."""
     rows = list(zip(*(c.points for c in curves), strict=False))  # up to where the shortest run ends
     x = np.array([np.median([place(p) for p in row]) for row in rows])
     values = np.array([[height(p) for p in row] for row in rows])

@@ -44,7 +44,7 @@ class BernoulliKernel:
         return value, slope, curvature
 
     def jets(self, x: np.ndarray, y: np.ndarray, D: Any = None, E: Any = None) -> np.ndarray:
-        """Of `K(x, y)`, ``(..., d)`` each: value and derivatives in `x` by value and derivatives in `y`.
+        """The jets of `K(x, y)` at ``x`` and ``y``, both ``(..., d)``: value and derivatives in `x` by those in `y`.
 
         Entry ``[..., a, b]`` of ``(..., 1 + d, 1 + d)`` is differentiated in `x_a` and in `y_b`, and not for index 0. With
         the diffusion ``D`` at `x`, and ``E`` at `y`, ``(..., d, d)``, one more row, and column, is `D : hess` in `x`, and
@@ -60,7 +60,7 @@ class BernoulliKernel:
                 terms = []
                 for along, left in row:
                     for across, right in column:
-                        # In each coordinate the order of the derivative; each one in y changes the sign.
+                        # The order of the derivative in each coordinate; each derivative in y changes the sign.
                         term = reduce(np.multiply, (factors[(along + across).count(i)][..., i] for i in range(d)))
                         term = -term if len(across) == 1 else term
                         terms.append(reduce(np.multiply, (w for w in (left, right) if w is not None), term))
@@ -69,8 +69,8 @@ class BernoulliKernel:
 
 
 def _functionals(dim: int, D: Any) -> list[list[tuple[tuple[int, ...], Any]]]:
-    """Value, derivatives and `D : hess` (without ``D`` not), each as coordinates to differentiate by and a weight (or
-    none)."""
+    """Value, derivatives and, with ``D``, `D : hess`: each a list of pairs of coordinates to differentiate by and a weight,
+    `None` for 1."""
     found: list[list[tuple[tuple[int, ...], Any]]] = [[((), None)]]
     found += [[((i,), None)] for i in range(dim)]
     if D is not None:

@@ -1,6 +1,6 @@
 r"""A field in the space, for `R` independent runs: by truncated features, or exactly by the kernel at all past states.
 
-Both move along `sum_a c_a d_a Phi(x)` at one state `x` (`d_0 Phi = Phi`), whose coefficients a rule gives, and tell their
+Both move along `sum_a c_a d_a Phi(x)` at one state `x` (`d_0 Phi = Phi`), whose coefficients a rule gives, and compute their
 jets at one state. ``mark`` and ``restore`` go back to where a look-ahead began.
 """
 
@@ -15,8 +15,8 @@ from ocp_torch.studies.kernel.rules import Datum
 
 
 class FeatureExpansion:
-    """`V = theta . features`: `F` parameters however many the states, and a step costs the same at every `n`. ``radius`` is
-    that of the ball it is projected on."""
+    """`V = theta . features` with `F` parameters, however many the states: a step costs the same at every `n`. ``radius`` is
+    that of the ball `V` is projected on, `None` for no projection."""
 
     def __init__(self, features: SobolevFeatures, runs: int, outputs: int, radius: float | None) -> None:
         self.features, self.radius = features, radius
@@ -82,7 +82,7 @@ class KernelExpansion:
 
     @property
     def parameters(self) -> int:
-        """Of each run and output: `n (d + 1)` after `n` states, with noise `n (d + 2)`."""
+        """The number of parameters of each run and output: `n (d + 1)` after `n` states, with noise `n (d + 2)`."""
         return self.known * self.coefficients.shape[2]
 
     def jet(self, datum: Datum) -> np.ndarray:

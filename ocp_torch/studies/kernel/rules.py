@@ -25,7 +25,7 @@ Jets = dict[str, np.ndarray]
 
 
 class Datum(NamedTuple):
-    """A problem's data at one state for each of `R` runs, and there the jets of the features, if there are any."""
+    """A problem's data at one state for each of `R` runs, and the jets of the features there, if there are any."""
 
     x: np.ndarray  # (R, d)
     f: np.ndarray  # (R,)
@@ -38,13 +38,14 @@ class Datum(NamedTuple):
 
 
 def _scalar(jet: np.ndarray, dim: int) -> Jet:
-    """That of a field with one output."""
+    """The jet of a field with one output."""
     curvature = jet[:, 1 + dim, 0] if jet.shape[1] > 1 + dim else None
     return Jet(jet[:, 0, 0], jet[:, 1 : 1 + dim, 0], curvature)
 
 
 class Rule(ABC):
-    """``fields`` names what moves; calling it with a datum and jets gives the coefficients of the improving step."""
+    """The update of a method: ``fields`` names the fields that move, and a call with a datum and jets gives the coefficients
+    of the improving step."""
 
     fields: tuple[str, ...]
     needs_divergences = False

@@ -30,7 +30,7 @@ def _grid(count: int = 601) -> torch.Tensor:
 
 
 def optimal_occupation():
-    """`mu*` for several discounts: bounded exactly when `rho > 1`."""
+    """A figure of `mu*` for several discounts: bounded exactly when `rho > 1`."""
     figure, (axis,) = _figure(1, width=6.0)
     x = _grid(2000)
     for rho in DISCOUNTS:
@@ -41,7 +41,7 @@ def optimal_occupation():
 
 
 def evolution(history: History):
-    """The costs and performances against the number of steps, in units of `OPT` and how far from it; bands are seeds."""
+    """Costs and performances against the number of steps, in units of `OPT` and as distances from it; bands are seeds."""
     figure, (axis, distance) = _figure(2)
     recipe, looks = history.recipe, list(history.numbers)
     for k, name in enumerate(recipe.numbers):
@@ -61,7 +61,7 @@ def evolution(history: History):
 
 @torch.no_grad()
 def iterates(history: History):
-    """What a method learns, for growing `n`, with the exact functions: `V` or `w` and the controller; all four for pd."""
+    """The learned functions for growing `n` beside the exact ones: `V` or `w` and the controller; all four for pd."""
     problem, constants = circle(history.recipe.noise)
     kind, x = OCCUPATION[history.recipe.method], _grid()
     V, u, mu = truth(history.recipe.noise).at(x)

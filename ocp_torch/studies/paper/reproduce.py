@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 def check(config: dict) -> tuple[tuple[int, ...], int, dict[str, int]]:
-    """Seeds, modes and the length of the comparison with the exact kernel, validated."""
+    """Seeds, modes and the lengths of the comparisons with the exact kernel, from ``config``; `InputError` if wrong."""
     seeds = config["seeds"]
     if not isinstance(seeds, list) or not seeds:
         raise InputError(f"seeds is {seeds!r}, but must be a list of whole numbers, as in [0,1,2].")
@@ -62,7 +62,7 @@ def reproduce(checked: tuple[tuple[int, ...], int, dict[str, int]], folder: Path
 
 
 def report(histories: dict[str, History], comparisons: list[Comparison], seeds: tuple[int, ...], modes: int) -> str:
-    """The numbers as Markdown: what was found, beside what an independent re-implementation of the paper found."""
+    """The numbers as Markdown, beside those of an independent re-implementation of the paper."""
     lines = [
         f"Circle, rho = 2, M = 2, C_V = 2; regularity 2, {modes} modes; averages; seeds {', '.join(map(str, seeds))}.",
         f"dual_noise: noise {NOISE:g}, regularity 3; OPT = {truth(NOISE).optimum:.9g}, and Perf, from grids.",

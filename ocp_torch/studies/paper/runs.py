@@ -1,6 +1,6 @@
-"""The numerical section's recipes, all on the circle with `rho = 2`, `M = 2`, `C_V = 2`, regularity 2, from zero, and that of
-the remark on noise, with regularity 3; and what they give: the measured curves, the fields to draw, the exact kernel beside
-its truncation, and costs."""
+"""The recipes of the paper's numerical section, all on the circle with `rho = 2`, `M = 2`, `C_V = 2`, regularity 2, from
+zero, and that of the remark on noise, with regularity 3; and their results: measured curves, fields to draw, the exact kernel
+beside its truncation, and costs."""
 
 import time
 from collections.abc import Callable
@@ -28,16 +28,16 @@ Tick = Callable[[int], None]
 
 # Nodes of the finest grid on which controllers are evaluated where there is noise.
 SIDE = 512
-# Parts of a window whose time is taken.
+# Parts of a window that are timed; the fastest counts.
 PARTS = 5
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """``looks`` are the step counts at which the averages are measured, ``drawn`` those at which they are drawn. ``numbers``
-    are the method's own, in the order of the keys of `figures.LABELS`. The table has the step counts that ``known`` has: what
-    an independent re-implementation found there, in per cent of `OPT`, as ranges over seeds. ``noise`` is that of the
-    circle."""
+    """A run of the paper. ``looks`` are the step counts at which the averages are measured, ``drawn`` those at which they are
+    drawn. ``numbers`` are the method's own, in the order of the keys of `figures.LABELS`. ``known`` has, for the step counts
+    of the table, the results of an independent re-implementation, in per cent of `OPT`, as ranges over seeds. ``noise`` is
+    that of the circle."""
 
     method: str
     section: str
@@ -54,7 +54,7 @@ class Recipe:
 
     @property
     def regularity(self) -> int:
-        """Of the space: second derivatives have to be continuous functionals where there is noise."""
+        """The regularity of the space: with noise second derivatives must be continuous functionals."""
         return 3 if self.noise else 2
 
     @property
@@ -67,10 +67,13 @@ class Recipe:
         return step_sizes(self.step, self.steps, SCHEDULE[self.method])
 
 
-# Of the circle with noise: the kink of `V*` becomes a layer of a tenth of the circle.
+# Noise of the noisy circle: the kink of `V*` becomes a layer of a tenth of the circle.
 NOISE = 1e-2
-SHORT, SHORT_DRAWN = (200, 500, 1000, 2000, 5000, 10000, 15000, 20000), (500, 2000, 5000, 20000)
-LONG, LONG_DRAWN = tuple(10 * n for n in SHORT), (2000, 20000, 100000, 200000)
+# Step counts at which short and long runs are measured, and drawn.
+SHORT = (200, 500, 1000, 2000, 5000, 10000, 15000, 20000)
+SHORT_DRAWN = (500, 2000, 5000, 20000)
+LONG = tuple(10 * n for n in SHORT)
+LONG_DRAWN = (2000, 20000, 100000, 200000)
 KNOWN: dict[str, dict[int, dict[str, tuple[float, float]]]] = {
     "dual": {5000: {"F_M": (-5.6, -5.3), "value": (2.1, 2.1)}, 20000: {"F_M": (-2.6, -2.5), "value": (0.9, 0.9)}},
     "primal": {5000: {"G": (0.6, 0.9)}, 20000: {"G": (0.17, 0.20)}},
@@ -101,7 +104,7 @@ class Truth(NamedTuple):
 
 @cache
 def truth(noise: float) -> Truth:
-    """That of the circle: exact, and with noise from grids."""
+    """The truth on the circle: exact, and with ``noise`` from grids."""
     problem, _ = circle(noise)
     if not problem.noisy:
         assert problem.exact_optimum is not None  # the circle has its exact truth
@@ -110,7 +113,7 @@ def truth(noise: float) -> Truth:
 
     def at(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         grid, density = reference.solution.grid, reference.solution.occupation
-        assert density is not None  # it is there wherever there is noise
+        assert density is not None  # grids give it wherever there is noise
         return *reference.interpolate(x), grid.interpolated(density[:, None], x)[:, 0]
 
     return Truth(reference.optimum, at)
@@ -136,7 +139,7 @@ class History:
 
 
 def carry_out(recipe: Recipe, seeds: tuple[int, ...], modes: int, tick: Tick = lambda steps: None) -> History:
-    """All ``seeds`` of one recipe at once, with truncated features. ``tick`` is told the steps made."""
+    """Run all ``seeds`` of one recipe at once, with truncated features. ``tick`` is called with the number of steps made."""
     problem, constants = circle(recipe.noise)
     features = SobolevFeatures(1, recipe.regularity, modes=modes)
     iteration = Iteration(problem, recipe.method, constants, seeds, features=features)
@@ -166,7 +169,7 @@ def carry_out(recipe: Recipe, seeds: tuple[int, ...], modes: int, tick: Tick = l
 
 @dataclass(frozen=True)
 class Comparison:
-    """The exact kernel beside its truncation on the same samples: how far the averaged fields are apart, and the cost."""
+    """The exact kernel beside its truncation on the same samples: differences of the averaged fields, and the cost."""
 
     method: str
     steps: int
@@ -197,7 +200,7 @@ def compare_with_exact(
 def timed(iteration: Iteration, sizes: np.ndarray, windows: int, tick: Tick) -> list[tuple[int, float]]:
     """Make all steps; at the end of each window, `n` and the CPU seconds per step of its fastest part.
 
-    The fastest of `PARTS`, because whatever else a machine does only ever slows a part down.
+    The fastest of `PARTS` counts, as other work of the machine can only slow a part down.
     """
     costs = []
     for window in np.array_split(sizes, min(windows, len(sizes))):

@@ -1,5 +1,5 @@
-"""How far the numbers of three grids may be off: extrapolation, and what lies between the nodes, where grids agree with one
-another about another problem."""
+"""The error of the numbers of three grids: extrapolation, and a search for features between the nodes, which all grids would
+miss."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,30 +16,32 @@ from ocp_torch.problems.starts import start_distribution
 from ocp_torch.studies.reference.finite_differences import diffusion
 from ocp_torch.studies.reference.grid import Grid
 
-# Orders of the schemes where V is smooth, by which the leading error is removed; the second is that of linear interpolation.
-ORDER, LINEAR = 2.0, 1.0
+# Order of the schemes where V is smooth, by which the leading error is removed.
+ORDER = 2.0
+# Order of linear interpolation.
+LINEAR = 1.0
 # Factor on the change of the extrapolated number from one pair of grids to the next: covers every order from 1 on.
 SAFETY = 3.0
-# What is removed by extrapolation counts as uncertain by this share at least, times SAFETY.
+# Part of what extrapolation removes that counts as uncertain at least, times SAFETY.
 DOUBT = 0.1
-# Orders between which that of the grids is looked for: no scheme has one outside.
+# Range in which the order of the grids is looked for: no scheme has one outside.
 ORDERS = (1e-3, 12.0)
 # Numbers that differ by less, relative to their size, are the same.
 ROUNDING = 1e-10
-# States evaluated for each node, and at least and at most.
-PER_NODE, FEWEST, MOST = 4, 2**16, 2**18
-# States worked on at once: the stencils of 64 nodes of a piece fit the memory.
+PER_NODE = 4  # states evaluated between the nodes, for each node
+FEWEST = 2**16  # of these states, at least
+MOST = 2**18  # of these states, at most
+NEAR_STARTS = 2**10  # more of these states, where `mu0` or `f` is narrow
+# States worked on at once: their stencils of 64 nodes each fit the memory.
 PIECE = 2**13
-# And more of them where `mu0` or `f` is narrow.
-NEAR_STARTS = 2**10
-# Ascents from the states that stand out most, and steps of each.
-ASCENTS, STEPS = 32, 60
-# A feature that no node shows, of this part of a function's oscillation, makes the error unknown; so does as much mass of mu0
-# that the nodes miss.
+ASCENTS = 32  # from the states that stand out most
+STEPS = 60  # of each ascent
+# A feature between the nodes of more than this part of a function's oscillation makes the error unknown; so does as much mass
+# of mu0 that the nodes miss.
 UNSEEN = 0.02
-# Oscillations below that part of the largest value are rounding.
+# Oscillations below this part of the largest value are rounding.
 FLAT = 1e-9
-# Beside a kink the nodes around differ, and its tip rises above them by less than this part of that: such tips do not count.
+# The tip of a kink rises above the nodes around by less than this part of their own differences: such tips do not count.
 KINK = 0.5
 
 
@@ -88,11 +90,11 @@ def extrapolate(
 
 
 def look_between(problem: Problem, grid: Grid) -> tuple[float, float, str | None]:
-    """Compare `f`, `a`, `B` and `D` with what the nodes of ``grid`` around give, at many states between and on ascents from
+    """Compare `f`, `a`, `B` and `D` between the nodes of ``grid`` with the nodes around, at many states and on ascents from
     there, and the mass of `mu0` at the nodes with 1.
 
-    How far `f` falls at most below what the nodes around show, by which `V` can be too high; how far the mass is from 1; and
-    a sentence that says what makes the error unknown, and where, or `None`.
+    Returns the largest amount by which `f` falls below the nodes around, as `V` can be too high by as much; the distance of
+    the mass from 1; and a sentence with what makes the error unknown, and where, or `None`.
     """
     seed = derive_seed(0, Branch.REFERENCE)
     x = scrambled_sobol(min(max(PER_NODE * grid.count, FEWEST), MOST), problem.dim, seed, torch.float64)
@@ -120,8 +122,8 @@ def look_between(problem: Problem, grid: Grid) -> tuple[float, float, str | None
 
 
 def _unseen(grid: Grid, function: Callable[[Tensor], Tensor], x: Tensor, sign: float) -> tuple[float, float, Tensor]:
-    """How far ``function``, times ``sign``, rises above all nodes of the cubic stencil and above cubic interpolation:
-    relative to its oscillation, absolutely, and at which state.
+    """The largest rise of ``function``, times ``sign``, above all nodes of the cubic stencil and above cubic interpolation:
+    relative to its oscillation, absolutely, and its state.
 
     A smooth function rises above its nodes by `O(h^2)` but hardly above the interpolation; beside a jump or a kink the
     interpolation is far off but the nodes are not, nor by more than they differ themselves.
@@ -139,7 +141,7 @@ def _unseen(grid: Grid, function: Callable[[Tensor], Tensor], x: Tensor, sign: f
         beside = sign * (here - (stencil.cubic.unsqueeze(-1) * around).sum(dim=1))
         return (torch.minimum(above, beside).clamp_min(0.0) / size).amax(dim=-1)
 
-    # From where the function itself is highest too: a feature may be narrower than the states are apart.
+    # Ascents from the highest states too: a feature may be narrower than the distance of the states.
     highest = x[(sign * sampled / size).amax(dim=-1).topk(ASCENTS).indices]
     level = lambda x: (sign * function(x) / size).amax(dim=-1)
     climbed = supremum(level, highest, ASCENTS, STEPS, differentiable=False)

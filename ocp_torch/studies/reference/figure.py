@@ -1,4 +1,4 @@
-"""The grid's `V` and `u` beside those of a trained controller: curves in one dimension, maps beyond."""
+"""Figures of the grid's `V` and `u` beside those of a trained controller: curves in one dimension, maps beyond."""
 
 import torch
 from torch import Tensor
@@ -8,8 +8,9 @@ from ocp_torch.maths.supremum import batched
 from ocp_torch.runs.canvas import blank_figure
 from ocp_torch.studies.reference.reference import Reference
 
-# States along a curve, along each side of a map, and arrows along each side of it.
-LINE_POINTS, MAP_POINTS, ARROWS = 400, 96, 16
+LINE_POINTS = 400  # states along a curve
+MAP_POINTS = 96  # states along each side of a map
+ARROWS = 16  # arrows along each side of a map
 
 
 @torch.no_grad()

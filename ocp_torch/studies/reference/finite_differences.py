@@ -27,7 +27,7 @@ from ocp_torch.problems.samples import driven
 from ocp_torch.studies.reference.grid import PIECE, Grid
 from ocp_torch.studies.reference.semi_lagrangian import minimiser, running_cost
 
-# Of what is taken back of the viscosity, relative to osc(V) h^{1/2} per 1 / rho; that of the semi-Lagrangian scheme.
+# Limit of what is taken back of the viscosity, relative to osc(V) h^{1/2} per 1 / rho; as in the semi-Lagrangian scheme.
 CLIP = 4.0
 # Dimensions in which the matrix is factored: at 40 nodes a side in three the factors fill gigabytes.
 FACTORED = 2
@@ -57,7 +57,7 @@ class FiniteDifferences:
         self.straight = 2.0 * own - D.abs().sum(dim=-1)  # what mixed derivatives leave of the weight along a coordinate
 
     def pull(self, slope: Tensor, nodes: slice | Tensor, u: Tensor) -> Tensor:
-        """`-B^T grad V / rho`, ``(N, m)``; here ``u`` says nothing of it."""
+        """`-B^T grad V / rho`, ``(N, m)``, which in this scheme does not depend on ``u``."""
         return -torch.einsum("ndm,nd->nm", self.B[nodes], slope[nodes]) / self.rho
 
     def velocity(self, u: Tensor) -> Tensor:
@@ -65,7 +65,7 @@ class FiniteDifferences:
         return driven(self.a, self.B, u) / self.grid.spacing
 
     def viscosity(self, g: Tensor) -> Tensor:
-        """What is missing along each coordinate for weights of one sign, ``(n, d)``."""
+        """The viscosity that is missing along each coordinate for weights of one sign, ``(n, d)``."""
         return (0.5 * g.abs() - self.straight.clamp_min(0.0)).clamp_min(0.0)
 
     def needs_viscosity(self, control: Tensor) -> bool:
@@ -73,8 +73,8 @@ class FiniteDifferences:
         return bool((self.viscosity(self.velocity(control)) > 0.0).any())
 
     def improve(self, value: Tensor, control: Tensor) -> tuple[Tensor, Tensor]:
-        """The best at each node of the control held, and of those that central and all one-sided differences give; with the
-        right side of the equation under it."""
+        """The best control at each node among the one held and those of central and all one-sided differences, and the right
+        side of the equation under it."""
         grid, everything = self.grid, slice(0, self.grid.count)
         ahead = torch.stack([grid.shifted(value, k, 1) - value for k in range(grid.dim)], dim=-1)
         behind = torch.stack([value - grid.shifted(value, k, -1) for k in range(grid.dim)], dim=-1)

@@ -1,4 +1,4 @@
-"""A periodic grid on the unit torus: nodes, interpolation stencils and differences; and what such grids can solve."""
+"""A periodic grid on the unit torus: nodes, stencils and differences; and checks that such grids can solve a problem."""
 
 from dataclasses import dataclass
 
@@ -14,18 +14,19 @@ OFFSETS = 4  # nodes of the cubic stencil per coordinate
 PIECE = 2**14
 MOST_DIMENSIONS = 3
 FEWEST_NODES = 8
-# Ratio of the sides of successive grids, and the finest side, by dimension: in three dimensions a grid half as fine as one
-# that is affordable shows little.
+# Ratio of the sides of successive grids, by dimension: in three dimensions a grid half as fine as an affordable one shows
+# little.
 RATIO = {1: 2.0, 2: 2.0, 3: 1.5}
+# Default side of the finest grid, by dimension.
 FINEST = {1: 1024, 2: 192, 3: 40}
-# In one dimension with noise: layers as thin as the diffusion over the speed, and ten digits in a second.
+# In one dimension with noise: V has layers as thin as the diffusion over the speed, and this takes a second.
 FINEST_WITH_NOISE = 4096
-# Index, weights and their copies, per entry of the interpolation matrix.
+# Bytes per entry of the interpolation matrix: index, weights and their copies.
 BYTES_PER_ENTRY = 40
 # A function that changes by more, relative to its size, over one period has not period 1.
 TOLERANCE = 1e-6
-# Single states and controls at which functions and the control cost are tried.
-PROBED, CONTROLS = 256, 64
+PROBED = 256  # states at which functions are tried
+CONTROLS = 64  # controls at which the control cost is tried
 
 
 @dataclass(frozen=True)

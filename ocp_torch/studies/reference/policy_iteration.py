@@ -21,23 +21,25 @@ from ocp_torch.studies.reference.finite_differences import FiniteDifferences
 from ocp_torch.studies.reference.grid import PIECE, Grid
 from ocp_torch.studies.reference.semi_lagrangian import SemiLagrangian, minimiser, running_cost
 
-# Policy iteration takes some ten policies; more than so many go in circles.
+# Policy iteration takes some ten policies; more than this go in circles.
 MOST_POLICIES = 40
-# A candidate that moves the end of the path by less than this many cells is no other control; one that is not better is tried
-# again halfway, so many times.
-NEGLIGIBLE, HALVINGS = 1e-3, 8
-# A neighbour whose control moves that end by less cells would lead to the same minimum.
+# A candidate that moves the end of the path by fewer cells than this counts as the control now held.
+NEGLIGIBLE = 1e-3
+# Times that a candidate which is not better is tried again halfway.
+HALVINGS = 8
+# A neighbour whose control moves that end by fewer cells than this would lead to the same minimum.
 DIFFERENT = 0.1
-# From so many policies on: they no longer get better when the last few left more than this part of the least residual before.
-FIRST, LAST, STUCK = 9, 4, 0.7
-# Error of V that evaluating a policy may leave, relative to the residual of the policy before; never more than the goal.
+# Policies no longer get better if the residuals of the last four are all above this part of the least one before.
+STUCK = 0.7
+LAST = 4
+FIRST = 9  # policies before that is tested
+# Error of V that the evaluation of a policy may leave, relative to the last residual; never more than the goal.
 EVALUATED = 0.01
-# Unknowns up to which the matrix is factored. The stencils of two and three dimensions fill the factors: with 14,000 unknowns
-# in three dimensions that took 14 s, and the iteration 0.05 s.
+# Unknowns up to which the matrix is factored: with 14,000 unknowns in three dimensions that took 14 s, and iteration 0.05 s.
 DIRECT = 1200
-# Iterations of the Krylov method; what needs more is left to sweeps, which cannot fail where `beta W` contracts.
+# Iterations of the Krylov method, at most; then sweeps follow, which cannot fail where `beta W` contracts.
 KRYLOV_ITERATIONS = 150
-# Sweeps contract by beta; so many times those that should do are tried.
+# Sweeps, at most, as a multiple of those that a contraction by beta should need.
 PATIENCE = 1.5
 
 
@@ -102,7 +104,7 @@ def improve(scheme: SemiLagrangian, value: Tensor, control: Tensor) -> tuple[Ten
     control, right = control.clone(), torch.empty_like(value)
 
     def adopt(nodes: Tensor, u: Tensor) -> Tensor:
-        """Hold ``u`` at those of ``nodes`` where it is better than what is held; which are the others."""
+        """Hold ``u`` at those of ``nodes`` where it is better than the control held; a mask of the others."""
         reached = scheme.right_side(value, nodes, u)[0]
         better = reached < right[nodes]
         control[nodes[better]], right[nodes[better]] = u[better], reached[better]
@@ -111,8 +113,8 @@ def improve(scheme: SemiLagrangian, value: Tensor, control: Tensor) -> tuple[Ten
     for nodes in scheme.pieces:
         held = control[nodes]
         right[nodes] = scheme.right_side(value, nodes, held)[0]
-        # The closed form, or the first that is better halfway to it, a quarter of the way, ...: without these a control far
-        # too large for the step would be refused, and the one held taken for optimal.
+        # The closed form, or the first better control halfway to it, a quarter of the way, ...: otherwise a control far too
+        # large for the step would be refused, and the one held taken for optimal.
         change = scheme.closed_form(slope, nodes, held, held) - held
         left = (scheme.push(nodes, change) > NEGLIGIBLE * grid.spacing).nonzero().squeeze(1)
         for k in range(HALVINGS):
@@ -150,7 +152,7 @@ def solve_fixed_point(
     rows = np.arange(0, index.numel() + 1, index.shape[1], dtype=np.int32)
     entries = weights.flatten().numpy(), index.flatten().int().numpy(), rows
     W = csr_array(entries, shape=(len(c), len(c)), copy=True)
-    W.eliminate_zeros()  # in place; of the monotone scheme they are three in four
+    W.eliminate_zeros()  # in place; three in four entries of the monotone scheme are 0
     A, right, first = (identity(len(c)) - beta * W).tocsc(), c.numpy(), start.numpy()
     if len(right) <= DIRECT:
         return torch.from_numpy(spsolve(A, right))
@@ -171,8 +173,8 @@ def solve_fixed_point(
 
 
 def defect(scheme: SemiLagrangian | FiniteDifferences, value: Tensor, control: Tensor) -> float:
-    """Median over the nodes of `R(u) + R*(s) - s . u >= 0`, `s = -B^T grad V / rho` midway along the path under `u`: how
-    far the Hamilton-Jacobi-Bellman equation is from being met where `V` is smooth."""
+    """The median over the nodes of `R(u) + R*(s) - s . u >= 0`, `s = -B^T grad V / rho` midway along the path under `u`: the
+    error in the Hamilton-Jacobi-Bellman equation where `V` is smooth."""
     slope, gaps = scheme.grid.gradient(value), []
     for nodes in scheme.pieces:
         u = control[nodes]

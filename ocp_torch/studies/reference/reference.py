@@ -15,26 +15,28 @@ from ocp_torch.studies.reference.policy_iteration import GridSolution, solve
 from ocp_torch.studies.reference.semi_lagrangian import CLIP, SemiLagrangian, minimiser
 from ocp_torch.studies.reference.with_noise import error_of_jumps, moved_numbers, with_noise
 
-# The step moves a typical state by this many cells, and is at most this share of 1 / rho on the coarsest grid.
-CELLS, LONGEST = 1.0, 0.25
-# Policy iteration ends where one more policy changes V by less, relative to the oscillation of f; where a monotone scheme is
-# all there is, whose own error is larger; and where it only makes a start for another.
-TOLERANCE, COARSE, ROUGH = 1e-7, 1e-4, 1e-3
-# What iterations stopped early leave is too much where it is more than that part of the stated error.
+CELLS = 1.0  # that a step moves a typical state by
+LONGEST = 0.25  # step on the coarsest grid, in units of 1 / rho, at most
+# Policy iteration ends where one more policy changes V by less, relative to the oscillation of f.
+TOLERANCE = 1e-7
+COARSE = 1e-4  # for the monotone scheme alone, whose own error is larger
+ROUGH = 1e-3  # for the start of another iteration
+# Iterations count as settled if the error of stopping them early is at most this part of the stated error.
 SETTLED = 0.5
-# How fast a typical state moves is found on a grid of at most so many nodes per coordinate, by dimension. The optimal speed
-# depends on the step a little, so it is found again with the step it gave, so many times in all.
-SPEED_SIDE, SPEED_ROUNDS = {1: 64, 2: 32, 3: 16}, 3
+# The typical speed is found on a grid of at most so many nodes per coordinate, by dimension.
+SPEED_SIDE = {1: 64, 2: 32, 3: 16}
+# Rounds of this, each with the step of the round before, on which the optimal speed depends a little.
+SPEED_ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What three grids say of ``problem``.
+    """The results of three grids for ``problem``.
 
-    ``optimum`` is `OPT` extrapolated, ``error`` its stated error, ``order`` the order observed (see `extrapolate`); an error
-    that nobody knows is `None`, and ``unknown`` says why; ``sides`` are nodes per coordinate and ``estimates`` the `OPT` of
-    the three grids; ``value_change`` the largest change of `V` from the second grid to the finest; ``unsettled`` is the part
-    of ``error`` that iterations stopped early leave; ``value`` ``(side,) * d`` is `V` on the finest grid.
+    ``optimum`` is `OPT` extrapolated, ``error`` its stated error, ``order`` the order observed (see `extrapolate`); an
+    unknown error is `None`, and ``unknown`` says why; ``sides`` are nodes per coordinate and ``estimates`` the `OPT` of the
+    three grids; ``value_change`` the largest change of `V` from the second grid to the finest; ``unsettled`` the part of
+    ``error`` from iterations stopped early; ``value`` ``(side,) * d`` is `V` on the finest grid.
     """
 
     problem: Problem
@@ -108,7 +110,7 @@ def _reference(
     order: float = ORDER,
     moved: Sequence[float] = (),
 ) -> Reference:
-    """What the ``solutions`` on three grids say; ``even`` and ``order`` are as `extrapolate` has them, ``moved`` are the
+    """The reference from ``solutions`` on three grids; ``even`` and ``order`` are as in `extrapolate`, ``moved`` are the
     numbers of the coarsest grid moved by parts of a cell."""
     start, sides = solutions[-1], tuple(s.grid.side for s in solutions)
     estimates = tuple(s.mean(problem) for s in solutions)
@@ -144,7 +146,7 @@ def _without_noise(problem: Problem, sides: Sequence[int]) -> list[GridSolution]
 
 
 def _monotone(problem: Problem, sides: Sequence[int]) -> list[GridSolution]:
-    """Those of the monotone scheme."""
+    """The solutions of the monotone scheme on grids of ``sides`` nodes a coordinate."""
     start, pace = _speed(problem, sides[0])
     solutions = []
     for n in sides:

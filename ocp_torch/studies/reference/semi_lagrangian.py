@@ -24,8 +24,8 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import driven
 from ocp_torch.studies.reference.grid import PIECE, Grid
 
-# Of the cubic correction, relative to osc(V) h^{3/2}: a smaller one costs accuracy where V is smooth and the grid coarse, a
-# larger one overshoots more at kinks.
+# Limit of the cubic correction, relative to osc(V) h^{3/2}: a smaller one costs accuracy where V is smooth and the grid
+# coarse, a larger one overshoots more at kinks.
 CLIP = 4.0
 # Nodes of the Gauss-Legendre rule for the discounted weights: exact to rounding for steps of a part of 1 / rho.
 QUADRATURE = 12
@@ -59,9 +59,10 @@ def discounted_weights(rho: float, tau: float) -> list[float]:
 
 class SemiLagrangian:
     """The scheme for ``problem`` on ``grid``; ``step`` is `tau`, in units of time; ``rise`` is `osc V`, to which clipping is
-    relative. At 0 all of the cubic correction is clipped: the scheme is monotone, and each policy lowers `V` whatever it
-    starts from. In its methods ``nodes`` are indices or a slice of nodes, ``u`` ``(N, m)`` their controls, ``value``
-    ``(n,)`` is `V` and ``slope`` ``(n, d)`` its gradient at all nodes. ``pieces`` are all nodes, piece by piece."""
+    relative. At 0 all of the cubic correction is clipped: the scheme is monotone, and each policy lowers `V` from any start.
+
+    In its methods ``nodes`` are indices or a slice of nodes, ``u`` ``(N, m)`` their controls, ``value`` ``(n,)`` is `V` and
+    ``slope`` ``(n, d)`` its gradient at all nodes. ``pieces`` are all nodes, piece by piece."""
 
     def __init__(self, problem: Problem, grid: Grid, step: float, rise: float = 0.0) -> None:
         self.problem, self.grid, self.step = problem, grid, step
@@ -83,8 +84,8 @@ class SemiLagrangian:
         return middle, x + self.step * self.problem.velocity(middle, u)
 
     def right_side(self, value: Tensor, nodes: slice | Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The right side ``(N,)`` under ``u``, which is linear in `V`; with it the nodes of `V` that enter, their weights,
-        and the rest, in which is what was clipped."""
+        """The right side ``(N,)`` under ``u``, which is linear in `V`; the nodes of `V` that enter it, their weights, and the
+        constant rest, which includes the clipped correction."""
         middle, end = self.move(nodes, u)
         stencil, f = self.grid.stencil(end), self.problem.state_cost
         correction = ((stencil.cubic - stencil.linear) * value[stencil.index]).sum(dim=-1)
@@ -108,5 +109,5 @@ class SemiLagrangian:
         return torch.where(torch.isfinite(found), found, otherwise)
 
     def push(self, nodes: Tensor, change: Tensor) -> Tensor:
-        """How far a ``change`` of control moves the end of the path, ``(N,)``."""
+        """The distance by which a ``change`` of control moves the end of the path, ``(N,)``."""
         return self.step * torch.einsum("ndm,nm->nd", self.B[nodes], change).abs().amax(dim=-1)

@@ -27,8 +27,8 @@ log = logging.getLogger(__name__)
 
 
 class ReferenceJob:
-    """What was asked for: a problem, or a run that names one and beside whose controller the reference is drawn. Every field
-    is checked before anything is solved or written; raises `InputError` for a wrong one."""
+    """A job of the command: a problem, or a run that names one and beside whose controller the reference is drawn. Every
+    field is checked before anything is solved or written; raises `InputError` for a wrong one."""
 
     def __init__(self, config: dict) -> None:
         section = require_section("problem", config["problem"])
@@ -56,7 +56,7 @@ class ReferenceJob:
         self.file = None if config["save"] is None else _npz(str(config["save"]))
 
     def run(self) -> Reference:
-        """Solve, print, and write what was asked for."""
+        """Solve, print, and write the requested files."""
         torch.set_num_threads(self.threads)
         started = time.process_time()
         reference = solve_reference(self.problem, self.side, self.memory)
@@ -100,7 +100,7 @@ def save_reference(path: Path, reference: Reference) -> None:
 
 
 def reference_table(reference: Reference) -> str:
-    """What a user reads: `OPT` with its error, the grids, the order, and the exact optimum where the problem knows it."""
+    """The table for the terminal: `OPT` with its error, the grids, the order, and the exact optimum where it is known."""
     problem = reference.problem
     error = "error unknown" if reference.error is None else f"+- {reference.error:.2g}"
     lines = [
