@@ -1,4 +1,4 @@
-"""A controller somebody brings, as a policy: checked, wrapped to the torus, with derivatives by differences."""
+"""A given controller as a policy: checked, wrapped to the torus, with derivatives by differences."""
 
 from collections.abc import Callable
 
@@ -12,19 +12,19 @@ from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.problem import Problem
 
-# States a controller is tried on before anything is computed with it, and sizes of batches among whose states some are again.
-PROBES, BATCHES = 7, (16, 64, 1024)
-# Two calls may differ by so much, relative to the control, and still be a function of the state; and a control may be longer
-# than the limit by so much, relative to it, as it was clipped in single precision: it is cut back.
-SAME, BEYOND = 1e-4, 1e-5
+PROBES = 7  # states on which a controller is tried before anything is computed with it
+BATCHES = (16, 64, 1024)  # sizes of batches that begin with these states, whose answers must be the same
+SAME = 1e-4  # difference of two answers, relative to the control, that rounding explains
+# Relative excess of a control over its limit that clipping in single precision explains: such a control is cut back.
+BEYOND = 1e-5
 
 
 class BlackBox:
     """``function`` of states ``(N, d)`` to controls ``(N, m)``, a tensor or an array, as a policy in float64.
 
-    It is asked on `[0, 1)^d` only. Central differences stand in for its derivatives, so that it may be NumPy, a runtime's
-    session or anything else; ``precision`` is what it computes in. Raises `InputError` where it fails, gives another
-    shape or a number that is not finite, breaks the problem's limit on the control, or depends on more than the state.
+    The function is called on `[0, 1)^d` only. Central differences stand in for its derivatives, so that it may be NumPy, a
+    runtime's session or anything else; ``precision`` is the one it computes in. Raises `InputError` where it fails, gives
+    another shape or a number that is not finite, breaks the limit on the control, or depends on more than the state.
     """
 
     def __init__(self, function: Callable, problem: Problem) -> None:
@@ -55,7 +55,7 @@ class BlackBox:
         """The answer at states ``x`` ``(N, d)`` of the unit cell, ``(N, m)``; whatever goes wrong is an `InputError`."""
         try:
             return self._ask(self._convert, x)
-        except Exception as error:  # whatever a stranger's code may raise
+        except Exception as error:  # whatever the user's code may raise
             raise _refusal(error) from None
 
     def _ask(self, convert: Callable[[Tensor], object], x: Tensor) -> Tensor:
@@ -75,7 +75,7 @@ class BlackBox:
         return out if out.is_floating_point() else out.double()
 
     def require_still(self) -> None:
-        """Raise `InputError` where it now answers otherwise than at first, or in batches of other sizes."""
+        """Raise `InputError` where the answers differ from those at first, or with the size of the batch."""
         for size in BATCHES:
             out = self._answered(self._states[:size])[:PROBES]
             if float((out - self._first).abs().max()) > _rounding(self._first):
@@ -91,7 +91,7 @@ class BlackBox:
         for convert in forms:
             try:
                 out, again, alone = (self._ask(convert, states) for states in (x, x, x[2:3]))
-            except Exception as error:  # whatever a stranger's code may raise
+            except Exception as error:  # whatever the user's code may raise
                 complaints.append(error)
                 continue
             size = _rounding(out)
@@ -112,7 +112,7 @@ class _WantsArrays(Exception):
 
 
 def _rounding(out: Tensor) -> float:
-    """By how much two answers ``(N, m)`` may differ and be the same."""
+    """The difference between two answers ``(N, m)`` that rounding explains."""
     return SAME * float(out.abs().max().nan_to_num(nan=1.0)) + 1e-12
 
 
@@ -124,8 +124,8 @@ def _refusal(error: Exception) -> InputError:
 
 
 def require_limit(u: Tensor, x: Tensor, cost: PowerCost) -> None:
-    """Raise `InputError` where a control ``(N, m)`` at one of the states ``x`` is beyond the limit of ``cost``, and that by
-    more than rounding."""
+    """Raise `InputError` where a control ``u`` ``(N, m)`` at one of the states ``x`` exceeds the limit of ``cost`` by more
+    than rounding."""
     gauge = cost.gauge(u)
     worst = int(gauge.argmax())
     if float(gauge[worst]) > 1.0 + BEYOND:

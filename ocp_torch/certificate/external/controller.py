@@ -1,4 +1,4 @@
-r"""The context of one given controller, wherever it comes from: what it costs, and how far from optimal it is.
+r"""The context of one given controller: what it costs, and how far from optimal it is.
 
 `V^u` and `mu^u` are fitted to its closed loop by least squares (P(u) and D(u), section 5.4 of the paper); the fitted `V`
 is the control variate of the simulation and, with the suprema of its Bellman slack, bounds `V^u` on both sides. A second
@@ -25,7 +25,7 @@ from ocp_torch.fields.fields import Fields
 from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.maths.jets import Field
 
-# The name under which its performance stands in a certificate.
+# The name under which the controller's performance stands in a certificate.
 GIVEN = "given"
 
 
@@ -94,7 +94,7 @@ class ControllerContext(Context):
         met = observe(self.problem, self.policy, found.get(GIVEN), self.few, 0)
         if self.value is None or "value" not in found:
             return met
-        # M is about the optimal controller, which the one from V is nearer to than anybody's.
+        # M is about the optimal controller, to which the one from V is nearer than the given one.
         best, states = ValuePolicy(self.problem, self.value), self.settings.occupation_states
         near = observe(self.problem, best, found["value"], self.few, states)
         return replace(met, sup_occupation=near.sup_occupation, a_priori_occupation=near.a_priori_occupation)

@@ -1,8 +1,8 @@
 r"""The context of recorded samples: expectations on samples held out, nothing simulated, no state evaluated anew.
 
 `F_M(V)` and `J(w, mu)` are expectations over the torus of pointwise functions of the data, so weighted means over independent
-samples estimate them without bias, with errors from their scatter. What a supremum is needed for cannot be had this way: the
-shifted and the Lagrangian bound are left out, and `M` and `C_V` are estimates, and said to be.
+samples estimate them without bias, with errors from their scatter. Samples give no suprema: the shifted and the Lagrangian
+bound are left out, and `M` and `C_V` are estimates, and said to be.
 """
 
 from dataclasses import dataclass, replace
@@ -22,14 +22,14 @@ from ocp_torch.problems.needs import SEARCHED
 from ocp_torch.problems.recorded.dataset import Dataset
 from ocp_torch.problems.samples import Samples
 
-# Held-out samples are put into so many groups: the scatter of their means gives the standard error, with nearly as many
-# degrees of freedom as there are groups.
-GROUPS, FEWEST = 64, 8
+# Groups of held-out samples at most, the scatter of whose means gives the standard error.
+GROUPS = 64
+FEWEST_SAMPLES = 8  # in a group, unless that leaves fewer than two groups
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedContext(FieldsContext):
-    """Fields trained on the recorded samples of ``problem``, held against those that were held out."""
+    """Fields trained on recorded samples of ``problem``, evaluated on those that were held out."""
 
     problem: Dataset
 
@@ -44,7 +44,7 @@ class RecordedContext(FieldsContext):
 
     @property
     def kind(self) -> str | None:
-        """From `V` where `B` is known everywhere, else `w / mu` of two networks, else there is no controller."""
+        """The controller: from `V` where `B` is known everywhere, else `w / mu` of two networks, else none."""
         trained = self.trained
         if trained.fields.value is not None and self.problem.knows_control_matrix:
             return "value"
@@ -80,7 +80,7 @@ class RecordedContext(FieldsContext):
 
     @cached_property
     def posed(self) -> WellPosed:
-        """What reading the file has checked already; the seam between two samples nobody can see."""
+        """The result of the checks made on reading the file; samples cannot show a jump at the seam."""
         samples, recording = self.problem.held_out, self.problem.recording
         mass = float(recording.samples.mean(recording.samples.mu0))
         return WellPosed(True, True, True, float(samples.f.min()), mass, [])
@@ -119,6 +119,6 @@ class RecordedContext(FieldsContext):
 
 def groups(samples: Samples) -> list[Samples]:
     """Disjoint groups of equal size, in the random order of the split; the few left over are not used."""
-    count = max(2, min(GROUPS, len(samples) // FEWEST))
+    count = max(2, min(GROUPS, len(samples) // FEWEST_SAMPLES))
     size = len(samples) // count
     return [samples.take(slice(k * size, (k + 1) * size)) for k in range(count)]

@@ -1,7 +1,8 @@
-"""A `V` that somebody brings, as a function of PyTorch's: is it continuous, and is its gradient that of the function?
+"""A given `V`, a function of PyTorch's: is it continuous, and is its gradient that of the function?
 
-A lower bound takes `V` for a subsolution by its values and derivatives at states. Without noise kinks do no harm, since the
-Hamiltonian is convex; where `V` jumps, or its gradient is not its own, it is none. With noise the gradient must not jump.
+A lower bound judges by values and derivatives at states whether `V` is a subsolution. Without noise kinks do no harm, since
+the Hamiltonian is convex; a `V` that jumps, or whose gradient is another function's, is none. With noise the gradient must
+not jump.
 """
 
 from collections.abc import Callable
@@ -19,16 +20,18 @@ from ocp_torch.maths.supremum import in_parts, value_and_gradient
 from ocp_torch.problems.blame import place
 from ocp_torch.problems.problem import Problem
 
-# Segments, of these lengths at least and at most, and the states on each, one at random in each of its parts, at which what
-# changes along it is added up: a kink makes that wrong by a 256th of the change at most.
-SEGMENTS, SHORTEST, LONGEST, ON_SEGMENT = 128, 0.05, 0.5, 256
-# A gradient is another function's where what it adds up to is off by so much of all that changes, in the mean or on one
-# segment. What is added up of one that has either sign at random is off by a sixteenth.
-OFF_IN_MEAN, OFF_ON_ONE = 0.1, 0.3
+SEGMENTS = 128  # along which the gradient is integrated
+SHORTEST, LONGEST = 0.05, 0.5  # lengths of the segments
+# States on a segment, one at random in each of its equal parts: a kink makes the integral wrong by a 256th at most.
+ON_SEGMENT = 256
+# A gradient is another function's where its integral is off by more than this part of all that changes, on average: random
+# states make it off by a sixteenth where the sign is random.
+OFF_IN_MEAN = 0.1
+OFF_ON_ONE = 0.3  # the same on a single segment
 
 
 class Periodic:
-    """``value`` ``(N, d) -> (N,)``, asked for states of the unit cell only."""
+    """``value`` ``(N, d) -> (N,)``, evaluated in the unit cell only."""
 
     def __init__(self, value: Field) -> None:
         self.value = value
@@ -38,7 +41,8 @@ class Periodic:
 
 
 def require_differentiable(value: Field, problem: Problem) -> None:
-    """Raise `InputError` where ``value`` jumps, or its derivatives are not its own; with noise, where its gradient jumps."""
+    """Raise `InputError` where ``value`` jumps, or its derivatives by autograd are another function's; with noise also where
+    its gradient jumps."""
     continuous = "a lower bound needs it to be continuous, also where a coordinate passes from 1 to 0"
     _require_continuous(lambda x: value(x).unsqueeze(-1), problem, f"value jumps by {{}}; {continuous}.")
     _require_derivative(lambda x, v: value(x), problem, "value", "gradient")
@@ -55,7 +59,8 @@ def _require_continuous(function: Field, problem: Problem, sentence: str) -> Non
 
 
 def _require_derivative(function: Callable[[Tensor, Tensor], Tensor], problem: Problem, what: str, its: str) -> None:
-    """``function`` maps states and directions, each ``(N, d)``, to ``(N,)``."""
+    """Raise `InputError` where the derivative by autograd of ``function``, which maps states and directions, each ``(N, d)``,
+    to ``(N,)``, does not integrate to its changes."""
     draw = partial(torch.rand, dtype=torch.float64, generator=fixed_generator())
     x = draw(SEGMENTS, problem.dim)
     v = normalize(draw(SEGMENTS, problem.dim) - 0.5) * (SHORTEST + (LONGEST - SHORTEST) * draw(SEGMENTS, 1))

@@ -1,7 +1,7 @@
 r"""A smooth activation of a layer, over a batch of cells.
 
-It is expanded about the layer's value at the centre of each cell, as `S(p) = sum_k s_k p^k` of the polynomial `p` there; what
-that leaves out of the value and its derivatives is bounded degree by degree.
+The activation is expanded about the layer's value at the centre of each cell, as `S(p) = sum_k s_k p^k` of the polynomial `p`
+there; what that leaves out of the value and its derivatives is bounded degree by degree.
 """
 
 import math
@@ -32,7 +32,7 @@ class Expansion:
         self.wide = upward(self.reach + self.radius)
 
     def supremum(self, j: int) -> Tensor:
-        """Of `|sigma^{(j)}|`, `1 <= j <= 3`, over the range of the layer."""
+        """An upper bound of `|sigma^{(j)}|`, `1 <= j <= 3`, over the range of the layer."""
         m, beyond = self.degree, self.sigma.ceiling(self.degree + 2)
         terms = [math.perm(k, j) * self.sizes[k] for k in range(j, m + 2)] or [torch.zeros_like(self.wide)]
         local = horner(terms, self.wide) + math.perm(m + 2, j) * beyond * self.wide ** (m + 2 - j)
@@ -40,18 +40,18 @@ class Expansion:
 
     @cached_property
     def top(self) -> Tensor:
-        """The supremum of `|sigma^{(m+1)}| / (m+1)!`."""
+        """An upper bound of `|sigma^{(m+1)}| / (m+1)!` over that range."""
         m = self.degree
         local = self.sizes[m + 1] + (m + 2) * self.sigma.ceiling(m + 2) * self.wide
         return local.clamp_max(self.sigma.ceiling(m + 1))
 
     def moved(self, j: int, supremum: Tensor) -> Tensor:
-        """A bound of `|sigma^{(j)}(h) - S^{(j)}(p)|`, with that of `|sigma^{(j+1)}|`."""
+        """A bound of `|sigma^{(j)}(h) - S^{(j)}(p)|`, from the ``supremum`` of `|sigma^{(j+1)}|`."""
         m = self.degree
         return supremum * self.radius + math.perm(m + 1, j) * self.top * self.reach ** (m + 1 - j)
 
     def majorant(self, j: int) -> list[Tensor]:
-        """`S^{(j)}(p)` in absolute values by degree, with all degrees above `m - j` in the last entry."""
+        """Sizes of `S^{(j)}(p)` by degree, in absolute values, with all degrees above `m - j` in the last entry."""
         m = self.degree
         return _majorant([math.perm(k + j, j) * self.sizes[k + j] for k in range(m + 1 - j)], self.levels, m + 1 - j)
 
@@ -126,7 +126,7 @@ def _composed(P: Tensor, series: list[Tensor], basis: Monomials) -> Tensor:
 
 
 def _majorant(coefficients: list[Tensor], levels: list[Tensor], m: int) -> list[Tensor]:
-    """Of `sum_k c_k (sum_j levels_j tau^j)^k` with everything >= 0: degrees `0 ... m - 1`, then all the rest together."""
+    """The terms of `sum_k c_k (sum_j levels_j tau^j)^k`, everything >= 0: degrees `0 ... m - 1`, then the sum of the rest."""
     total = summed(levels)
     result = [coefficients[-1]]  # by degree; the tail starts empty
     tail = torch.zeros_like(total)

@@ -19,7 +19,7 @@ from ocp_torch.fields import activations
 
 # Rounding of one derivative relative to the sum of its terms.
 RELATIVE = 2.0**-46
-# The ceilings are computed in floating point themselves.
+# Factor that covers the rounding of the ceilings themselves.
 UP = 1.0 + 1e-12
 
 

@@ -15,14 +15,13 @@ from ocp_torch.problems.problem import Problem
 
 # Degree of the models, by dimension: with a higher one fewer cells are needed, and each takes longer.
 DEGREE = {1: 4, 2: 5}
-# A cell that is longer than so many times its shortest side is bisected along its longest, whatever its models say: without
-# it some would become slivers.
-LONGEST = 4.5
+# A cell whose longest side is above so many times the shortest is bisected along it, lest it become a sliver.
+LARGEST_ASPECT = 4.5
 
 
 def degree(problem: Problem) -> int:
-    """That of the models for ``problem``: one more with noise, as second derivatives lose an order. Measured in two
-    dimensions: half of the cells, in 0.7 to 0.85 of the time."""
+    """Degree of the models for ``problem``: one more with noise, as second derivatives lose an order; in two dimensions that
+    takes half of the cells, and 0.7 to 0.85 of the time."""
     return DEGREE[problem.dim] + problem.noisy
 
 
@@ -73,7 +72,7 @@ class Cover:
         return len(self.upper)
 
     def take(self, index: Tensor) -> "Cover":
-        """Those at ``index``, rows or flags."""
+        """The cells at ``index``, rows or flags."""
         return Cover(*(column[index] for column in vars(self).values()))
 
     def halves(self) -> tuple[Tensor, Tensor]:
@@ -84,7 +83,7 @@ class Cover:
         return torch.cat([self.centre - shift, self.centre + shift]), half.repeat(2, 1)
 
     def integral(self) -> tuple[float, float]:
-        """Below and above the integral of `W mu0` over all cells; `fsum` rounds once."""
+        """Lower and upper bound of the integral of `W mu0` over all cells; `fsum` rounds once."""
         means = self.mean.tolist()
         middle = math.fsum(means)
         rounded = math.fsum(self.radius.tolist()) + ROUNDING * math.fsum(map(abs, means))
@@ -93,12 +92,12 @@ class Cover:
 
 
 def _loosest(Q: TaylorModel, box: Box) -> Tensor:
-    """The coordinate ``(N,)`` along which the bound of `Q` is loosest: terms of second order and more make it so, by their
-    power of the coordinate, and the radius, most along the longest side."""
+    """The coordinate ``(N,)`` along which the bound of `Q` is loosest. Nonlinear terms count by their power of it, the radius
+    by the length of the side."""
     half = box.half
     exponents = half.new_tensor(box.basis.exponents)
     exponents[box.basis.ends[1] : box.basis.ends[2]] = 0.0
     bent = torch.einsum("kn,ki->ni", Q.coefficients.abs(), exponents)
     loose = bent + Q.radius.unsqueeze(-1) * half / half.sum(dim=-1, keepdim=True)
     axis = loose.nan_to_num(nan=math.inf, posinf=math.inf).argmax(dim=-1)
-    return torch.where(half.amax(dim=-1) > LONGEST * half.amin(dim=-1), half.argmax(dim=-1), axis)
+    return torch.where(half.amax(dim=-1) > LARGEST_ASPECT * half.amin(dim=-1), half.argmax(dim=-1), axis)

@@ -29,8 +29,8 @@ from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.replaced import replaced
 
-# Data evaluated at one state are taken to be right up to so much, relative to 1 + their size: 2^16 units in the last place
-# of float64 are left to the rounding of the user's formula.
+# Assumed error of data evaluated at one state, relative to 1 + their size: it leaves 2^16 units in the last place of float64
+# to the rounding of the user's formula.
 EVALUATION = 2.0**-36
 # Relative rounding of the few operations that constants and computed numbers take here.
 FEW_ROUNDINGS = 1e-12
@@ -49,7 +49,7 @@ class Enclosure:
 
 def lipschitz_enclosure(problem: Problem, box: Box) -> Enclosure | None:
     """The data at the centre of each cell, up to the Lipschitz constant times half of the cell's diagonal; `None` if a
-    constant is unknown. What ``problem`` does not override is constant. It is its own data that are evaluated, whatever
+    constant is unknown. What ``problem`` does not override is constant. The data are those of the instance itself, whatever
     class changes them."""
     declared = problem.lipschitz if problem.lipschitz is not None else Lipschitz()
     diagonal = box.half.norm(dim=-1)
@@ -82,8 +82,8 @@ def power_conjugate(cost: PowerCost, p: TaylorModel) -> TaylorModel:
 
 
 def limited_conjugate(cost: LimitedCost, p: TaylorModel) -> TaylorModel:
-    """`R_c*(p)`: `R*` below `|p| = c^{q-1}`, linear above. A cell on both sides takes `R*` less what that exceeds `R_c*` by:
-    between 0 and its value at the largest `|p|`, as it grows quadratically from 0 at the knee."""
+    """`R_c*(p)`: `R*` below `|p| = c^{q-1}`, linear above. A cell on both sides takes `R*` less its excess over `R_c*`, which
+    grows quadratically from 0 at the knee: it lies between 0 and its value at the largest `|p|`."""
     near, squares = power_conjugate(cost, p), (p * p).sum()
     low, high = squares.bounds()
     far = power(squares, 0.5) * cost.limit + (-cost.largest)
@@ -97,7 +97,7 @@ def limited_conjugate(cost: LimitedCost, p: TaylorModel) -> TaylorModel:
 
 
 def box_limited_conjugate(cost: BoxLimitedCost, p: TaylorModel) -> TaylorModel:
-    """The sum of those of the actuators, each of which has its own limit."""
+    """The sum of the conjugates of the actuators, each of which has its own limit."""
     each = enumerate(LimitedCost(cost.q, c) for c in cost.limit)
     return TaylorModel.stack([limited_conjugate(own, p[..., i : i + 1]) for i, own in each]).sum()
 
@@ -149,8 +149,8 @@ def manufactured_enclosure(problem: Manufactured, box: Box) -> Enclosure | None:
 class ByClass:
     """A function of an object and an argument, given by a ``method`` of the object's own class or ``known`` for a class.
 
-    The most derived class that gives it counts. What it gives is about the methods ``about`` of the object, so it is not
-    to be believed where a class further down changes one of those. ``default``, for the rest, follows all such changes.
+    The most derived class that gives it counts. The function describes the methods ``about`` of the object, so it cannot be
+    trusted where a class further down changes one of them. ``default``, for the rest, follows all such changes.
     """
 
     method: str
@@ -159,7 +159,7 @@ class ByClass:
     default: Callable | None = None
 
     def _source(self, owner: object) -> tuple[Callable | None, bool]:
-        """How it is given for ``owner``, and whether that is to be believed."""
+        """The function for ``owner``, if there is one, and whether it can be trusted."""
         changes = lambda names: any(name in names for name in self.about)
         unchanged = not changes(vars(owner))
         for cls in type(owner).__mro__:
@@ -171,7 +171,8 @@ class ByClass:
         return self.default and partial(self.default, owner), self.default is not None
 
     def holds_for(self, owner: object) -> bool:
-        """Whether it is given, and neither ``owner`` nor a class below the one that gives it changes what it is about."""
+        """Whether there is a function for ``owner``, and neither ``owner`` nor a class below the one that gives it changes
+        what it describes."""
         return self._source(owner)[1]
 
     def __call__(self, owner: object, argument: Any) -> Any:

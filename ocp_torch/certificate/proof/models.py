@@ -11,11 +11,11 @@ from torch import Tensor
 
 from ocp_torch.certificate.proof.taylor import ROUNDING, Monomials, TaylorModel, monomials, upward
 
-# `power` expands where the lower bound of g is above this part of the upper one. Nearer to a zero of g, which a power may
-# not be smooth at, the range is as good as an expansion.
+# `power` expands where the lower bound of g is above this part of the upper one. Nearer to a zero of g, where a power may
+# not be smooth, the range is as good as an expansion.
 SMOOTH = 0.25
-# Error of a computed g^e relative to itself, in units of ROUNDING: so much, and so much times e. As |log g| <= 745 in
-# float64, an exponent off by 2^-53 e changes g^e by less than 2 e ROUNDING.
+# Error of a computed g^e relative to itself, in units of ROUNDING: the first number plus e times the second. As
+# |log g| <= 745 in float64, an exponent off by 2^-53 e changes g^e by less than 2 e ROUNDING.
 POWER_ERROR = (16.0, 8.0)
 
 
@@ -90,8 +90,8 @@ def compose(g: TaylorModel, series: Sequence[Tensor], error: Tensor | float, top
 
 
 def absolute(g: TaylorModel) -> TaylorModel:
-    """`|g|`. Where the sign of `g` is not known: the chord over its range, which is exact at both ends and too high by at
-    most its height at 0, less half of that height."""
+    """`|g|`. Where the sign of `g` is unknown, the model is the chord over its range, which is exact at both ends and too
+    high by at most its height at 0, less half of that height."""
     low, high = g.bounds()
     crosses = (low < 0.0) & (high > 0.0)
     width = torch.where(crosses, high - low, 1.0)

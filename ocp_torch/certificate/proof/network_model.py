@@ -23,7 +23,7 @@ from ocp_torch.fields.sobolev import SobolevFeatures, SobolevField
 from ocp_torch.maths.jets import Jet
 from ocp_torch.maths.sums import summed
 
-# Room in the rounding of a dot product of n terms: it is bounded as if it had so many more.
+# Head-room for the rounding of a dot product, which is bounded as if it had so many more terms.
 EXTRA_TERMS = 8
 Known = PeriodicMLP | SobolevField
 
@@ -52,7 +52,7 @@ def network_model(field: Known, box: Box, noise: TaylorModel | None = None) -> J
 
 
 def _layered(network: PeriodicMLP, box: Box, curved: bool) -> SmoothModel:
-    """What a perceptron's last layer gives, ``(N, 1)``."""
+    """The last layer of a perceptron, ``(N, 1)``."""
     model = embed(box, network.embedding.waves(box.centre.shape[1]), curved)
     for layer in network.body:
         if isinstance(layer, nn.Linear):
@@ -66,7 +66,7 @@ def _layered(network: PeriodicMLP, box: Box, curved: bool) -> SmoothModel:
 
 
 def _waved(field: SobolevField, box: Box, curved: bool) -> SmoothModel:
-    """The features of a Sobolev field, combined, ``(N, 1)``: its float64 amplitudes times its coefficients are weights."""
+    """The features of a Sobolev field, combined, ``(N, 1)``: float64 amplitudes times coefficients are their weights."""
     weights = field.features.amplitudes().repeat(2) * field.coefficients[1:]
     return affine(embed(box, field.features.frequencies, curved), weights.unsqueeze(0), field.coefficients[:1])
 
@@ -99,7 +99,7 @@ def affine(model: SmoothModel, weight: Tensor, bias: Tensor) -> SmoothModel:
 
 
 def product(left: SmoothModel, right: SmoothModel) -> SmoothModel:
-    """`g h`, whose derivatives are sums of products of theirs."""
+    """`g h`, whose derivatives are sums of products of derivatives of `g` and of `h`."""
     basis, m, places = left.basis, left.basis.degree, left.derivatives
     own, its = ({at: of.sizes(*at) for at in places} for of in (left, right))
     radii = []

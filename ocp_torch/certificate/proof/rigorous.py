@@ -28,16 +28,19 @@ from ocp_torch.problems.problem import Problem
 
 # The number of cells that a tolerance takes grows exponentially with the dimension.
 MOST_DIMENSIONS = 2
-# An enclosure is held against the data in so many cells per coordinate, whole and shrunk to 2^-8 of their size, where a wrong
-# value is not hidden by the radius; and in cells of so many sizes that hold states where the data are narrow.
-SPOT_CELLS, SPOT_SIZES, ODD_CELLS = 16, (1.0, 2.0**-8), (16, 128, 1024)
-# Cells a side to start with, by dimension, and cells evaluated at once, which bounds the memory.
-FIRST_CELLS, CHUNK = {1: 64, 2: 32}, 256
-# How close to the sampled supremum, relative to the size of `theta V mu0`, by dimension; and the part of that which the
-# integral may take.
-TOLERANCE, INTEGRAL_PART = {1: 1e-5, 2: 1e-3}, 0.1
-# States at which the supremum and that size are estimated beforehand, and the least size relative to that of the costs.
-SAMPLED, LEAST_SIZE = 2**14, 1e-3
+# Cells per coordinate in which an enclosure is compared with the data,
+SPOT_CELLS = 16
+# of full size, and so small that their radius does not hide a wrong value.
+SPOT_SIZES = (1.0, 2.0**-8)
+# Cells per coordinate, of which those around narrow features of the data are compared too.
+ODD_CELLS = (16, 128, 1024)
+FIRST_CELLS = {1: 64, 2: 32}  # a side to start with, by dimension
+CHUNK = 256  # cells evaluated at once, which bounds the memory
+# How close to the sampled supremum a proof comes, relative to the size of `theta V mu0`, by dimension.
+TOLERANCE = {1: 1e-5, 2: 1e-3}
+INTEGRAL_PART = 0.1  # of the tolerance, which the integral may take
+SAMPLED = 2**14  # states at which the supremum and that size are estimated beforehand
+LEAST_SIZE = 1e-3  # of `theta V mu0`, relative to the mean state cost
 # Cells are not bisected below this half-width: all centres, and their multiples by wave numbers, are then exact.
 SMALLEST_HALF = 2.0**-32
 
@@ -63,8 +66,8 @@ class RigorousBound:
 
 
 def obstacle(problem: Problem, value: Field, odd: Tensor | None = None) -> str | None:
-    """Why there can be no rigorous bound for ``value`` on ``problem``; `None` where there can. Its enclosure is held against
-    its data in a few cells, and at the states ``odd`` ``(K, d)``, where a search found them narrow."""
+    """Why there can be no rigorous bound for ``value`` on ``problem``; `None` where there can. The problem's enclosure is
+    compared with its data in a few cells, and at the states ``odd`` ``(K, d)``, where a search found narrow features."""
     if problem.dim > MOST_DIMENSIONS:
         return f"cells cover the torus in at most {MOST_DIMENSIONS} dimensions, and this problem has {problem.dim}"
     if not is_known(value):
@@ -98,7 +101,7 @@ def obstacle(problem: Problem, value: Field, odd: Tensor | None = None) -> str |
 
 def contradiction(problem: Problem, box: Box, found: Enclosure, t: Tensor) -> str | None:
     """The name of a part of the enclosure ``found`` that does not hold the problem's own data at `centre + half t`, if there
-    is one: what somebody wrote by hand may be wrong. ``t`` is ``(N, d)`` with entries in `[-1, 1]`."""
+    is one: an enclosure written by hand may be wrong. ``t`` is ``(N, d)`` with entries in `[-1, 1]`."""
     x = box.centre + box.half * t
     powers = torch.stack([(t ** t.new_tensor(alpha)).prod(dim=-1) for alpha in box.basis.exponents])
     models = {"state_cost": found.f, "control_matrix": found.B, "initial_density": found.mu0}
@@ -149,9 +152,9 @@ def rigorous_lower_bound(
     pending, finished = Cover.join([Cover.of(problem, value, theta, *piece) for piece in pieces]), []
     count, goal = len(pending), sampled_slack + room
     while True:
-        # Where Q is larger than was met by sampling, more cannot be proved.
+        # Where Q is larger than sampling met, no tighter bound can be proved.
         goal = max(goal, float(pending.reached.max()) + room)
-        # The radius of W mu0 is held per volume, so that all cells together keep theirs.
+        # The radius of W mu0 is limited per volume, so that all cells together keep to the tolerance.
         volume = (2.0 * pending.half).prod(dim=-1)
         tight = (pending.upper <= goal) & (pending.radius <= INTEGRAL_PART * room * volume)
         done = tight | (pending.half.amax(dim=-1) <= SMALLEST_HALF)

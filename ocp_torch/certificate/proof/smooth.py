@@ -10,7 +10,7 @@ from ocp_torch.certificate.proof.taylor import ROUNDING, Monomials, TaylorModel,
 
 
 def derivatives(dim: int, curved: bool) -> list[tuple[int, ...]]:
-    """What radii are of: the value `()`, each slope `(i,)`, and with ``curved`` each second derivative `(i, j)`, `i <= j`."""
+    """The derivatives that have radii: the value `()`, each slope `(i,)`, and if ``curved`` each `(i, j)` with `i <= j`."""
     return [a for k in range(2 + curved) for a in itertools.combinations_with_replacement(range(dim), k)]
 
 
@@ -28,11 +28,11 @@ class SmoothModel:
 
     @property
     def derivatives(self) -> list[tuple[int, ...]]:
-        """Those with radii, in their order."""
+        """The `derivatives` that have radii, in the order of ``radii``."""
         return derivatives(self.basis.dim, len(self.radii) > 1 + self.basis.dim)
 
     def slope(self, *along: int) -> Tensor:
-        """The coefficients of `dP/dt_i`, ``(K, N, width)``, of several coordinates one after the other."""
+        """The coefficients of `dP/dt_i`, ``(K, N, width)``; for several coordinates ``along`` of repeated derivatives."""
         polynomial = self.P
         for i in along:
             slope = torch.zeros_like(polynomial)
@@ -44,7 +44,7 @@ class SmoothModel:
         return polynomial
 
     def sizes(self, *along: int) -> list[Tensor]:
-        """Those of `slope` by degree, ``(N, width)`` each."""
+        """The sums of the absolute coefficients of `slope` by degree, ``(N, width)`` each."""
         return self.basis.sizes(self.slope(*along))
 
     def _model(self, half: Tensor, *along: int) -> TaylorModel:
@@ -60,6 +60,6 @@ class SmoothModel:
         return TaylorModel(self.P, self.radii[0], self.basis), TaylorModel.stack(slopes)
 
     def hessian(self, half: Tensor) -> TaylorModel:
-        """`hess_x h`, ``(N, width, d, d)``; only where the radii of second derivatives are there."""
+        """`hess_x h`, ``(N, width, d, d)``; needs the radii of second derivatives."""
         d = range(self.basis.dim)
         return TaylorModel.stack([TaylorModel.stack([self._model(half, i, j) for i in d]) for j in d])

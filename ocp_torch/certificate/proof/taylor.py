@@ -21,9 +21,9 @@ from ocp_torch.maths.sums import summed
 # fewer than 256 roundings of 2^-53 on any path, and gamma_256 < 2^-44 (Higham, Accuracy and Stability of Numerical
 # Algorithms, section 3.1). Library functions are assumed to be accurate to 16 units in the last place.
 ROUNDING = 2.0**-44
-# A radius is a short sum of products of numbers >= 0. The first number makes up for the rounding of that sum itself, the
-# second for underflow.
-UPWARD, SMALLEST = 1.0 + 2.0**-40, 1e-290
+# A radius is a short sum of products of numbers >= 0: this factor covers the rounding of that sum itself.
+UPWARD = 1.0 + 2.0**-40
+SMALLEST = 1e-290  # added to a radius to cover underflow
 
 
 def upward(radius: Tensor) -> Tensor:
