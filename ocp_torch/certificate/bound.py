@@ -14,14 +14,15 @@ if TYPE_CHECKING:
     from ocp_torch.certificate.context import Context
     from ocp_torch.certificate.external.dataset import RecordedContext
 
-# The sides, named as `certificate.json` names them: below `OPT`, above `OPT` and the controller's performance, and below
-# that performance.
-LOWER, UPPER, PERFORMANCE = "lower", "upper", "perf_lower"
+# The sides of bounds, by their names in `certificate.json`.
+LOWER = "lower"  # below `OPT`
+UPPER = "upper"  # above `OPT` and the controller's performance
+PERFORMANCE = "perf_lower"  # below that performance
 
 
 class Bound(ABC):
-    """One bound, without any state: what it computes that others share is a property of the `Context`, and what takes long
-    the context keeps in its `results`.
+    """One bound, without any state: what bounds share is a property of the `Context`, and what takes long to compute is kept
+    in its `results`.
 
     A new bound is a subclass in a file of its own and one line in `ocp_torch.certificate.bounds.BOUNDS`. ``name`` and
     ``side`` (`LOWER`, `UPPER` or `PERFORMANCE`) say where `certificate.json` has it, ``label`` what tables call it.
@@ -33,22 +34,22 @@ class Bound(ABC):
 
     @abstractmethod
     def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
-        """What it rests on, beside a problem that is one: it counts where every need holds and none is guessed."""
+        """What the bound rests on, beside a well-posed problem: it counts where every need holds and none is guessed."""
 
     @abstractmethod
     def evaluate(self, context: Context) -> Estimate | None:
         """The number; `None` where ``context`` cannot give it."""
 
     def applies(self, context: Context) -> bool:
-        """Whether certificates of ``context`` have an entry for it, be it an empty one."""
+        """Whether certificates of ``context`` have an entry for the bound, be it an empty one."""
         return True
 
     def valid(self, context: Context) -> bool:
-        """Whether nothing that was found shows the number to be wrong. One that is wrong is not shown at all."""
+        """Whether nothing that was found shows the number to be wrong; a wrong one is not shown at all."""
         return True
 
     def about(self, context: Context) -> str | None:
-        """Of an upper bound: the controller whose performance it bounds; `None` where it bounds `OPT` alone."""
+        """The controller whose performance an upper bound bounds; `None` where it bounds `OPT` alone."""
         return context.kind
 
     def notes(self, context: Context, shown: Estimate | None) -> list[str]:
@@ -56,13 +57,13 @@ class Bound(ABC):
         return []
 
     def searches(self, context: Context) -> list[str]:
-        """How the suprema behind it were found, a sentence each."""
+        """How the suprema behind the bound were found, a sentence each."""
         return []
 
 
 def recorded(context: Context) -> RecordedContext:
     """``context``, for bounds that apply only where it is `recorded`."""
-    return cast("RecordedContext", context)  # its module imports bounds, so that its class cannot be asked for here
+    return cast("RecordedContext", context)  # an import of the class would be circular
 
 
 def sentence_on(what: str, found: Extremum) -> str:

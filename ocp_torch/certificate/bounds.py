@@ -10,8 +10,8 @@ from ocp_torch.certificate.upper.minimised import MinimisedPrimal
 from ocp_torch.certificate.upper.penalised import PenalisedPrimal
 from ocp_torch.certificate.upper.recorded import RecordedPrimal
 
-# In the order of `certificate.json`. Two of one name and side are variants of which only one applies to a context. A bound
-# of one's own: `BOUNDS.append(Mine())`, before anything is certified.
+# In the order of `certificate.json`. Two of one name and side are variants of which only one applies to a context. To add a
+# bound: `BOUNDS.append(Mine())`, before anything is certified.
 BOUNDS: list[Bound] = [
     PenalisedDual(),
     RecordedDual(),
@@ -28,5 +28,5 @@ BOUNDS: list[Bound] = [
 
 
 def on(side: str) -> dict[str, Bound]:
-    """The bounds on ``side`` by name, one of each, in the order of the list."""
+    """The bounds on ``side`` by name, the last of each name, in the order of the list."""
     return {bound.name: bound for bound in BOUNDS if bound.side == side}

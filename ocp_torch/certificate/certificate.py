@@ -1,4 +1,4 @@
-"""The certificate: bounds, performances, standard errors and what they rest on; and the gaps between the sides of it."""
+"""The certificate: bounds, performances, standard errors and what they rest on; and the gaps between its sides."""
 
 import json
 import math
@@ -56,7 +56,7 @@ class Certificate:
     subsolution: Subsolution | None = field(default=None, compare=False)
 
     def needs(self, name: str) -> tuple[Need, ...]:
-        """What the bound ``name`` rests on; nothing for simulations, the truth, and names that nobody listed."""
+        """What the bound ``name`` rests on; nothing for simulations, the truth, and names that are not listed."""
         found = next((bound.needs(self.assumptions) for bound in BOUNDS if bound.name == name), ())
         return tuple(replace(need, holds=False) if need.name in self.refuted else need for need in found)
 
@@ -65,13 +65,13 @@ class Certificate:
         return self.stands and all(need.counts for need in self.needs(name))
 
     def conditional(self, name: str) -> bool:
-        """Whether the bound ``name`` rests on a guess that nothing refutes: it is one if the guess is right."""
+        """Whether the bound ``name`` rests on a guess that nothing refutes: it is a bound if the guess is right."""
         needs = self.needs(name)
         return self.stands and all(n.holds for n in needs) and any(n.basis == GUESSED for n in needs)
 
     @property
     def stands(self) -> bool:
-        """Whether the problem is one, and nothing contradicts anything: without that no number counts."""
+        """Whether the problem is well posed and no two bounds contradict each other: else no number counts."""
         return self.assumptions.problem_holds and self.contradiction is None
 
     @property
@@ -85,7 +85,7 @@ class Certificate:
         return self.best_upper_of(self.subject)
 
     def best_upper_of(self, controller: str | None) -> Side | None:
-        """The same of any ``controller``."""
+        """The bound on any ``controller`` that counts with the lowest upper end, and that end; no simulation."""
         about = lambda name: self.about.get(name, controller) == controller
         return self._lowest(self.upper, lambda name: self.counts(name) and about(name))
 
@@ -113,9 +113,9 @@ class Certificate:
 
     @property
     def gap(self) -> dict:
-        """From the best lower bound that counts to the best upper bound, and to the simulated performance, relative to the
-        lower; between the far ends of their intervals. ``conditional``: what a lower bound that rests on a guess would make
-        of it, where that is higher than all that count."""
+        """Gaps from the best lower bound that counts to the best upper bound, and to the simulated performance, relative to
+        the lower; between the far ends of their intervals. ``conditional`` is the smaller gap for a lower bound that rests on
+        a guess, where that is higher than all that count."""
         lower, upper, perf = self.best_lower, self.best_upper, self.best_perf
         supposed = self._highest(lambda name: self.counts(name) or self.conditional(name))
         supposed = None if supposed == lower else supposed
@@ -175,8 +175,8 @@ class Certificate:
 
     @property
     def hold(self) -> bool:
-        """Whether every check passed, what each number rests on holds, and no two bounds contradict each other; a guess that
-        is not used is no matter."""
+        """Whether every check passed, what each number rests on holds, and no two bounds contradict each other; guesses are
+        left aside."""
         shown = [*known_of(self.lower), *known_of(self.upper)]
         needs = [need for name in shown for need in self.needs(name) if need.basis != GUESSED]
         return self.assumptions.hold and all(need.holds for need in needs) and self.contradiction is None
@@ -199,13 +199,13 @@ class Certificate:
         return max(ends, key=lambda side: side[1], default=None)
 
     def _lowest(self, estimates: dict[str, Estimate | None], usable: Callable[[str], bool]) -> Side | None:
-        """That of ``estimates`` with the lowest upper end among those that are ``usable``, and that end."""
+        """The one of ``estimates`` with the lowest upper end among those that are ``usable``, and that end."""
         ends = [(name, e.interval(self.confidence)[1]) for name, e in known_of(estimates).items() if usable(name)]
         return min(ends, key=lambda side: side[1], default=None)
 
 
 def relative_gap(lower: Side | None, upper: Side | None) -> float | None:
-    """Relative to the lower bound; `None` where that is not positive, or where the two cross, as errors may make them."""
+    """The gap relative to the lower bound; `None` where that is not positive, or where errors make the two sides cross."""
     if lower is None or upper is None or lower[1] <= 0.0 or upper[1] < lower[1]:
         return None
     return (upper[1] - lower[1]) / lower[1]

@@ -31,8 +31,8 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.recorded.dataset import Dataset
 
 # Bounds contradict each other where their intervals at this joint level are apart,
-LEVEL = 0.999
-# and by more than so much of their size: equal numbers differ in the last digits of float64 and of what was given.
+CONTRADICTION_LEVEL = 0.999
+# by more than this part of their size: equal numbers may differ in the last digits of float64 and of what was given.
 ROUNDING = 1e-9
 
 
@@ -40,7 +40,7 @@ def certify(context: Context) -> Certificate:
     """The certificate of ``context``. Raises `ProblemError` where a function of its problem is not finite."""
     bounds = [bound for bound in BOUNDS if bound.applies(context)]
     evaluated = lambda side: {bound.name: shown(bound, context) for bound in bounds if bound.side == side}
-    _ = context.posed  # first of all: functions that are not finite are refused here
+    _ = context.posed  # first of all, to refuse functions that are not finite
     with context.ahead:
         simulated, zero = context.simulated  # before the upper side, which is of the best of them
         upper, perf_lower = evaluated(UPPER), evaluated(PERFORMANCE)
@@ -90,7 +90,7 @@ def unseen(name: str, found: Simulated) -> list[str]:
 
 
 def handed_out(certificate: Certificate, context: Context) -> Certificate:
-    """``certificate`` with the controller that is handed out as its subject, and what is known of that one alone."""
+    """``certificate`` with the controller that is handed out as its subject, and what is computed for that one alone."""
     choose = context.settings.prefer == CERTIFIED and not context.settled
     best = certificate.best_certified if choose else None
     subject = certificate.subject if best is None else best
@@ -100,15 +100,15 @@ def handed_out(certificate: Certificate, context: Context) -> Certificate:
 
 
 def shown(bound: Bound, context: Context) -> Estimate | None:
-    """What ``bound`` says, unless it is known to be wrong."""
+    """The number of ``bound`` in ``context``; `None` where there is none, or it is known to be wrong."""
     estimate = bound.evaluate(context)
     return estimate if estimate is not None and bound.valid(context) else None
 
 
 def examined(certificate: Certificate) -> Certificate:
-    """``certificate``, where a lower bound on `OPT` is above an upper one by more than their errors, or one on a performance
-    above what was simulated, without anything that counts. A guess that is shown to be wrong in this way is dropped, with a
-    warning, and the rest stands."""
+    """``certificate`` with its contradiction, so that nothing counts, where a lower bound on `OPT` is above an upper one by
+    more than their errors, or a lower bound on a performance above what was simulated. A guess that is shown to be wrong in
+    this way is dropped, with a warning, and the rest stands."""
     if not certificate.stands:
         return certificate
     truth = {} if certificate.exact is None else {"OPT": Estimate(certificate.exact, 0.0)}
@@ -123,7 +123,7 @@ def examined(certificate: Certificate) -> Certificate:
     sound += product(least.items(), own.items())
     supposed = {n: e for n, e in lower.items() if certificate.conditional(n)}
     guessed = [*product(supposed.items(), (above | truth).items())]
-    level = 1.0 - (1.0 - LEVEL) / max(1, len(sound) + len(guessed))
+    level = 1.0 - (1.0 - CONTRADICTION_LEVEL) / max(1, len(sound) + len(guessed))
     apart = lambda under, over: under.interval(level)[0] > over.interval(level)[1] + ROUNDING * abs(over.value)
     for (low, under), (high, over) in sound:
         if apart(under, over):
@@ -177,6 +177,6 @@ def certify_policy(
     policy fails."""
     shared = problem, constants, settings, run, progress
     certificate = certify(ControllerContext(*shared, policy=policy, value=value, network=network, kept=kept))
-    if isinstance(policy, BlackBox):  # now that it was asked for many states
+    if isinstance(policy, BlackBox):  # after calls at many states
         policy.require_still()
     return certificate

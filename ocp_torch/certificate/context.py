@@ -31,11 +31,10 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.scan import odd_states
 
-# A divergence takes a reverse pass through a network for each control at each state: what needs it, upper sides and
-# residuals, is computed on one state in eight, and beyond sixteen dimensions on one in `d / 2`.
+# A divergence takes a reverse pass through a network for each control at each state: upper sides and residuals are computed
+# on one state in eight, and beyond sixteen dimensions on one in `d / 2`.
 DIVERGENCE_PART = 8
-# However few the states of a certificate, its problem is scanned as if there were so many: a feature that is missed is one
-# that every bound misses.
+# The problem is scanned as if a certificate had at least so many states: a feature that the scan misses every bound misses.
 LEAST_SCANNED = 2**17
 
 
@@ -74,7 +73,7 @@ class Context:
 
     @property
     def followed(self) -> str | None:
-        """The controller whose closed loop is looked at and fitted: the one handed out, where that acts at every instant."""
+        """The controller whose closed loop is checked and fitted: the one handed out, where that acts at every instant."""
         return self.kind
 
     @property
@@ -93,7 +92,7 @@ class Context:
 
     @property
     def kept(self) -> Subsolution | None:
-        """What the lower bound was of before: `V` need not be trained on for it again."""
+        """The function that the lower bound was of before: `V` need not be trained on for it again."""
         return None
 
     @property
@@ -125,7 +124,7 @@ class Context:
 
     @cached_property
     def few(self) -> list[Samples]:
-        """Sets of fewer, for what takes divergences."""
+        """Independent sets of fewer states, for bounds that take divergences."""
         count = max(1, self.settings.points // max(DIVERGENCE_PART, self.problem.dim // 2))
         return replicated_samples(self.problem, count, self.settings.replicates, self.seed, not self.external)
 
@@ -137,7 +136,7 @@ class Context:
 
     @cached_property
     def posed(self) -> WellPosed:
-        """Whether the problem is one."""
+        """What the checks of the problem itself found."""
         return check_problem(self.problem, self.wide, lambda: self.odd)
 
     @cached_property
@@ -156,7 +155,7 @@ class Context:
 
     @property
     def remembered(self) -> dict[str, Simulated]:
-        """What an earlier certificate has found of controllers that are the same."""
+        """What an earlier certificate simulated of controllers that are the same, by name."""
         return {}
 
     @cached_property
@@ -201,7 +200,7 @@ class Context:
     @cached_property
     def informed(self) -> Constants:
         """The constants by which bounds are computed: an `M` that nobody gave follows from what was met of the density."""
-        guessed = self.constants.basis("M") == GUESSED  # else nobody has to look
+        guessed = self.constants.basis("M") == GUESSED  # else the density need not be computed
         return self.constants.informed(self.densest) if guessed else self.constants
 
     @property
@@ -222,15 +221,15 @@ class Context:
 
     @cached_property
     def closed_loop(self) -> ClosedLoopBounds | None:
-        """``fitted``, where nothing jumps and no divergence is hidden: else it is not what the formulas see, and a wrong
-        number is not shown at all."""
+        """``fitted``, where nothing jumps and no divergence is hidden: else its formulas do not hold, and a wrong number is
+        not shown at all."""
         usable = self.fitted is not None and self.hidden is None and self.checked.regular_holds
         return self.fitted if usable else None
 
     @cached_property
     def takes_fitted_J(self) -> bool:
-        """Whether the `J` of the closed loop is shown: unless that of the trained densities is of the same controller, with a
-        `C_V` that holds, and no larger."""
+        """Whether the `J` of the closed loop is shown: unless the `J` of the trained densities is of the same controller,
+        with a `C_V` that holds, and no larger."""
         if self.closed_loop is None:
             return False
         own = self.densities if self.followed == DENSITY and self.checked.value_holds else None
@@ -238,7 +237,7 @@ class Context:
 
     @cached_property
     def assumptions(self) -> Assumptions:
-        """What the bounds rest on, in the end."""
+        """What the bounds rest on, after all checks."""
         found = self.checked if self.hidden is None else replace(self.checked, regular_holds=False)
         # What is proved of a given controller stands whatever its divergence; of trained fields it is used with their J.
         proved = self.fitted if self.external else self.closed_loop if self.takes_fitted_J else None

@@ -1,6 +1,6 @@
-r"""Numbers with their uncertainty: means over independent randomised point sets, and how to take noise off them.
+r"""Numbers with their uncertainty: means over independent randomised point sets, with plane waves as control variates.
 
-Plane waves integrate to 0 over the torus exactly, so what a fit to them explains may go: `int g = E[g - sum_k c_k phi_k]`
+Plane waves integrate to 0 over the torus, so what they explain of `g` may be taken off: `int g = E[g - sum_k c_k phi_k]`
 for every choice of `c`, with `phi_k` cosines and sines of `2 pi k . x`, `k != 0`. The waves are those that stand out in `g`.
 Each half of the sets is averaged with the coefficients that fit the other half best, so that the fit leaves no bias.
 """
@@ -22,11 +22,11 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.starts import evaluation_distribution
 
-# How often an interval covers the truth where nobody asks for another level.
+# Default level of intervals: how often they cover the truth.
 CONFIDENCE = 0.95
-# Waves in a fit, and states evaluated at once.
-WAVES, CHUNK = 96, 8192
-# Below so many recorded starts that carry a mean these say nothing of it.
+WAVES = 96  # in a fit
+CHUNK = 8192  # states evaluated at once
+# Effective number of recorded starts, below which these tell no mean.
 FEWEST_STARTS = 16
 
 
@@ -46,7 +46,7 @@ def t_factor(level: float, degrees: int) -> float:
 class Estimate:
     """A value, its standard error, and a bound on what averaging cannot remove (integration and truncation).
 
-    ``replicates`` is how many independent ones the standard error comes from; 0 where there is no sampling error.
+    ``replicates`` is the number of independent means behind the standard error; 0 where there is no sampling error.
     """
 
     value: float
@@ -89,12 +89,12 @@ class Estimate:
 
 
 def known(estimate: Estimate | None) -> TypeGuard[Estimate]:
-    """Whether there is a number."""
+    """Whether there is an estimate, and it is finite."""
     return estimate is not None and estimate.finite
 
 
 def known_of(estimates: dict[str, Estimate | None]) -> dict[str, Estimate]:
-    """Those of ``estimates`` that are numbers."""
+    """The ``estimates`` that are there and finite."""
     return {name: estimate for name, estimate in estimates.items() if known(estimate)}
 
 
@@ -115,22 +115,22 @@ def integral(samples: Samples, integrand: Tensor) -> float:
 
 
 def starting_level(samples: Samples, values: Tensor) -> float:
-    """The mean of ``values`` ``(N,)`` by `mu0`, as its mass among the ``samples`` has it; 0 where few of them have any."""
+    """The mean of ``values`` ``(N,)`` by `mu0`, over its mass at the ``samples``; 0 where few of them have any."""
     shares = samples.weight * samples.mu0
     behind = float(shares.sum()) ** 2 / max(float(shares.square().sum()), 1e-300)
     return float((shares * values).sum() / shares.sum()) if behind >= FEWEST_STARTS else 0.0
 
 
 def starting_mean(samples: Samples, values: Tensor, level: float) -> float:
-    """`E[V mu0]` for ``values`` ``(N,)`` of `V`, from a ``level`` that other samples say: `mu0` has mass 1, so it is
-    `c + E[(V - c) mu0]` for every `c`. With `c` near the answer neither how much of `mu0` these ``samples`` met matters, nor
-    a factor that is wrong by less than they show."""
+    """`E[V mu0]` for ``values`` ``(N,)`` of `V`, from a ``level`` that other samples give: `mu0` has mass 1, so it is
+    `c + E[(V - c) mu0]` for every `c`. With `c` near the answer it hardly matters how much of the mass of `mu0` these
+    ``samples`` met, or whether `mu0` has a wrong factor too small for them to show."""
     return level + integral(samples, (values - level) * samples.mu0)
 
 
 def integrals(states: list[Tensor], values: list[Tensor], weights: list[Tensor] | None = None) -> list[float]:
-    """The mean of each of ``values`` ``(N,)`` over its set of ``states`` ``(N, d)``, with the noise of plane waves taken off
-    where the states are uniform; else ``weights`` ``(N,)`` are one over their density, and no wave explains a narrow peak."""
+    """The mean of each of ``values`` ``(N,)`` over its set of ``states`` ``(N, d)``, less what plane waves explain where the
+    states are uniform; else ``weights`` ``(N,)`` are one over their density, and no wave explains a narrow peak."""
     if weights is not None and any(bool((w != 1.0).any()) for w in weights):
         return [float((w * v).mean()) for w, v in zip(weights, values, strict=True)]
     plain = [float(v.mean()) for v in values]

@@ -28,7 +28,7 @@ class Trained:
     """What training hands over: the fields, how they give `mu` (see `trained_policies`), the network they are made of, and
     which ``kind`` of controller was handed out, where that is settled already.
 
-    The `V` of a warm start stays as it is while others are trained: ``memory`` keeps what was simulated of its controller.
+    ``memory`` keeps the simulation of the controller of a warm start, whose `V` stays as it is while others are trained.
     """
 
     fields: Fields
@@ -53,7 +53,7 @@ class FieldsContext(Context):
 
     @cached_property
     def fields(self) -> Fields:
-        """In float64."""
+        """The trained fields in float64."""
         return in_float64(self.trained.fields)
 
     @property

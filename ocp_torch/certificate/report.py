@@ -1,4 +1,4 @@
-"""A certificate as `certificate.json` holds it, by a stable schema, and that as a table for the terminal, and in words."""
+"""A certificate as `certificate.json` holds it, by a stable schema; as a table for the terminal; and in words."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from ocp_torch.certificate.certificate import Certificate
 
 SCHEMA = 2
-# A gap above this says nothing as a percentage, and is told as a multiple.
-MEANS = 1.0
-# Of numbers of which the largest is not between these eight decimals show too little, or too much.
+# Gaps above this are written as a multiple, not in per cent.
+WIDE = 1.0
+# Where the largest number is outside this range eight decimals would show too few or too many digits.
 DECIMALS = (1e-3, 1e4)
 # What the controllers of a run are called in sentences.
 CONTROLLERS = {
@@ -38,7 +38,7 @@ def to_dict(certificate: Certificate) -> dict:
     below = certificate.perf_lower
 
     def bound(name: str, estimate: Estimate | None) -> dict | None:
-        """Also what it rests on, whether it counts, and what it supposes where a guess may be right."""
+        """An estimate with what the bound rests on, whether it counts, and what it supposes where a guess may be right."""
         if not known(estimate):
             return None
         needs = certificate.needs(name)
@@ -140,12 +140,12 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
 
 def gap_in_words(gap: float) -> str:
     """A relative gap in per cent, or, where that would mean nothing, how many times the lower bound the upper one is."""
-    return f"{100.0 * gap:.4f}%" if gap <= MEANS else f"the upper side is {1.0 + gap:.3g} times the lower one"
+    return f"{100.0 * gap:.4f}%" if gap <= WIDE else f"the upper side is {1.0 + gap:.3g} times the lower one"
 
 
 def _against(ratio: float) -> str:
     """How far a number is from `OPT`, by their ``ratio``, in the width of its column."""
-    return f"{100.0 * (ratio - 1.0):+11.4f}%" if abs(ratio - 1.0) <= MEANS else f"{f'{ratio:.3g} times':>12}"
+    return f"{100.0 * (ratio - 1.0):+11.4f}%" if abs(ratio - 1.0) <= WIDE else f"{f'{ratio:.3g} times':>12}"
 
 
 def in_words(certificate: dict) -> list[str]:
@@ -162,7 +162,7 @@ def in_words(certificate: dict) -> list[str]:
 
 
 def holding(certificate: dict) -> list[str]:
-    """How a controller is meant that holds its control: a sentence, or none."""
+    """How long the controller holds each control, and which numbers are not of it: a sentence, or none."""
     held = certificate.get("held_for")
     if held is None:
         return []
@@ -173,7 +173,7 @@ def holding(certificate: dict) -> list[str]:
 
 
 def taking(certificate: dict) -> str:
-    """How sure such a sentence is, and what else it takes."""
+    """How sure the sentence on sub-optimality is, and what else it takes."""
     found = certificate.get("suboptimality") or {}
     taken = "".join(f", taking {sentence}" for sentence in map(visible, found.get("takes", ())))
     return f"{100.0 * certificate['confidence']:.3g} % sure of the sampling{taken}"

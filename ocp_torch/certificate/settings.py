@@ -1,4 +1,4 @@
-"""What is asked of a certificate: of which run, how much is spent on it and how sure it is; and whether it can be had."""
+"""What is asked of a certificate: its run, its effort and its confidence; and whether that can be had."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,24 +11,24 @@ from ocp_torch.files.limits import require_memory
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 
-# Of the name of a problem or a method, in characters: a longer one would break tables.
+# Longest name of a problem or a method, in characters: a longer one would break tables.
 LONGEST_NAME = 120
 # How performance deals with the infinite horizon: stop late and bound the rest, or stop at an exponential time.
 TRUNCATED, RANDOM = "truncated", "random"
 # Which controller is handed out: the one with the lowest simulated performance, or with the lowest bound without simulation.
 SIMULATED, CERTIFIED = "simulated", "certified"
-# Bytes of a number; and numbers that a simulated trajectory and a state of the occupation's supremum have in memory at once,
-# at least, per coordinate of states and controls: those of a Runge-Kutta step.
-DOUBLE, AT_ONCE = 8, 4
+DOUBLE = 8  # bytes of a number
+# Numbers in memory at once, at least, per coordinate of states and controls: those of a Runge-Kutta step.
+AT_ONCE = 4
 
-# Told the name of each part of a certificate as it begins; and for those who do not want to know.
+# Called with the name of each part of a certificate as it begins; `silent` ignores it.
 Progress = Callable[[str], None]
 silent: Progress = lambda part: None
 
 
 @dataclass(frozen=True)
 class Run:
-    """Which run; ``step`` and ``samples``, the states drawn, are those of its end, 0 where nothing was trained."""
+    """Which run a certificate is of; ``step`` and ``samples`` (states drawn) are at its end, 0 where nothing was trained."""
 
     problem: str
     method: str
@@ -40,7 +40,7 @@ class Run:
 
     @classmethod
     def read(cls, certificate: dict) -> "Run":
-        """What ``certificate``, as a file has it, says. Raises `InputError` where it does not say it, or absurdly."""
+        """The run that ``certificate``, read from a file, names. Raises `InputError` where a field is missing or absurd."""
         said = {name: certificate[name] for name in cls.__dataclass_fields__ if name in certificate}
         for name in ("problem", "method", *({"stopped"} & said.keys())):
             if not isinstance(said.get(name), str):
@@ -70,8 +70,8 @@ class CertificateSettings:
     horizon: str = TRUNCATED  # truncated: bounded tail in `bias`; random: an exponential time, no tail and more noise
     prefer: str = SIMULATED  # hand out the controller of the lowest performance, simulated or certified
     stage: StageSettings = field(default_factory=StageSettings)  # the fit to the closed loop
-    # Whether a few trajectories are simulated once more, on far finer steps, for the bias; nothing that makes a claim may do
-    # without, so that it is no field of a configuration.
+    # Whether a few trajectories are simulated once more, on far finer steps, for the bias: no claim may do without, so that
+    # this is no field of a configuration.
     audited: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -95,7 +95,7 @@ class CertificateSettings:
 
 def require_possible(problem: Problem, settings: CertificateSettings, trains_value: bool = True) -> None:
     """Raise `InputError`, before anything is trained, where ``settings`` ask for more memory than there is, or for a proof
-    that there is none of."""
+    that is not available."""
     d, m, replicates = problem.dim, problem.control_dim, settings.replicates
     if settings.rigorous:
         # A proof is loaded only where one is asked for.

@@ -30,8 +30,8 @@ from ocp_torch.control.policies import (
 from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.problems.samples import Samples
 
-# States of each set at which the density is looked at for places without mass.
-LOOKED_AT = 4096
+# States of each set at which the density is checked for places without mass.
+CHECKED_STATES = 4096
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -59,8 +59,8 @@ class TrainedContext(FieldsContext):
 
     @property
     def tightened(self) -> Subsolution | None:
-        """`V` trained on for its bound, as the certificate would train it, where that pays and there is no noise: its
-        controller may be the best one."""
+        """`V` trained on for its bound, as the certificate would train it, where that promises enough and there is no noise:
+        its controller may be the best one."""
         sampled = self.sampled_value
         if sampled is None or not sampled.search or self.problem.noisy:
             return None
@@ -100,7 +100,7 @@ class TrainedContext(FieldsContext):
         return self._best_of([n for n, p in self.policies.items() if not isinstance(p, HeldPolicy)] or [self.kind])
 
     def _best_of(self, names: list[str]) -> str:
-        """Of the controllers ``names`` the one with the lowest performance, or the first where none is known."""
+        """The one of the controllers ``names`` with the lowest performance, or the first where none is known."""
         found = self.simulated[0]
         known = {name: found[name].perf.above for name in names if name in found and found[name].perf.finite}
         return min(known, key=known.__getitem__, default=names[0])
@@ -152,7 +152,7 @@ class TrainedContext(FieldsContext):
 
     @property
     def densest(self) -> float | None:
-        """Of the fitted density and of what simulation shows of it."""
+        """The largest of the fitted density and of the one found backwards in time; `None` where neither is known."""
         fitted = None if self.fitted is None or self.hidden is not None else self.fitted.sup_occupation
         return max((d for d in (fitted, self.observed.sup_occupation) if d is not None), default=None)
 
@@ -169,7 +169,7 @@ class TrainedContext(FieldsContext):
     @property
     def notes(self) -> list[str]:
         notes = list(self._fit[1])
-        # Of the density players' controllers that may be handed out.
+        # The forms of `mu` of those density players' controllers that may be handed out.
         forms = {DENSITY: self.occupation} if self.followed == DENSITY else {}
         forms |= {MINIMISED: CLOSED} if MINIMISED in self.policies else {}
         if self.densities is not None and any(map(self._is_empty_somewhere, forms.values())):
@@ -181,7 +181,7 @@ class TrainedContext(FieldsContext):
     def _is_empty_somewhere(self, occupation: str | None) -> bool:
         """Whether the `mu` that fields give by ``occupation`` is 0 at a sampled state."""
         mu = occupation_density(occupation, self.problem, self.fields, self.constants)
-        return any(bool((mu(samples.x[:LOOKED_AT]) <= 0.0).any()) for samples in self.few)
+        return any(bool((mu(samples.x[:CHECKED_STATES]) <= 0.0).any()) for samples in self.few)
 
     @property
     def remarks(self) -> list[str]:

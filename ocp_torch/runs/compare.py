@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from ocp_torch.certificate.report import MEANS
+from ocp_torch.certificate.report import WIDE
 from ocp_torch.certificate.settings import LONGEST_NAME
 from ocp_torch.errors import InputError, visible
 from ocp_torch.files.reading import FOLDER, kind, read_json
@@ -94,7 +94,7 @@ class Comparison:
 
 
 def _shown(value, form: str) -> str:
-    if form.endswith("%") and value is not None and not 0.0 <= value <= MEANS:  # as a percentage it says nothing
+    if form.endswith("%") and value is not None and not 0.0 <= value <= WIDE:  # as a percentage it says nothing
         return "none" if value < 0.0 else f"{1.0 + value:.3g} times"
     text = "-" if value is None else format(value, form)
     return text if len(text) <= WIDEST or not isinstance(value, int | float) else f"{value:.6g}"

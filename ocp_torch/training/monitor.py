@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 
 from ocp_torch.certificate import Certificate, CertificateSettings
 from ocp_torch.certificate.estimate import known_of
-from ocp_torch.certificate.report import MEANS
+from ocp_torch.certificate.report import WIDE
 from ocp_torch.control.policies import admissible_density, occupation_density
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
@@ -127,7 +127,7 @@ class Monitor(Silent):
         values = {name: f"{e.value:.6f}" for name in ("F_M", "J") if (e := shown.get(name)) is not None}
         gaps = [gap for kind in ("certified", "simulated") if (gap := certificate.gap[kind]) is not None]
         if gaps:
-            values["gap"] = f"{100 * min(gaps):.2f}%" if min(gaps) <= MEANS else "wide"
+            values["gap"] = f"{100 * min(gaps):.2f}%" if min(gaps) <= WIDE else "wide"
         self._show(values)
         # To train.log, not to the terminal.
         log.debug("step %d: %s", trainer.step, ", ".join(f"{k} {v}" for k, v in values.items()))

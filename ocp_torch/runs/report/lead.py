@@ -2,14 +2,14 @@
 
 import math
 
-from ocp_torch.certificate.report import MEANS, in_words, taking
+from ocp_torch.certificate.report import WIDE, in_words, taking
 from ocp_torch.runs.report.words import NEEDS, number, percent, sentence
 
 
 def certified(certificate: dict) -> bool:
     """Whether the certificate bounds how far from optimal the controller is, by a gap of at most `MEANS`."""
     found = _at_most(certificate)
-    return certificate["contradiction"] is None and found is not None and found[0] <= MEANS
+    return certificate["contradiction"] is None and found is not None and found[0] <= WIDE
 
 
 def lead(certificate: dict) -> str:
@@ -21,7 +21,7 @@ def lead(certificate: dict) -> str:
         nothing = f"nothing is certified of how far from optimal the controller is: {_why(certificate)}"
         return " ".join(map(sentence, [nothing, *said]))
     most, taken = found
-    if most > MEANS:
+    if most > WIDE:
         times = f"{math.ceil(10.0 * (1.0 + most)) / 10.0:,g}"
         return sentence(f"hardly anything is certified: the controller may cost {times} times the optimum ({taken})")
     simulated = _simulated(certificate) is not None

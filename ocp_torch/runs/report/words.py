@@ -2,7 +2,7 @@
 
 from ocp_torch.certificate import bounds
 from ocp_torch.certificate.bound import LOWER, UPPER
-from ocp_torch.certificate.report import CONTROLLERS, MEANS, holding
+from ocp_torch.certificate.report import CONTROLLERS, WIDE, holding
 from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED
 from ocp_torch.runs.compare import number
 
@@ -59,7 +59,7 @@ def trust(certificate: dict) -> list[str]:
     proved, seen = gap["certified"], gap["simulated"]
     if certificate["contradiction"] is not None:
         return ["Trust none of the numbers below until the contradiction is resolved: one of them is wrong."]
-    if proved is not None and number(proved) > MEANS:
+    if proved is not None and number(proved) > WIDE:
         found.append(
             f"The bounds without simulation are far apart: `{sides[UPPER]}` is {1.0 + proved:.2g} times `{sides[LOWER]}`."
         )
