@@ -53,7 +53,7 @@ class Bound(ABC):
         return context.kind
 
     def notes(self, context: Context, shown: Estimate | None) -> list[str]:
-        """What a user should be told beside the number that is ``shown``."""
+        """Warnings that belong to the number that is ``shown``."""
         return []
 
     def searches(self, context: Context) -> list[str]:

@@ -1,4 +1,4 @@
-"""What the bounds of one certificate share: a problem, states, functions, and what was found of them, each computed once."""
+"""What the bounds of one certificate share: a problem, states, functions and results, each computed once."""
 
 import contextlib
 from dataclasses import dataclass, field, replace
@@ -53,9 +53,9 @@ class Context:
     progress: Progress = silent
     results: dict = field(default_factory=dict, init=False)  # what a bound has computed and needs again, by name
 
-    recorded = external = False  # whether it is of recorded samples, or of a controller that somebody brings
+    recorded = external = False  # whether it is of recorded samples, or of a given controller
     divergent = ""  # which bounds take a divergence, in words
-    listed: ClassVar[tuple[str, ...]] = ()  # controllers that a certificate names whether they were simulated or not
+    listed: ClassVar[tuple[str, ...]] = ()  # controllers that a certificate names even if they were not simulated
     if TYPE_CHECKING:  # each kind gives these itself, as a field, a constant or a property
 
         @property
@@ -78,7 +78,7 @@ class Context:
 
     @property
     def settled(self) -> bool:
-        """Whether the controller that is handed out is not to be chosen any more."""
+        """Whether the controller that is handed out was chosen before."""
         return False
 
     def held_for(self, name: str | None) -> float | None:
@@ -150,7 +150,7 @@ class Context:
 
     @property
     def ahead(self) -> contextlib.AbstractContextManager[None]:
-        """Within it a second core works on the lower side, beside simulation and the upper one."""
+        """A context in which a second core works on the lower side, beside simulation and the upper side."""
         return contextlib.nullcontext() if self.sampled_value is None else self.sampled_value.ahead()
 
     @property
@@ -165,7 +165,7 @@ class Context:
         if not candidates:
             return {}, None
         self.progress("simulation")
-        # Where the best certified one is handed out, each may be it.
+        # Where the controller with the best certified bound is handed out, none can be left out.
         how = self.settings, self.seed, not self.external and self.settings.prefer != CERTIFIED
         return simulate_candidates(self.problem, candidates, *how, self.remembered, self.kind if self.settled else None)
 
@@ -199,7 +199,7 @@ class Context:
 
     @cached_property
     def informed(self) -> Constants:
-        """The constants by which bounds are computed: an `M` that nobody gave follows from what was met of the density."""
+        """The constants by which bounds are computed: an `M` that was not given follows from the density met."""
         guessed = self.constants.basis("M") == GUESSED  # else the density need not be computed
         return self.constants.informed(self.densest) if guessed else self.constants
 
@@ -239,6 +239,6 @@ class Context:
     def assumptions(self) -> Assumptions:
         """What the bounds rest on, after all checks."""
         found = self.checked if self.hidden is None else replace(self.checked, regular_holds=False)
-        # What is proved of a given controller stands whatever its divergence; of trained fields it is used with their J.
+        # A C_V proved for a given controller stands whatever its divergence; for trained fields it is used with their J.
         proved = self.fitted if self.external else self.closed_loop if self.takes_fitted_J else None
         return found if proved is None else found.with_value_bound(proved.C_V)

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from ocp_torch.certificate.certificate import Certificate
 
 SCHEMA = 2
-# Gaps above this are written as a multiple, not in per cent.
-WIDE = 1.0
+WIDE = 1.0  # gaps above this are written as a multiple, not in per cent
 # Where the largest number is outside this range eight decimals would show too few or too many digits.
 DECIMALS = (1e-3, 1e4)
 # What the controllers of a run are called in sentences.

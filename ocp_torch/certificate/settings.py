@@ -18,8 +18,7 @@ TRUNCATED, RANDOM = "truncated", "random"
 # Which controller is handed out: the one with the lowest simulated performance, or with the lowest bound without simulation.
 SIMULATED, CERTIFIED = "simulated", "certified"
 DOUBLE = 8  # bytes of a number
-# Numbers in memory at once, at least, per coordinate of states and controls: those of a Runge-Kutta step.
-AT_ONCE = 4
+AT_ONCE = 4  # numbers in memory at once, at least, per coordinate of states and controls: those of a Runge-Kutta step
 
 # Called with the name of each part of a certificate as it begins; `silent` ignores it.
 Progress = Callable[[str], None]
@@ -98,7 +97,7 @@ def require_possible(problem: Problem, settings: CertificateSettings, trains_val
     that is not available."""
     d, m, replicates = problem.dim, problem.control_dim, settings.replicates
     if settings.rigorous:
-        # A proof is loaded only where one is asked for.
+        # Imported only where a proof is asked for.
         from ocp_torch.certificate.proof.rigorous import MOST_DIMENSIONS
 
         if d > MOST_DIMENSIONS or not trains_value:

@@ -30,8 +30,7 @@ from ocp_torch.control.policies import (
 from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.problems.samples import Samples
 
-# States of each set at which the density is checked for places without mass.
-CHECKED_STATES = 4096
+CHECKED_STATES = 4096  # states of each set at which the density is checked for places without mass
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -11,10 +11,8 @@ from ocp_torch.problems.constants import FROM_DENSITY, FROM_PROBLEM, Constants
 from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED, Need
 from ocp_torch.problems.problem import Problem, shipped
 
-# Relative excess of an estimated supremum over a bound, up to which numerical errors explain it.
-TOLERANCE = 0.02
-# The same of a simulated value over C_V.
-VALUE_TOLERANCE = 1e-3
+TOLERANCE = 0.02  # relative excess of an estimated supremum over a bound, up to which numerical errors explain it
+VALUE_TOLERANCE = 1e-3  # relative excess of a simulated value over C_V that numerical errors explain
 # An M that is not declared must be this factor above the density observed: trained with an M that is too small the dual keeps
 # the density just below it, and F_M is then above OPT.
 CLEARANCE = 1.1

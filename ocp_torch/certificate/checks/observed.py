@@ -1,6 +1,6 @@
 """What is observed of a controller: how large it gets, where it leads, and whether it and the problem are regular.
 
-Jumps and layers are found by halving segments until only they are left to see.
+Jumps and layers are found by halving segments until nothing else changes across them.
 """
 
 import math
@@ -26,8 +26,7 @@ LINES = 48  # of each length, half of them along an axis
 LENGTHS = (1.0, 0.1, 0.01, 1e-3)
 ON_LINE = 65  # states on a line
 FOLLOWED = 64  # pieces of the lines of a length that are halved, for each way to choose them
-# After the last halving the longest segment is 3e-11 long: what still changes across it is no slope.
-HALVINGS = 34
+HALVINGS = 34  # after the last halving the longest segment is 3e-11 long: what still changes across it is no slope
 FIRST_HALVINGS = 14  # after which only the segments with the largest changes go on
 REMAINING_SEGMENTS = 384
 # A change relative to the largest value met that counts as a jump; above the noise of a controller in float32.
@@ -41,8 +40,8 @@ CONTROLLER, DRIFT, MATRIX, NOISE, LOOP = "controller", "drift", "control matrix"
 
 @dataclass(frozen=True)
 class Jump:
-    """The largest jump found, `|u(x+) - u(x-)|`, where, and of what; ``size`` is 0 where none was. ``width`` is the length of
-    the segment it was seen across."""
+    """The largest jump found: its ``size``, `|u(x+) - u(x-)|`, 0 where there is none; a state ``x`` ``(d,)`` next to it; of
+    ``what``; and the ``width`` of the segment across which it was seen."""
 
     size: float
     x: Tensor
@@ -60,7 +59,7 @@ class Jump:
 
 @dataclass(frozen=True)
 class Observed:
-    """What the checks found; `None` where it was not looked for."""
+    """What the checks found; `None` where a check was not made."""
 
     sup_occupation: float | None = None
     a_priori_occupation: float | None = None  # >= sup mu^u, by the divergence of the closed loop
@@ -171,7 +170,7 @@ def _pieces(function, dim: int, generator: torch.Generator, near: Tensor | None)
         middle = draw(LINES, dim)
         if near is not None and len(near):
             rows = torch.randint(len(near), (LINES // 2,), generator=generator)
-            # Somewhere on the line, not always on the same of its states.
+            # At a random place on the line, not always at the same of its states.
             middle[: LINES // 2] = near[rows] + 0.3 * length * (draw(LINES // 2, dim) - 0.5) / dim**0.5
         direction = torch.randn(LINES, dim, dtype=torch.float64, generator=generator)
         axis = torch.randint(dim, (LINES,), generator=generator)

@@ -1,9 +1,9 @@
-r"""Do a few states carry a mean? Then its standard error is not to be trusted, and more states are wanted where those are.
+r"""Do a few states carry a mean? Then its standard error cannot be trusted, and more states are needed where those are.
 
 Of `N` contributions whose fourth moment is `k` times the square of their second, about `N / k` make the scatter. Where that
-is few, states are drawn from a density fitted to what is rare, with exact weights; what stays rare widens the interval: where
-`n` were met there may be `n + 2 sqrt(n) + 3` (Poisson).
-Where contributions have no variance at all their scatter says nothing, however many are drawn: what lies beyond is estimated.
+is few, states are drawn from a density fitted to the rare ones, with exact weights; what stays rare widens the interval:
+where `n` were met there may be `n + 2 sqrt(n) + 3` (Poisson).
+The scatter of contributions without variance says nothing, however many are drawn: what lies beyond them is estimated.
 """
 
 import math
@@ -23,14 +23,11 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.starts import UNIFORM_STATES, evaluation_distribution
 
-# States behind the scatter, below which a few carry the mean.
-FEW = 30.0
-# Kurtosis below which contributions are not examined.
-LEAST_KURTOSIS = 30.0
-# Contributions that fall off as a lower power have no variance; by one below 1 no mean.
-HEAVY = 2.0
-LEAST_TAIL = 16  # largest contributions that tell the power; it is told by the root of `N`, if that is enough
-LEAST_POWER = 1.05  # that is assumed
+FEW = 30.0  # states behind the scatter, below which a few carry the mean
+LEAST_KURTOSIS = 30.0  # kurtosis below which contributions are not examined
+HEAVY = 2.0  # contributions that fall off as a lower power have no variance; by one below 1 no mean
+LEAST_TAIL = 16  # of `N` contributions the largest `sqrt(N)` tell the power, if they are so many at least
+LEAST_POWER = 1.05  # assumed where the largest tell a lower one
 # Factor on what is added, as that is off by as much as the power: of 8.5, the mean of `|x|^-.8`, up to .4 was missing.
 ROOM = 2.0
 # The largest fourth of them must fall off as slowly: errors of an arm's `V` did not, and .35 % had been added to one mean.
@@ -91,7 +88,7 @@ def beyond_largest(values: Tensor, weights: Tensor, size: float) -> float:
 
 
 def widened(estimate: Estimate, contributions: list[Tensor]) -> Estimate:
-    """``estimate`` with its interval widened by the `rarity` of what it is the mean of."""
+    """``estimate`` with its interval widened by the `rarity` of the ``contributions`` it is the mean of."""
     rare = rarity(torch.cat(contributions), estimate.value)
     return replace(estimate, bias=(estimate.bias or 0.0) + rare) if rare > 0.0 else estimate
 
@@ -107,8 +104,8 @@ R = TypeVar("R", bound=Judged)
 
 
 def sharpened(evaluate: Callable[[list[Samples]], R], problem: Problem, sets: list[Samples], seed: int) -> R:
-    """``evaluate`` on ``sets`` of samples of ``problem``, or, while few of them carry a mean, on others of the same number,
-    drawn from a density fitted to what those few show."""
+    """``evaluate`` on ``sets`` of samples of ``problem``, or, while few samples carry a mean, on sets of that size drawn from
+    a density fitted to those few."""
     found = evaluate(sets)
     for k in range(ROUNDS):
         rare = [c for c in found.contributions if rarity(torch.cat(c), 1.0) > 0.0]

@@ -1,1 +1,1 @@
-"""Certificates of what was not trained here: a controller somebody brings, recorded samples."""
+"""Certificates of what was not trained here: a given controller, recorded samples."""

@@ -117,7 +117,7 @@ def _rounding(out: Tensor) -> float:
 
 
 def _refusal(error: Exception) -> InputError:
-    """What a user is told where the controller raised ``error``."""
+    """The `InputError` for an ``error`` that the controller raised."""
     if isinstance(error, InputError):
         return error
     return InputError(f"the controller raised {type(error).__name__}: {first_line(error)}.")

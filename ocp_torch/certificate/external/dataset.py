@@ -22,8 +22,7 @@ from ocp_torch.problems.needs import SEARCHED
 from ocp_torch.problems.recorded.dataset import Dataset
 from ocp_torch.problems.samples import Samples
 
-# Groups of held-out samples at most, the scatter of whose means gives the standard error.
-GROUPS = 64
+GROUPS = 64  # groups of held-out samples at most, the scatter of whose means gives the standard error
 FEWEST_SAMPLES = 8  # in a group, unless that leaves fewer than two groups
 
 

@@ -27,7 +27,7 @@ ON_SEGMENT = 256
 # A gradient is another function's where its integral is off by more than this part of all that changes, on average: random
 # states make it off by a sixteenth where the sign is random.
 OFF_IN_MEAN = 0.1
-OFF_ON_ONE = 0.3  # the same on a single segment
+OFF_ON_ONE = 0.3  # or by this part of the largest change on a single segment
 
 
 class Periodic:

@@ -22,19 +22,15 @@ from ocp_torch.problems.samples import Samples
 
 # Radii that are tried, from the smallest until two in a row promise less than another (one did beside a gain of .2 %).
 RADII = tuple(2.0 ** (0.5 * k) for k in range(-15, -8))
-# States of all sets together on which a radius is tried.
-TRIAL_STATES = 2048
+TRIAL_STATES = 2048  # states of all sets together on which a radius is tried
 # States where the slack of V is largest, at which its averages are evaluated too, as theirs is large there.
 WORST_STATES = 2048
-# Ascents of such a trial at most.
-TRIAL_ASCENTS = 8
+TRIAL_ASCENTS = 8  # ascents of such a trial at most
 # A trial must promise this part of the bound for all states to be evaluated: for six oscillators that gave .45 % in 60 of
 # 230 s. For another radius it must promise as much beyond the bound that the first came to.
 LEAST_PROMISE = 3e-4
-# Directions at most along which neighbours lie.
-DIRECTIONS = 8
-# Evaluations of V at most for the values at all sampled states.
-EVALUATIONS = 2**20
+DIRECTIONS = 8  # directions at most along which neighbours lie
+EVALUATIONS = 2**20  # evaluations of V at most for the values at all sampled states
 
 
 class Mollified:

@@ -23,10 +23,8 @@ from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.needs import Need
 from ocp_torch.problems.samples import Samples
 
-# States of a half that must lie above the constant taken off `V`: with fewer none is sought.
-FEWEST_ABOVE = 16
-# Training samples at most that are compared with the held-out ones.
-MOST_TRAINED = 2**15
+FEWEST_ABOVE = 16  # states of a half that must lie above the constant taken off `V`: with fewer none is sought
+MOST_TRAINED = 2**15  # training samples at most that are compared with the held-out ones
 
 
 class PenalisedDual(Bound):

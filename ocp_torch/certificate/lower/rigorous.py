@@ -14,8 +14,7 @@ if TYPE_CHECKING:
 
 # How far rounding may take a number in float64 from its value in real arithmetic, relative to 1 + its size.
 ROUNDING = 1e-9
-# Level of the interval of a sampled mean that, outside the proved one, refutes a proof.
-REFUTING_LEVEL = 0.9999
+REFUTING_LEVEL = 0.9999  # level of the interval of a sampled mean that, outside the proved one, refutes a proof
 
 
 class Rigorous(Bound):

@@ -22,7 +22,7 @@ from ocp_torch.problems.samples import Samples
 
 # Part of the bound that training for it must promise: .39 and .85 % were promised of two arms, .51 and 1.0 % came.
 LEAST_PROMISE = 0.0006
-# The same with noise: 1.1 to 7.3 % were promised of two dubins and a unicycle, and 1.2 to 7.5 % came.
+# That part with noise: 1.1 to 7.3 % were promised of two dubins and a unicycle, and 1.2 to 7.5 % came.
 NOISY_LEAST_PROMISE = 0.005
 # Part of the torus with the largest slacks, whose mean stands for the supremum in that promise.
 LARGEST_PART = 0.01
@@ -80,7 +80,7 @@ class SampledValue:
 
     @contextlib.contextmanager
     def ahead(self) -> Iterator[None]:
-        """Within it a second core looks for the `best`, if there is one and two threads may evaluate the problem."""
+        """A context in which a second core seeks the `best`, if there is one and two threads may evaluate the problem."""
         _ = self.initial  # needed at once, beside that search
         if self.search and self.problem.concurrent:
             self._best.begin()

@@ -14,21 +14,16 @@ from ocp_torch.problems.generator import Generator, hjb_slack
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# The largest `theta` for which the multiple `theta V` is tried.
-MAX_THETA = 1.5
+MAX_THETA = 1.5  # the largest `theta` for which the multiple `theta V` is tried
 # Ascents of a search in steep places for each ascent from the largest values: peaks of .09 and .30 % of a bound were then
 # found with 8 of 8 seeds in three and two coordinates; of one of 1.07 % in five coordinates .75 to 1.07 % was.
 STEEP_ASCENTS = 64
-# Random states among which a search chooses the steepest, for each of its ascents.
-STATES_PER_ASCENT = 8
-# Searches at most.
-MOST_SEARCHES = 8
-# Searches in a row without a higher peak after which no other is made.
-FRUITLESS = 2
+STATES_PER_ASCENT = 8  # random states among which a search chooses the steepest, for each of its ascents
+MOST_SEARCHES = 8  # searches at most
+FRUITLESS = 2  # searches in a row without a higher peak after which no other is made
 # Highest ends of a search that climb on in double precision: a peak of .09 % of a bound was .03 % high before.
 FINISHED = 32
-# Peaks are sought that are higher than the known supremum by more than this part of `E[V mu0]`.
-NEGLIGIBLE = 1e-5
+NEGLIGIBLE = 1e-5  # peaks are sought that are higher than the known supremum by more than this part of `E[V mu0]`
 
 
 @dataclass(frozen=True)

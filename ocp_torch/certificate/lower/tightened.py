@@ -33,8 +33,7 @@ from ocp_torch.steppers.nonfinite import NonFiniteError
 # `M`, steps, and the first learning rate, which falls to 0. The slack's mean over the part `1 / M` of the torus stands for
 # its supremum: a pendulum's bound was 3.0311, in as long 3.0278 by 600 steps of M = 1,000 and 1,400 of 3,000.
 PLAN = (3000.0, 2000, 5e-3)
-# The same with noise, which rounds kinks and makes a step take twice as long.
-NOISY_PLAN = (3000.0, 700, 2e-3)
+NOISY_PLAN = (3000.0, 700, 2e-3)  # with noise, which rounds kinks and makes a step take twice as long
 # Decays of the optimiser's moments: a unicycle's bound came to 1.2985 by 2,000 steps at a rate of 5e-3; by the usual
 # (.95, .95) at 1e-3 to 1.2959 by 2,100 and to 1.2986 by 4,500.
 BETAS = (0.9, 0.95)

@@ -30,10 +30,8 @@ NEAREST, FARTHEST = 1e-4, 1e-2
 
 # Steps between searches for peaks in steep places, where no worst state leads: a unicycle's bound was 1.2996, without 1.2928.
 SEEK_EVERY = 50
-# Random states of such a search, for each new state of a step.
-SOUGHT = 4
-# Part of these states from which ascents start.
-ASCENDING = 1 / 16
+SOUGHT = 4  # random states of such a search, for each new state of a step
+ASCENDING = 1 / 16  # part of these states from which ascents start
 
 
 class WorstStates:

@@ -28,12 +28,11 @@ from ocp_torch.problems.problem import Problem
 
 # The number of cells that a tolerance takes grows exponentially with the dimension.
 MOST_DIMENSIONS = 2
-# Cells per coordinate in which an enclosure is compared with the data,
+# Cells per coordinate in which an enclosure is compared with the data: of full size, and so small that their radius does not
+# hide a wrong value.
 SPOT_CELLS = 16
-# of full size, and so small that their radius does not hide a wrong value.
 SPOT_SIZES = (1.0, 2.0**-8)
-# Cells per coordinate, of which those around narrow features of the data are compared too.
-ODD_CELLS = (16, 128, 1024)
+ODD_CELLS = (16, 128, 1024)  # cells per coordinate, of which those around narrow features of the data are compared too
 FIRST_CELLS = {1: 64, 2: 32}  # a side to start with, by dimension
 CHUNK = 256  # cells evaluated at once, which bounds the memory
 # How close to the sampled supremum a proof comes, relative to the size of `theta V mu0`, by dimension.

@@ -17,7 +17,7 @@ def derivatives(dim: int, curved: bool) -> list[tuple[int, ...]]:
 @dataclass(frozen=True)
 class SmoothModel:
     """A layer's values `h` and their derivatives: `|h - P| <= r_0` and `|dh/dt_i - dP/dt_i| <= r_i` on each cell, and where
-    second derivatives are carried the same for those.
+    second derivatives are carried likewise for those.
 
     ``P`` ``(K, N, width)`` by the order of ``basis``; ``radii`` ``(R, N, width)``, one for each of `derivatives`.
     """

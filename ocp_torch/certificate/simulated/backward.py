@@ -1,4 +1,4 @@
-"""Where a closed loop leads: its occupation density, found backwards in time along trajectories, and the largest of it."""
+"""The occupation density of a closed loop, found backwards in time along trajectories, and its supremum."""
 
 import math
 from typing import cast
@@ -26,10 +26,9 @@ STEP_LENGTH = 0.1
 FEWEST_STEPS, MOST_STEPS = 10, 75
 # The logarithm at which the growth of a density is cut off, so that it stays a number: e^60 is unbounded to any check.
 LARGEST_GROWTH = 60.0
-# With noise, evaluations of the closed loop at each state and time, shared by the paths and the `d + 1` differences on each.
+# Evaluations of the noisy loop at each state and time at first, shared by the paths and the `d + 1` differences on each.
 FEW_EVALUATIONS = 48
-# The same near the densest states: more show a density that is too large for M more surely.
-EVALUATIONS = 192
+EVALUATIONS = 192  # near the densest states: more show a density that is too large for M more surely
 FEWEST_PATHS = 4  # from each state, with noise
 DENSEST_STATES = 6  # of the first look, near which the density is computed again
 NEARBY_DIVISOR = 3  # of the number of all states, for the number of states near those
@@ -139,9 +138,9 @@ def estimated_sup_occupation(
     together: bool = False,
     rounded: Policy | None = None,
 ) -> float:
-    """The largest `mu^u` met: at the ends of trajectories, where mass accumulates, at uniform states, and then near the
-    highest of them; ``together`` as in `backward_flow`. ``rounded``, the policy in single precision, takes its place where no
-    differences are taken."""
+    """The largest `mu^u` met: at ends of trajectories, where mass gathers, at uniform states, and then near the densest of
+    these; ``together`` as in `backward_flow`. ``rounded``, the policy in single precision, is used where no differences are
+    taken."""
     if rounded is not None and differentiable(problem, rounded):
         policy = rounded if is_even(problem, problem.control_matrix(end_states)) else policy
     count = max(1, 2 * states // 3)

@@ -25,12 +25,10 @@ from ocp_torch.problems.replaced import replaced
 CHECKED_PATHS = 64
 # States checked on each step: on steps of a fiftieth of a turn 20 of the paths show a wall a thousandth of a turn thick.
 STATES_ON_STEP = 8
-# Ends of steps before and after a step between which the motion must be steady.
-AROUND = 4
-# There the slowest speed of the coordinate is above this part of the fastest, and velocities change by less than this part.
+AROUND = 4  # ends of steps before and after a step between which the motion must be steady
+# Part of the fastest speed that the slowest must exceed there, and of the velocity that its change must stay below.
 STEADY = 0.5
-# A speed of at most this part of the slowest around is as good as standing still.
-STILL = 0.05
+STILL = 0.05  # a speed of at most this part of the slowest around is as good as standing still
 # A coordinate that moves less in a step, in turns, is at rest.
 AT_REST = 1e-5
 

@@ -1,4 +1,4 @@
-r"""A controller whose control is held for a while, simulated as what it is.
+r"""The simulation of a controller whose control is held for a while.
 
 Trajectories are smooth within each hold, so that no step need be halved because a control jumps. But holds are many, some
 `12 / (rho h)` to the end of the discount, and choosing a control takes longer than moving under it. Late costs count little,

@@ -46,7 +46,7 @@ class FeedbackLoop:
         return torch.cat([x, self.value(x).unsqueeze(-1)], dim=-1) if self.value is not None and self.summed else x
 
     def renewed(self, state: Tensor) -> Tensor:
-        """The ``state``: nothing of it is held."""
+        """The ``state`` itself: nothing of it is held."""
         return state
 
     def noise(self, state: Tensor) -> Tensor:
@@ -114,7 +114,7 @@ class Sliding:
         self.stays = torch.zeros(count, dtype=torch.bool)
 
     def by(self, integrate: Integrate) -> Integrate:
-        """The results of ``integrate``, of whose columns the first is `-Q_u` and the second `z - V`."""
+        """The integrator ``integrate``, whose columns are `-Q_u` and `z - V`, with its results corrected."""
 
         def corrected(rows: Tensor, steps: int) -> tuple[Tensor, Tensor]:
             rates, end = integrate(rows, steps)

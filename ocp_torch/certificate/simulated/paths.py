@@ -26,8 +26,7 @@ from ocp_torch.maths.runge_kutta import (
 )
 from ocp_torch.maths.seeds import Branch, derive_seed
 
-# Factor on the steps where the usual ones jump over a wall: one a hundredth of a turn thick is then met.
-FINER = 8
+FINER = 8  # factor on the steps where the usual ones jump over a wall: one a hundredth of a turn thick is then met
 FINER_DOUBLINGS = MAX_DOUBLINGS - 3  # the finest are then as fine as elsewhere
 
 

@@ -132,7 +132,7 @@ class Simulation:
         return self._judged(self._paths(steps))
 
     def _without_value(self, trajectories: int) -> "Simulation":
-        """This simulation by the cost itself, along so many ``trajectories`` of each set."""
+        """This simulation by the cost itself, along ``trajectories`` of each set."""
         rounded = None if self.rounded is None else (self.rounded[0], None)
         return replace(self, trajectories=trajectories, value=None, initial=None, rounded=rounded)
 

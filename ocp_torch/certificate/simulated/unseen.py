@@ -61,9 +61,8 @@ def unmet_cost(loop: Loop, met: float, draws: int, size: float) -> float:
 def unmet_tail(paths: Paths, results: Tensor, size: float) -> float:
     """What results larger than any of ``results`` ``(N,)`` of ``paths`` add to their mean, whose size is ``size``.
 
-    That is told by how the largest fall off (`beyond_largest`), but is at most what `3 / N` of all paths add if their results
-    are as large as the largest rate found: beside kinks of `V` errors fall off slowly only up to the largest slack (on a
-    torus .1 % instead of up to .6 %)."""
+    The estimate is `beyond_largest`, but at most what `3 / N` of all paths add if their results are as large as the largest
+    rate found: beside kinks of `V` errors fall off slowly up to the largest slack alone (on a torus .1 % instead of .6 %)."""
     beyond = beyond_largest(results, paths.mass, size)
     if not beyond > 0.0:
         return 0.0

@@ -24,15 +24,13 @@ from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.generator import Generator, pull_back
 from ocp_torch.problems.samples import Samples
 
-# Another function must lower the bound by more than this part of `|E[V mu0]|`: less is rounding.
-LEAST_GAIN = 1e-7
+LEAST_GAIN = 1e-7  # another function must lower the bound by more than this part of `|E[V mu0]|`: less is rounding
 # Heights above which `V` is lowered, as parts of its range: of eight heights on four tori .3 was best three times, .8 once.
 HEIGHTS = (0.3, 0.6, 0.9)
-# The slope of `h` grows from 0 to 1 within this part of the range above the height.
-BEND = 0.25
+BEND = 0.25  # the slope of `h` grows from 0 to 1 within this part of the range above the height
 # How often at most the best function is chosen and its slack climbed: another one may lower a spike that ascents find.
 MOST_CHOICES = 4
-# That ends where no supremum grows by more than this part of itself,
+# Climbing ends where no supremum grows by more than this part of itself,
 GROWTH = 0.01
 # or where the bound rises by no more than this part of `|E[V mu0]|`: ascents in eight coordinates take 2.2 s instead of 3.7.
 BOUND_RISE = 1e-6

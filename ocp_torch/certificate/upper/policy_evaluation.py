@@ -38,10 +38,8 @@ LARGEST_RATIO = 16.0
 COLLAPSE_STEP = 40
 # A mass of `mu` below this is a collapse, and the fit is begun anew (dubins with noise: two seeds of three).
 LEAST_MASS = 0.01
-# Factor on the learning rate of a fit that is begun anew.
-RESTART_FACTOR = 0.3
-# Fits at this learning rate or less are not checked for a collapse.
-LEAST_CHECKED_RATE = 1e-3
+RESTART_FACTOR = 0.3  # factor on the learning rate of a fit that is begun anew
+LEAST_CHECKED_RATE = 1e-3  # fits at this learning rate or less are not checked for a collapse
 # Ascents of either sign to the slack's suprema: in 64 coordinates they found 7, where 4,096 states showed .1.
 ASCENTS = 32
 ASCENT_STEPS = 40
@@ -49,11 +47,10 @@ ASCENT_STEPS = 40
 EXCESS_STATES = 4096
 # Steps after which the first round may end: in 16 coordinates the bound was 5e-6 above the optimum after 100, 5e-5 after 25.
 EXCESS_FIRST = 100
-# Steps between two looks at the excess from then on.
-EXCESS_EVERY = 25
+EXCESS_EVERY = 25  # steps between two looks at the excess from then on
 # Part of `good_excess` at which the first round ends early: any `mu` will do where `V` solves its equation.
 EARLY_PART = 0.05
-# The same where the slack is steep: at 1 the circle's certified gap was .002 % wider than after a round of 300 steps.
+# That part where the slack is steep: at 1 the circle's certified gap was .002 % wider than after a round of 300 steps.
 STEEP_EARLY_PART = 0.5
 
 

@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     from ocp_torch.certificate.context import Context
     from ocp_torch.certificate.external.dataset import RecordedContext
 
-# Samples of largest fitted density at which the contraction of the flow is checked.
-DENSEST_SAMPLES = 10
+DENSEST_SAMPLES = 10  # samples of largest fitted density at which the contraction of the flow is checked
 
 
 class RecordedPrimal(PenalisedPrimal):
