@@ -31,7 +31,7 @@ class Certificate:
     names of guesses that another bound excludes. ``outside`` is the part of the discounted time that the controller spends
     outside the box of a system in physical units. ``held_for`` is the time for which it holds each control, `None` where it
     acts at every instant; ``followed`` is the one whose closed loop was fitted, by the density ``occupation``, to draw.
-    ``subsolution`` is what the shifted bound is of, where that is not the `V` that was certified.
+    ``subsolution`` is the function of the shifted bound, where that is not the `V` that was certified.
     """
 
     run: Run
@@ -108,7 +108,7 @@ class Certificate:
 
     @property
     def controller(self) -> str | None:
-        """The controller that all this is about: the ``subject``, or the one with the smallest simulated performance."""
+        """The controller of the certificate: the ``subject``, or the one with the lowest simulated performance."""
         return None if self._handed_out is None else self._handed_out[0]
 
     @property

@@ -50,7 +50,7 @@ class TrainedContext(FieldsContext):
         single = self.fields.rounded
         rounded = {name: (policy, single.value) for name, policy in self.policies_of(single).items()}
         found = {name: Candidate(policy, self.value, initial, rounded[name]) for name, policy in self.policies.items()}
-        if sampled is not None and own is not None:  # its controller has a control variate of its own
+        if sampled is not None and own is not None:  # the controller from its V has a control variate of its own
             initial = replace(sampled, value=own, search=False).initial
             beside = (rounded[TRAJECTORIES][0], single.trajectory_value)
             found[TRAJECTORIES] = Candidate(self.policies[TRAJECTORIES], own, initial, beside)
@@ -110,7 +110,7 @@ class TrainedContext(FieldsContext):
 
     @property
     def has_densities(self) -> bool:
-        """Whether there is a trained `w`, of which a divergence is known."""
+        """Whether there is a trained `w` whose divergence is known."""
         return self.fields.control_density is not None and self.problem.gives_divergences
 
     @cached_property
@@ -184,7 +184,7 @@ class TrainedContext(FieldsContext):
 
     @property
     def remarks(self) -> list[str]:
-        """What a user should know of the controllers themselves."""
+        """Warnings about the controllers themselves."""
         found, zero = self.simulated
         notes = [
             f"the performance of the {CONTROLLERS.get(name, name)} is not finite; it is left out."

@@ -1,1 +1,1 @@
-"""What the bounds rest on, held against what could refute it."""
+"""Checks of what the bounds rest on against what could refute it."""

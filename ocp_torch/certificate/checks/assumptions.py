@@ -87,7 +87,7 @@ class Assumptions:
         return replace(self, C_V=C_V, value_holds=True, control_holds=True, basis=self.basis | {"C_V": SEARCHED})
 
     def to_dict(self) -> dict:
-        """JSON form of the numbers; a supremum that grew beyond all numbers is null."""
+        """JSON form of the numbers; an infinite supremum is null."""
         numbers = {
             k: v for k, v in vars(self).items() if not k.endswith("_holds") and k not in ("basis", "M_is", "warnings")
         }

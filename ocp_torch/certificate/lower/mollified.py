@@ -44,7 +44,7 @@ class Mollified:
             mixed = torch.randn(dim, DIRECTIONS, generator=fixed_generator(), dtype=torch.float64)
             axes = torch.linalg.qr(mixed).Q.T
         self.value, self.radius = value, radius
-        self.offsets = radius * torch.cat([torch.zeros_like(axes[:1]), axes, -axes])  # (2 k + 1, d)
+        self.offsets = radius * torch.cat([torch.zeros_like(axes[:1]), axes, -axes])  # (2 K + 1, d)
 
     @property
     def rounded(self) -> "Mollified":
@@ -52,7 +52,7 @@ class Mollified:
         return Mollified(rounded(self.value), self.dim, self.radius)
 
     def neighbours(self, x: Tensor) -> Tensor:
-        """All states that are averaged over, ``(N (2 k + 1), d)``."""
+        """All states that are averaged over, ``(N (2 K + 1), d)``."""
         return (x.unsqueeze(1) + self.offsets.to(x)).remainder(1.0).flatten(0, 1)
 
     def __call__(self, x: Tensor) -> Tensor:

@@ -101,7 +101,7 @@ class SampledValue:
     def _trained_on(self) -> Generator[None, None, Subsolution | None]:
         if not worth(self.own, NOISY_LEAST_PROMISE if self.problem.noisy else LEAST_PROMISE):
             return None
-        batch = len(self.sets[0])  # a small certificate is a quick one
+        batch = len(self.sets[0])  # states a step: a small certificate trains on few
         return (yield from tightened(self.problem, self.value, self.seed, batch, self.steps))
 
     def _found(self) -> Generator[None, None, Found]:

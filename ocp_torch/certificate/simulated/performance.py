@@ -98,11 +98,11 @@ class Simulation:
 
     With ``value`` its Bellman slack is simulated and ``initial``, `E[V mu0]` per replicate from many more states, is added.
     The cost itself is simulated where the slack is too large (`NO_VARIATE`), and along fewer paths where these are long
-    (`MOST_STEPS`). Steps are halved, without noise ``doublings`` times at most, until a trajectory
-    changes by less than ``tolerance``, relative to the answer, or all of them by little beside the standard error.
-    ``rounded``, the controller and `V` in single precision, takes their place where both agree at the starts; a few
-    trajectories are exact, and their differences go into the bias, unless, without noise, they are not ``audited``. A
-    `HeldPolicy` renews its control as it is meant to, always up to a truncated ``horizon``.
+    (`MOST_STEPS`). Steps are halved, without noise ``doublings`` times at most, until a trajectory changes by less than
+    ``tolerance``, relative to the answer, or all of them by little beside the standard error. ``rounded``, the controller
+    and `V` in single precision, takes their place where both agree at the starts; a few trajectories are exact, and their
+    differences go into the bias, unless, without noise, they are not ``audited``. A `HeldPolicy` renews its control at the
+    times it is meant to, always up to a truncated ``horizon``.
     """
 
     problem: Problem

@@ -47,7 +47,7 @@ ASCENT_STEPS = 40
 EXCESS_STATES = 4096
 # Steps after which the first round may end: in 16 coordinates the bound was 5e-6 above the optimum after 100, 5e-5 after 25.
 EXCESS_FIRST = 100
-EXCESS_EVERY = 25  # steps between two looks at the excess from then on
+EXCESS_EVERY = 25  # steps between two evaluations of the excess from then on
 # Part of `good_excess` at which the first round ends early: any `mu` will do where `V` solves its equation.
 EARLY_PART = 0.05
 # That part where the slack is steep: at 1 the circle's certified gap was .002 % wider than after a round of 300 steps.
