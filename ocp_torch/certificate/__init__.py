@@ -1,13 +1,13 @@
 """Bounds, performances and what they assume; needs no trainer."""
 
-from ocp_torch.certificate.bound import LOWER, PERFORMANCE, UPPER, Bound
 from ocp_torch.certificate.bounds import BOUNDS
+from ocp_torch.certificate.bounds.bound import LOWER, PERFORMANCE, UPPER, Bound
 from ocp_torch.certificate.certificate import Certificate
 from ocp_torch.certificate.certify import certify_fields, certify_policy
-from ocp_torch.certificate.fields import Trained, in_float64
+from ocp_torch.certificate.contexts.fields import Trained, in_float64
+from ocp_torch.certificate.contexts.trained import TrainedContext
 from ocp_torch.certificate.report import table
 from ocp_torch.certificate.settings import CertificateSettings, Run
-from ocp_torch.certificate.trained import TrainedContext
 from ocp_torch.certificate.upper.policy_evaluation import StageSettings
 
 __all__ = [

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from ocp_torch.certificate.bounds import BOUNDS
 from ocp_torch.certificate.checks.assumptions import Assumptions
-from ocp_torch.certificate.estimate import CONFIDENCE, Estimate, known, known_of
 from ocp_torch.certificate.report import to_dict
 from ocp_torch.certificate.settings import Run
+from ocp_torch.certificate.statistics.estimate import CONFIDENCE, Estimate, known, known_of
 from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.needs import GUESSED, Need

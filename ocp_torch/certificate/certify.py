@@ -7,20 +7,20 @@ from itertools import product
 import torch
 from torch import nn
 
-from ocp_torch.certificate.bound import LOWER, PERFORMANCE, UPPER, Bound
 from ocp_torch.certificate.bounds import BOUNDS
+from ocp_torch.certificate.bounds.bound import LOWER, PERFORMANCE, UPPER, Bound
 from ocp_torch.certificate.certificate import Certificate
-from ocp_torch.certificate.context import Context
-from ocp_torch.certificate.estimate import Estimate, known_of
+from ocp_torch.certificate.contexts.context import Context
+from ocp_torch.certificate.contexts.controller import ControllerContext
+from ocp_torch.certificate.contexts.fields import FieldsContext, Trained
+from ocp_torch.certificate.contexts.recorded import RecordedContext
+from ocp_torch.certificate.contexts.trained import TrainedContext
 from ocp_torch.certificate.external.black_box import BlackBox
-from ocp_torch.certificate.external.controller import ControllerContext
-from ocp_torch.certificate.external.dataset import RecordedContext
-from ocp_torch.certificate.fields import FieldsContext, Trained
 from ocp_torch.certificate.report import CONTROLLERS
 from ocp_torch.certificate.settings import CERTIFIED, CertificateSettings, Progress, Run, silent
 from ocp_torch.certificate.simulated.outside import outside_note
 from ocp_torch.certificate.simulated.performance import Simulated
-from ocp_torch.certificate.trained import TrainedContext
+from ocp_torch.certificate.statistics.estimate import Estimate, known_of
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import InputError
 from ocp_torch.fields.subsolution import Subsolution

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ocp_torch.certificate import bounds
-from ocp_torch.certificate.bound import LOWER, PERFORMANCE, UPPER
-from ocp_torch.certificate.estimate import Estimate, known
+from ocp_torch.certificate.bounds.bound import LOWER, PERFORMANCE, UPPER
 from ocp_torch.certificate.settings import LONGEST_NAME
+from ocp_torch.certificate.statistics.estimate import Estimate, known
 from ocp_torch.errors import visible
 from ocp_torch.problems.needs import GUESSED
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from ocp_torch.certificate.estimate import CONFIDENCE
+from ocp_torch.certificate.statistics.estimate import CONFIDENCE
 from ocp_torch.certificate.upper.policy_evaluation import StageSettings
 from ocp_torch.errors import InputError, require_choice, require_flag, require_integer, require_number, visible
 from ocp_torch.files.limits import require_memory

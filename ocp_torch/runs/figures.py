@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.bound import LOWER, UPPER
-from ocp_torch.certificate.fields import in_float64
+from ocp_torch.certificate.bounds.bound import LOWER, UPPER
+from ocp_torch.certificate.contexts.fields import in_float64
 from ocp_torch.certificate.lower.slack import slack_function
 from ocp_torch.certificate.settings import LONGEST_NAME
 from ocp_torch.control.policies import NETWORK, occupation_density, trained_policies

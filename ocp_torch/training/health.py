@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate import Certificate
-from ocp_torch.certificate.estimate import known
+from ocp_torch.certificate.statistics.estimate import known
 from ocp_torch.errors import notes
 from ocp_torch.fields.fields import Fields, typical_sizes
 from ocp_torch.maths.seeds import Branch, derive_seed

@@ -15,8 +15,8 @@ from tqdm.asyncio import tqdm as terminal_bar
 from tqdm.auto import tqdm
 
 from ocp_torch.certificate import Certificate, CertificateSettings
-from ocp_torch.certificate.estimate import known_of
 from ocp_torch.certificate.report import WIDE
+from ocp_torch.certificate.statistics.estimate import known_of
 from ocp_torch.control.policies import admissible_density, occupation_density
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples

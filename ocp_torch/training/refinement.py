@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.fields import in_float64
+from ocp_torch.certificate.contexts.fields import in_float64
 from ocp_torch.certificate.lower.slack import slack_function
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.maths.jets import Field

@@ -21,7 +21,7 @@ from ocp_torch.certificate import (
     certify_fields,
     table,
 )
-from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.statistics.estimate import Estimate
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems import Manufactured
 from ocp_torch.problems.constants import resolve_constants

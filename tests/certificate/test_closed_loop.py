@@ -6,8 +6,8 @@ from functools import partial
 import pytest
 import torch
 
-from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.simulated.performance import Simulation
+from ocp_torch.certificate.statistics.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.upper import policy_evaluation
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.certificate.upper.multiples import Terms, best_multiples, terms_on

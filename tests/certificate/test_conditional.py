@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from ocp_torch.certificate import Run, StageSettings, Trained, certify_fields
-from ocp_torch.certificate.estimate import replicated_samples
+from ocp_torch.certificate.contexts.trained import TrainedContext
 from ocp_torch.certificate.lower.penalised import levelled
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.report import table
 from ocp_torch.certificate.settings import CertificateSettings
-from ocp_torch.certificate.trained import TrainedContext
+from ocp_torch.certificate.statistics.estimate import replicated_samples
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems import Circle
 from ocp_torch.problems.constants import FROM_DENSITY, OBSERVED_ROOM, resolve_constants

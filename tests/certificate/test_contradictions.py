@@ -6,8 +6,8 @@ import pytest
 
 from ocp_torch.certificate import Run
 from ocp_torch.certificate.certify import examined
-from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.report import table
+from ocp_torch.certificate.statistics.estimate import Estimate
 from ocp_torch.runs.compare import compare
 from support.looks import LOWER, certificate
 

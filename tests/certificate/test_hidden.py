@@ -9,7 +9,7 @@ import torch
 from ocp_torch.certificate import Run, Trained, certify_fields
 from ocp_torch.certificate.checks.hidden import Flux, hidden_divergence
 from ocp_torch.certificate.checks.observed import largest_jump
-from ocp_torch.certificate.estimate import replicated_samples
+from ocp_torch.certificate.statistics.estimate import replicated_samples
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.certificate.upper.penalised import density_bounds
 from ocp_torch.control.policies import CLOSED, NETWORK

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.simulated.outside import outside_note, time_outside
+from ocp_torch.certificate.statistics.estimate import Estimate
 from ocp_torch.control.policies import zero_policy
 from ocp_torch.problems import Circle
 from support.systems import Conveyor, Swing

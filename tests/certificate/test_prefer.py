@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ocp_torch import load_controller
-from ocp_torch.certificate.estimate import known_of
+from ocp_torch.certificate.statistics.estimate import known_of
 from ocp_torch.control.policies import density_policy, occupation_density
 from ocp_torch.runs.evaluate import certify_saved
 from support.controllers import controllers

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp_torch.certificate import CertificateSettings, Run, Trained, certify_fields, table
-from ocp_torch.certificate.lower.rigorous import refuted
+from ocp_torch.certificate.bounds.rigorous import refuted
 from ocp_torch.certificate.lower.slack import slack_function
 from ocp_torch.certificate.proof.activated import activate
 from ocp_torch.certificate.proof.activations import SERIES

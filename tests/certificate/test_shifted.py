@@ -12,16 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp_torch.certificate import Run, StageSettings, Trained, certify_fields
-from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lower.mollified import DIRECTIONS, EVALUATIONS, Mollified, mollified_shift
 from ocp_torch.certificate.lower.sampled import SampledValue, attainable
 from ocp_torch.certificate.lower.shifted import Shift, climbed, highest, scaled_by
-from ocp_torch.certificate.lower.slack import MAX_THETA, Peaks, SlackParts, slack_function
+from ocp_torch.certificate.lower.slack import MAX_THETA, SlackParts, slack_function
 from ocp_torch.certificate.lower.tightened import tightened
 from ocp_torch.certificate.settings import CertificateSettings
+from ocp_torch.certificate.statistics.estimate import replicated_samples
 from ocp_torch.fields import Fields, PeriodicMLP, Subsolution
 from ocp_torch.maths.ahead import Ahead
 from ocp_torch.maths.jets import jet
+from ocp_torch.maths.peaks import Peaks
 from ocp_torch.problems import Circle, Simulator
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.generator import Generator

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ocp_torch.certificate import CertificateSettings, Run
-from ocp_torch.certificate.estimate import Estimate, t_factor
+from ocp_torch.certificate.statistics.estimate import Estimate, t_factor
 from ocp_torch.errors import InputError
 from ocp_torch.maths.sampling import evaluation_points
 from support.looks import certificate

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from ocp_torch.certificate import Run, Trained, certify_fields
-from ocp_torch.certificate.checks.tails import beyond_largest, rarity, sharpened, widened
-from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.simulated import unseen
 from ocp_torch.certificate.simulated.performance import Simulation
+from ocp_torch.certificate.statistics.estimate import Estimate, replicated_samples
+from ocp_torch.certificate.statistics.tails import beyond_largest, rarity, sharpened, widened
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.control.policies import NETWORK, zero_policy
 from ocp_torch.fields import Fields, PeriodicMLP

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ocp_torch.certificate.checks.wellposed import check_problem
-from ocp_torch.certificate.estimate import replicated_samples
+from ocp_torch.certificate.statistics.estimate import replicated_samples
 from ocp_torch.control.policies import NETWORK
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields, PeriodicMLP

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ocp_torch.certificate.estimate import integrals
+from ocp_torch.certificate.statistics.estimate import integrals
 from ocp_torch.fields import CONTROL_DENSITY, VALUE, Fields, PeriodicMLP
 from ocp_torch.fields.coupled_waves import coupled_waves
 from ocp_torch.fields.waves import prominent_waves

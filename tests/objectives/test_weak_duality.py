@@ -9,10 +9,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lower.penalised import penalised
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.lower.slack import slack_function
+from ocp_torch.certificate.statistics.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.certificate.upper.penalised import density_bounds
 from ocp_torch.control.policies import CLOSED, NETWORK, occupation_density

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp_torch.certificate import CertificateSettings, StageSettings
-from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lower.penalised import penalised
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.proof.rigorous import rigorous_lower_bound
+from ocp_torch.certificate.statistics.estimate import replicated_samples
 from ocp_torch.certificate.upper.penalised import density_bounds
 from ocp_torch.control.policies import CLOSED, ValuePolicy, admissible_density, occupation_density
 from ocp_torch.control.saved import load_controller

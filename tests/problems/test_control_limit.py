@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp_torch.certificate import CertificateSettings, StageSettings
-from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.external.black_box import BlackBox
 from ocp_torch.certificate.lower.penalised import penalised
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.proof.enclosures import conjugate_model
 from ocp_torch.certificate.proof.models import Box
 from ocp_torch.certificate.proof.rigorous import obstacle, rigorous_lower_bound
+from ocp_torch.certificate.statistics.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
 from ocp_torch.certificate.upper.penalised import density_bounds
 from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE, admissible_density, occupation_density, trained_policies

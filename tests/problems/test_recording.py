@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields
-from ocp_torch.certificate.external.dataset import groups
+from ocp_torch.certificate.contexts.recorded import groups
 from ocp_torch.certificate.upper.recorded import closed_loop_samples
 from ocp_torch.control.policies import NETWORK, trained_policies
 from ocp_torch.control.saved import load_controller

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from ocp_torch.certificate.estimate import replicated_samples
 from ocp_torch.certificate.lower.sampled import SampledValue
+from ocp_torch.certificate.statistics.estimate import replicated_samples
 from ocp_torch.problems import Circle, Problem
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.scan import odd_states

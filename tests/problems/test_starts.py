@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from ocp_torch.certificate.checks.wellposed import check_problem
-from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, Simulation, starting_points
+from ocp_torch.certificate.statistics.estimate import Estimate, replicated_samples
 from ocp_torch.control.policies import zero_policy
 from ocp_torch.gym.environment import ControlEnvironment
 from ocp_torch.maths.mixture_fit import fitted_mixture

@@ -9,8 +9,8 @@ from functools import partial
 import torch
 
 from ocp_torch.certificate import CertificateSettings, Run, StageSettings, Trained, certify_fields, certify_policy
-from ocp_torch.certificate.estimate import known
-from ocp_torch.certificate.external.controller import GIVEN
+from ocp_torch.certificate.contexts.controller import GIVEN
+from ocp_torch.certificate.statistics.estimate import known
 from ocp_torch.control.policies import NETWORK, zero_policy
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems.constants import resolve_constants

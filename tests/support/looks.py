@@ -7,7 +7,7 @@ from collections.abc import Callable
 from ocp_torch.certificate import Certificate, Run
 from ocp_torch.certificate.certify import examined
 from ocp_torch.certificate.checks.assumptions import Assumptions
-from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.statistics.estimate import Estimate
 
 LOWER = 0.05  # above any constant's bound on the circle, below what doing nothing costs
 

@@ -8,7 +8,7 @@ import torch
 from matplotlib.image import imread
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ocp_torch.certificate import trained
+from ocp_torch.certificate.contexts import trained
 from ocp_torch.control.saved import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.runs.build import build_certificate_settings

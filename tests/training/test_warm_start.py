@@ -8,10 +8,10 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from ocp_torch.certificate.contexts.trained import TrainedContext
 from ocp_torch.certificate.report import table
 from ocp_torch.certificate.simulated import candidates
 from ocp_torch.certificate.simulated.performance import Simulation
-from ocp_torch.certificate.trained import TrainedContext
 from ocp_torch.control.controller import Controller
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.pace import Pace

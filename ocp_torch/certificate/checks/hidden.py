@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.estimate import t_factor
+from ocp_torch.certificate.statistics.estimate import t_factor
 from ocp_torch.maths.plane_waves import plane_waves
 
 TURN = 2.0 * math.pi

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.estimate import Estimate, integral
+from ocp_torch.certificate.statistics.estimate import Estimate, integral
 from ocp_torch.errors import ProblemError
 from ocp_torch.maths.mixtures import effective_part
 from ocp_torch.maths.sampling import scrambled_sobol

@@ -12,9 +12,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.estimate import integral
 from ocp_torch.certificate.lower.shifted import Shift, highest
 from ocp_torch.certificate.lower.slack import SlackParts
+from ocp_torch.certificate.statistics.estimate import integral
 from ocp_torch.fields.rounded import rounded
 from ocp_torch.maths.jets import Field, Jet, jet
 from ocp_torch.maths.seeds import fixed_generator

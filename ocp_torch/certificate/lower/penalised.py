@@ -10,68 +10,19 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.bound import LOWER, Bound, recorded
-from ocp_torch.certificate.checks.assumptions import Assumptions
-from ocp_torch.certificate.checks.tails import rarity, unmet
-from ocp_torch.certificate.context import Context
-from ocp_torch.certificate.estimate import Estimate, starting_level, starting_mean
 from ocp_torch.certificate.lower.levels import best_level
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.lower.shifted import Shift
 from ocp_torch.certificate.lower.slack import SlackParts
+from ocp_torch.certificate.statistics.estimate import Estimate, starting_level, starting_mean
+from ocp_torch.certificate.statistics.tails import rarity, unmet
+from ocp_torch.maths.jets import Field
 from ocp_torch.problems.generator import Generator
-from ocp_torch.problems.needs import Need
+from ocp_torch.problems.recorded.dataset import Dataset
 from ocp_torch.problems.samples import Samples
 
 FEWEST_ABOVE = 16  # states of a half that must lie above the constant taken off `V`: with fewer none is sought
 MOST_TRAINED = 2**15  # training samples at most that are compared with the held-out ones
-
-
-class PenalisedDual(Bound):
-    """`F_M` of a `V` that is known everywhere."""
-
-    name, side, label = "F_M", LOWER, "F_M"
-
-    def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
-        return (assumptions.M_is_large,)
-
-    def applies(self, context: Context) -> bool:
-        return not context.recorded
-
-    def evaluate(self, context: Context) -> Estimate | None:
-        V, constants = context.sampled_value, context.informed
-        if V is None:
-            return None
-        # Training aimed at the bound without M, to which the constant in V means nothing.
-        return levelled(V.best, constants.M) if constants.needs_no_M else penalised(V, constants.M)
-
-
-class RecordedDual(PenalisedDual):
-    """`F_M` where only recorded samples are known: a weighted mean over the held-out samples."""
-
-    def applies(self, context: Context) -> bool:
-        return context.recorded
-
-    def evaluate(self, context: Context) -> Estimate | None:
-        if context.value is None:
-            return None
-        sets, M, problem = recorded(context).sets, context.informed.M, recorded(context).problem
-        trained = Generator.of(problem, problem.training.take(slice(MOST_TRAINED)))
-        known = trained.chunked_jet(context.value)
-        level = starting_level(trained.data, known.value)
-        seen = [(generator := Generator.of(problem, s), generator.chunked_jet(context.value)) for s in sets]
-        initial = [starting_mean(g.data, V.value, level) for g, V in seen]
-        slacks = [g.hjb_slack(V) for g, V in seen]
-        found = _penalised(initial, sets, slacks, [0.0] * len(sets), M)
-        # A violation, or a start, that is larger in training samples than in any held-out one was missed there by chance.
-        violated = lambda data, V, slack: float((data.weight * slack.clamp_min(0.0)).max())
-        started = lambda data, V, slack: float((data.weight * data.mu0 * (V.value - level).abs()).max())
-        missed = 0.0
-        for shown, counted in ((violated, M), (started, 1.0)):
-            largest = shown(trained.data, known, trained.hjb_slack(known))
-            if largest > max(shown(g.data, V, slack) for (g, V), slack in zip(seen, slacks, strict=True)):
-                missed += counted * unmet(largest, sum(map(len, sets)))
-        return replace(found, bias=(found.bias or 0.0) + missed) if missed else found
 
 
 def penalised(V: SampledValue, M: float) -> Estimate:
@@ -93,6 +44,27 @@ def levelled(shift: Shift, M: float) -> Estimate:
     slacks = [part.slack(theta) for part, theta in zip(shift.parts, thetas, strict=True)]
     initial = [theta * e for theta, e in zip(thetas, shift.initial, strict=True)]
     return _penalised(initial, shift.sets, slacks, list(levels), M)
+
+
+def penalised_on_records(problem: Dataset, sets: list[Samples], value: Field, M: float) -> Estimate:
+    """`F_M` of ``value``, a weighted mean over the held-out samples in ``sets``; the interval is widened by what these show
+    less of than training samples do."""
+    trained = Generator.of(problem, problem.training.take(slice(MOST_TRAINED)))
+    known = trained.chunked_jet(value)
+    level = starting_level(trained.data, known.value)
+    seen = [(generator := Generator.of(problem, s), generator.chunked_jet(value)) for s in sets]
+    initial = [starting_mean(g.data, V.value, level) for g, V in seen]
+    slacks = [g.hjb_slack(V) for g, V in seen]
+    found = _penalised(initial, sets, slacks, [0.0] * len(sets), M)
+    # A violation, or a start, that is larger in training samples than in any held-out one was missed there by chance.
+    violated = lambda data, V, slack: float((data.weight * slack.clamp_min(0.0)).max())
+    started = lambda data, V, slack: float((data.weight * data.mu0 * (V.value - level).abs()).max())
+    missed = 0.0
+    for shown, counted in ((violated, M), (started, 1.0)):
+        largest = shown(trained.data, known, trained.hjb_slack(known))
+        if largest > max(shown(g.data, V, slack) for (g, V), slack in zip(seen, slacks, strict=True)):
+            missed += counted * unmet(largest, sum(map(len, sets)))
+    return replace(found, bias=(found.bias or 0.0) + missed) if missed else found
 
 
 def _penalised(

@@ -9,33 +9,17 @@ changes nothing.) Where the slack of `V` is large, as at kinks, a `theta` below 
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-from ocp_torch.certificate.bound import LOWER, Bound, sentence_on
-from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
-from ocp_torch.certificate.estimate import Estimate, integrals
-from ocp_torch.certificate.lower.slack import (
-    MAX_THETA,
-    NEGLIGIBLE,
-    STEEP_ASCENTS,
-    Peaks,
-    Scaled,
-    SlackParts,
-    climbed_from,
-    slack_function,
-    steep_peaks,
-)
+from ocp_torch.certificate.lower.slack import MAX_THETA, Scaled, SlackParts, slack_function
+from ocp_torch.certificate.statistics.estimate import Estimate, integrals
 from ocp_torch.fields.rounded import rounded
 from ocp_torch.maths.jets import Field
+from ocp_torch.maths.peaks import NEGLIGIBLE, STEEP_ASCENTS, Peaks, climbed_from, steep_peaks
 from ocp_torch.maths.supremum import Extremum, minimiser
 from ocp_torch.problems.generator import Generator
-from ocp_torch.problems.needs import Need
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
-
-if TYPE_CHECKING:
-    from ocp_torch.certificate.context import Context
-
 
 # Divisor of the ascents from steep places for averaged functions: for six oscillators all of them took 70 s or more.
 AVERAGED_DIVISOR = 4
@@ -182,21 +166,3 @@ def climbed(problem: Problem, value: Field, parts: SlackParts, theta: float, asc
 def scaled_by(parts: SlackParts, initial: float) -> float:
     """The `theta` in `[0, MAX_THETA]` that maximises the bound on sampled states, which is concave in `theta`."""
     return minimiser(lambda theta: float(parts.slack(theta).max()) - theta * initial, 0.0, MAX_THETA)
-
-
-class Shifted(Bound):
-    """The best shifted bound that was found of functions made of `V` (`SampledValue.best`)."""
-
-    name, side, label = "shifted", LOWER, "shifted"
-
-    def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
-        return (found_by_search("sup Q"),)
-
-    def evaluate(self, context: "Context") -> Estimate | None:
-        return None if context.sampled_value is None else context.sampled_value.best.estimate
-
-    def searches(self, context: "Context") -> list[str]:
-        if context.sampled_value is None:
-            return []
-        best = context.sampled_value.best
-        return [sentence_on(best.sentence, best.largest)]

@@ -15,12 +15,13 @@ from collections.abc import Generator
 import torch
 from torch import Tensor, nn
 
-from ocp_torch.certificate.lower.slack import STEEP_ASCENTS, slack_function, steep_peaks
+from ocp_torch.certificate.lower.slack import slack_function
 from ocp_torch.certificate.lower.worst import WorstStates
 from ocp_torch.fields.fields import VALUE, Fields, cost_unit
 from ocp_torch.fields.rounded import rounded
 from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.maths.jets import Field
+from ocp_torch.maths.peaks import STEEP_ASCENTS, steep_peaks
 from ocp_torch.maths.sampling import SobolSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives.levelled import LevelledDual

@@ -3,9 +3,9 @@
 import math
 from typing import NamedTuple
 
-from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.simulated.performance import Simulated, Simulation
+from ocp_torch.certificate.statistics.estimate import CONFIDENCE, Estimate
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.policies import Policy, zero_policy
 from ocp_torch.maths.jets import Field

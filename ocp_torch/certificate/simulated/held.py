@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.simulated.loops import HeldLoop
+from ocp_torch.certificate.statistics.estimate import Estimate
 from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.runge_kutta import (

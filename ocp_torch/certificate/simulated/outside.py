@@ -6,10 +6,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.estimate import CONFIDENCE, Estimate
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.simulated.candidates import BASELINE_PART
 from ocp_torch.certificate.simulated.performance import Simulation
+from ocp_torch.certificate.statistics.estimate import CONFIDENCE, Estimate
 from ocp_torch.control.policies import Policy
 from ocp_torch.problems.control_cost import PowerCost
 from ocp_torch.problems.physical.system import System

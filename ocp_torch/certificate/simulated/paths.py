@@ -7,11 +7,11 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.simulated.between import jumped_over
 from ocp_torch.certificate.simulated.held import held_integrals
 from ocp_torch.certificate.simulated.loops import FeedbackLoop, HeldLoop, Loop, Sliding
 from ocp_torch.certificate.simulated.steps import Steps
+from ocp_torch.certificate.statistics.estimate import Estimate
 from ocp_torch.maths.brownian import Grid, Multilevel, at_random_times, discounted
 from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.jets import Field

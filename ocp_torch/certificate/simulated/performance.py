@@ -12,8 +12,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.checks.tails import widened
-from ocp_torch.certificate.estimate import Estimate
 from ocp_torch.certificate.settings import RANDOM, TRUNCATED, CertificateSettings
 from ocp_torch.certificate.simulated.loops import HeldLoop, Loop, loop_of
 from ocp_torch.certificate.simulated.paths import Paths
@@ -27,6 +25,8 @@ from ocp_torch.certificate.simulated.unseen import (
     unmet_tail,
     unseen_cost,
 )
+from ocp_torch.certificate.statistics.estimate import Estimate
+from ocp_torch.certificate.statistics.tails import widened
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.runge_kutta import MAX_DOUBLINGS

@@ -5,9 +5,9 @@ import math
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.checks.tails import beyond_largest, unmet
 from ocp_torch.certificate.simulated.loops import Loop
 from ocp_torch.certificate.simulated.paths import Paths
+from ocp_torch.certificate.statistics.tails import beyond_largest, unmet
 from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.supremum import batched, supremum
 from ocp_torch.problems.problem import Problem

@@ -20,28 +20,21 @@ that, and what is said along trajectories holds in the mean over paths (Ito's fo
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.bound import PERFORMANCE, UPPER, Bound, sentence_on
-from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
 from ocp_torch.certificate.checks.hidden import Hidden, hidden_divergence
-from ocp_torch.certificate.checks.tails import widened
-from ocp_torch.certificate.estimate import Estimate, integral
-from ocp_torch.certificate.lower.slack import Peaks, climbed_from
+from ocp_torch.certificate.statistics.estimate import Estimate, integral
+from ocp_torch.certificate.statistics.tails import widened
 from ocp_torch.certificate.upper.lowered import LoweredSlack, Lowering
 from ocp_torch.certificate.upper.multiples import Integrand, Terms, best_multiples, terms_on
 from ocp_torch.maths.jets import Field
+from ocp_torch.maths.peaks import Peaks, climbed_from
 from ocp_torch.maths.supremum import Extremum, batched
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.generator import Generator
-from ocp_torch.problems.needs import Need
 from ocp_torch.problems.samples import Samples
-
-if TYPE_CHECKING:
-    from ocp_torch.certificate.context import Context
 
 
 @dataclass(frozen=True)
@@ -122,41 +115,3 @@ def closed_loop_bounds(
     return ClosedLoopBounds(
         lagrangian, J, C_V, eps_hi, eps_lo, below, sandwich, hidden, contributions, densest, occupation, how, own.sought
     )
-
-
-class Lagrangian(Bound):
-    """The Lagrangian bound of the controller that is followed, from the density that was fitted to its closed loop."""
-
-    name, side, label = "lagrangian", UPPER, "Lagrangian"
-
-    def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
-        return found_by_search("sup |Q_u|"), assumptions.regular
-
-    def evaluate(self, context: "Context") -> Estimate | None:
-        return context.closed_loop.lagrangian if context.closed_loop else None
-
-    def about(self, context: "Context") -> str | None:
-        return context.followed
-
-    def searches(self, context: "Context") -> list[str]:
-        return slack_searches(context.closed_loop)
-
-
-class LagrangianBelow(Lagrangian):
-    """The Lagrangian bound with its signs reversed: a lower bound on the performance of a given controller."""
-
-    side = PERFORMANCE
-
-    def applies(self, context: "Context") -> bool:
-        return context.external
-
-    def evaluate(self, context: "Context") -> Estimate | None:
-        return context.closed_loop.below if context.closed_loop else None
-
-
-def slack_searches(found: ClosedLoopBounds | None) -> list[str]:
-    """How the two suprema of the slack behind ``found`` were found, a sentence each."""
-    if found is None:
-        return []
-    named = lambda what: f"{what} of {found.how}"
-    return [sentence_on(named("eps_hi"), found.eps_hi), sentence_on(named("eps_lo"), found.eps_lo)]

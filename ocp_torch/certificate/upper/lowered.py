@@ -13,12 +13,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.estimate import integral
-from ocp_torch.certificate.lower.slack import MAX_THETA, STEEP_ASCENTS, Peaks, steep_peaks
+from ocp_torch.certificate.lower.slack import MAX_THETA
+from ocp_torch.certificate.statistics.estimate import integral
 from ocp_torch.certificate.upper.multiples import Terms, best_multiple
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.fields.rounded import rounded
 from ocp_torch.maths.jets import Field, Jet
+from ocp_torch.maths.peaks import STEEP_ASCENTS, Peaks, steep_peaks
 from ocp_torch.maths.supremum import Extremum, extremes, minimiser
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.generator import Generator, pull_back

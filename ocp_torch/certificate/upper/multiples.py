@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.certificate.checks.hidden import Flux
-from ocp_torch.certificate.estimate import integral
+from ocp_torch.certificate.statistics.estimate import integral
 from ocp_torch.maths.jets import CHUNK, Field
 from ocp_torch.maths.supremum import minimiser
 from ocp_torch.problems.generator import Generator

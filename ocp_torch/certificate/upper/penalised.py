@@ -1,24 +1,18 @@
 """`J`, in which the Liouville residual of `w` and `mu` is penalised, and at the same states `G`, the least over `mu`."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.bound import UPPER, Bound
-from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.checks.hidden import Flux, Hidden, hidden_divergence
-from ocp_torch.certificate.checks.tails import widened
-from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.control.policies import DENSITY, Density
+from ocp_torch.certificate.statistics.estimate import Estimate
+from ocp_torch.certificate.statistics.tails import widened
+from ocp_torch.control.policies import Density
 from ocp_torch.maths.jets import CHUNK, Field
 from ocp_torch.problems.generator import Generator
-from ocp_torch.problems.needs import Need
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
-
-if TYPE_CHECKING:
-    from ocp_torch.certificate.context import Context
 
 
 class DensityBounds(NamedTuple):
@@ -67,38 +61,3 @@ def _upper_integrands(problem, control_density, occupation, samples: Samples, C_
     mu, drifted, carried = generator.drift_flux(occupation)
     J = generator.primal_integrand(w, mu, inflow - mu - drifted / rho, C_V)
     return J, spread + drifted, pushed + carried
-
-
-class PenalisedPrimal(Bound):
-    """The lower of two `J`: that of the trained `w` and `mu`, and that of the density fitted to the closed loop."""
-
-    name, side, label = "J", UPPER, "J"
-
-    def needs(self, assumptions: Assumptions) -> tuple[Need, ...]:
-        return assumptions.C_V_is_large, assumptions.cost_is_positive, assumptions.regular
-
-    def applies(self, context: "Context") -> bool:
-        return not context.recorded
-
-    def evaluate(self, context: "Context") -> Estimate | None:
-        if context.closed_loop and context.takes_fitted_J:
-            return None if context.coarse else context.closed_loop.J
-        return context.densities.J if context.densities else None
-
-    def valid(self, context: "Context") -> bool:
-        return context.hidden is None
-
-    def about(self, context: "Context") -> str | None:
-        """The controller whose closed loop was fitted if that `J` is shown, or `w / mu` if that is the one followed."""
-        return context.followed if context.takes_fitted_J or context.followed == DENSITY else None
-
-    def notes(self, context: "Context", shown: Estimate | None) -> list[str]:
-        notes = []
-        if context.hidden is not None:
-            notes.append(f"{context.divergent} are not used: {context.hidden.sentence}.")
-        if context.fitted is not None and context.coarse:
-            notes.append("J is left out: the controller computes in float32, too coarse for its divergence.")
-        found = context.closed_loop if context.takes_fitted_J and context.densities else None
-        if found is not None and not context.checked.value_holds:
-            notes.append(f"the J shown is that of the closed loop, with C_V = {found.C_V:.4g} proved for it.")
-        return notes

@@ -6,56 +6,19 @@ its data at the recorded states too: `f + R(u)`, `a + B u` and, from `div a` and
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.bound import recorded
-from ocp_torch.certificate.checks.hidden import Hidden, hidden_divergence
-from ocp_torch.certificate.checks.tails import widened
-from ocp_torch.certificate.estimate import Estimate, starting_level, starting_mean
-from ocp_torch.certificate.fields import in_float64
-from ocp_torch.certificate.upper.multiples import best_multiples, terms_on
-from ocp_torch.certificate.upper.penalised import PenalisedPrimal
-from ocp_torch.certificate.upper.policy_evaluation import Drawn, fit_closed_loop
+from ocp_torch.certificate.checks.hidden import Hidden
+from ocp_torch.certificate.statistics.estimate import Estimate
 from ocp_torch.control.policies import Policy
 from ocp_torch.maths.jets import CHUNK, control_flux_divergence
-from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.problems.control_cost import PowerCost
-from ocp_torch.problems.generator import Generator
-from ocp_torch.problems.problem import MARGIN
 from ocp_torch.problems.samples import Samples
 
-if TYPE_CHECKING:
-    from ocp_torch.certificate.context import Context
-    from ocp_torch.certificate.external.dataset import RecordedContext
-
 DENSEST_SAMPLES = 10  # samples of largest fitted density at which the contraction of the flow is checked
-
-
-class RecordedPrimal(PenalisedPrimal):
-    """`J` where only recorded samples are known."""
-
-    def applies(self, context: "Context") -> bool:
-        return context.recorded
-
-    def evaluate(self, context: "Context") -> Estimate | None:
-        fit = recorded(context).fit
-        return fit.J if fit else None
-
-    def valid(self, context: "Context") -> bool:
-        return context.hidden is None and context.checked.regular_holds
-
-    def about(self, context: "Context") -> str | None:
-        return context.kind
-
-    def notes(self, context: "Context", shown: Estimate | None) -> list[str]:
-        if context.hidden is not None:
-            return [f"J is not used: {context.hidden.sentence}."]
-        fit = recorded(context).fit
-        said = "J is above the controller's performance if C_V = {:.4g}, by the samples met, bounds its value."
-        return [said.format(fit.C_V)] if fit else []
 
 
 @torch.no_grad()
@@ -78,43 +41,6 @@ class RecordedFit(NamedTuple):
     C_V: float
     sup_occupation: float
     hidden: Hidden | None
-
-
-def fit_recorded(context: "RecordedContext", kind: str) -> RecordedFit:
-    """`J(mu u, mu)` of the controller ``kind``, on held-out samples, with `log mu` fitted on the training samples.
-
-    By parts `E[(f + R(u)) mu] = E[V mu0 - mu Q_u - V r]`, the same number with less scatter. `C_V` is the larger of the
-    constant's and of `sup V + sup max(-Q_u, 0)`, which bounds `V^u`, over all samples and with head-room. Raises
-    `ArithmeticError` where the fit fails.
-    """
-    problem, trained, constants, seed = context.problem, context.trained, context.constants, context.seed
-    cost, rho, stage = problem.control_cost, problem.discount, context.settings.stage
-    policy, rough = (context.policies_of(fields)[kind] for fields in (context.fields, trained.fields))
-    like = next(trained.fields.parameters())
-    training = closed_loop_samples(problem.training.to(like), rough, cost)
-    pool = Drawn(training, derive_seed(seed, Branch.POLICY_EVALUATION, 2))
-    fitted = in_float64(fit_closed_loop(problem, rough, trained.fields, trained.network, constants, stage, seed, pool))
-    value = context.value if context.value is not None else fitted.value
-    loops = [closed_loop_samples(samples, policy, cost) for samples in context.sets]
-    found = [terms_on(Generator(loop, rho, cost), value, fitted.log_occupation) for loop in loops]
-    terms, slacks, densities, fluxes = zip(*found, strict=True)
-    seen = training.to(torch.zeros((), dtype=torch.float64))
-    with torch.no_grad():
-        generator = Generator(seen, rho, cost)
-        V = generator.jet(value)
-        slack = generator.hjb_slack(V)
-    largest = max(0.0, *(float(v.max()) for v in (*(t.v for t in terms), V.value)))
-    deepest = max(0.0, *(float(-q.min()) for q in (*slacks, slack)))
-    C_V = max(constants.C_V, MARGIN * (largest + deepest))
-    excess = best_multiples(terms, lambda t, s: t.J(s, C_V))
-    level = starting_level(seen, V.value)
-    J = [starting_mean(t.samples, t.v, level) + e for t, e in zip(terms, excess, strict=True)]
-    highest = highest_occupation(torch.cat(densities), Samples.concatenate(loops), rho)
-    estimate = widened(
-        Estimate.of(J, controller=kind),
-        [t.samples.weight * (t.J(1.0, C_V) + (t.v - level) * t.samples.mu0) for t in terms],
-    )
-    return RecordedFit(estimate, C_V, highest, hidden_divergence(list(fluxes)))
 
 
 def highest_occupation(mu: Tensor, loop: Samples, rho: float) -> float:

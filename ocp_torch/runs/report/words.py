@@ -1,7 +1,7 @@
 """Sentences of a report on a certificate: which number to trust, what each bound is, and what it rests on."""
 
 from ocp_torch.certificate import bounds
-from ocp_torch.certificate.bound import LOWER, UPPER
+from ocp_torch.certificate.bounds.bound import LOWER, UPPER
 from ocp_torch.certificate.report import CONTROLLERS, WIDE, holding
 from ocp_torch.problems.needs import GIVEN, GUESSED, PROVED, SEARCHED
 from ocp_torch.runs.compare import number

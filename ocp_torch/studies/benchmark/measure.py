@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from ocp_torch.certificate import BOUNDS, LOWER, UPPER, CertificateSettings, Run, StageSettings, Trained, bounds
-from ocp_torch.certificate.estimate import replicated_samples
-from ocp_torch.certificate.lower.penalised import PenalisedDual
+from ocp_torch.certificate.bounds.penalised_dual import PenalisedDual
+from ocp_torch.certificate.contexts.trained import TrainedContext
 from ocp_torch.certificate.simulated.performance import Simulation
-from ocp_torch.certificate.trained import TrainedContext
+from ocp_torch.certificate.statistics.estimate import replicated_samples
 from ocp_torch.certificate.upper.penalised import DensityBounds
 from ocp_torch.control.policies import Policy
 from ocp_torch.errors import InputError

@@ -7,13 +7,13 @@ from hashlib import sha256
 import torch
 
 from ocp_torch.certificate.checks.observed import Observed, observe
-from ocp_torch.certificate.checks.tails import sharpened
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
-from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.certificate.fields import FieldsContext, in_float64
+from ocp_torch.certificate.contexts.fields import FieldsContext, in_float64
 from ocp_torch.certificate.report import CONTROLLERS
 from ocp_torch.certificate.simulated.candidates import Candidate
 from ocp_torch.certificate.simulated.performance import Simulated
+from ocp_torch.certificate.statistics.estimate import Estimate
+from ocp_torch.certificate.statistics.tails import sharpened
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
 from ocp_torch.certificate.upper.penalised import DensityBounds, density_bounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop

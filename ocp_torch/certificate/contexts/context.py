@@ -10,20 +10,20 @@ from torch import Tensor
 from ocp_torch.certificate.checks.assumptions import Assumptions, check_assumptions, value_holds
 from ocp_torch.certificate.checks.hidden import Hidden
 from ocp_torch.certificate.checks.observed import Observed
-from ocp_torch.certificate.checks.tails import sharpened
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
-from ocp_torch.certificate.estimate import Estimate, replicated_samples
 from ocp_torch.certificate.lower.sampled import SampledValue
-from ocp_torch.certificate.lower.slack import Peaks
 from ocp_torch.certificate.settings import CERTIFIED, CertificateSettings, Progress, Run, silent
 from ocp_torch.certificate.simulated.candidates import Candidate, simulate_candidates
 from ocp_torch.certificate.simulated.outside import time_outside
 from ocp_torch.certificate.simulated.performance import Simulated
+from ocp_torch.certificate.statistics.estimate import Estimate, replicated_samples
+from ocp_torch.certificate.statistics.tails import sharpened
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds, closed_loop_bounds
 from ocp_torch.certificate.upper.penalised import DensityBounds
 from ocp_torch.control.policies import DENSITY, Policy
 from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.maths.jets import Field
+from ocp_torch.maths.peaks import Peaks
 from ocp_torch.problems.closed_loop import ClosedLoop
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.needs import GUESSED

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from torch import nn
 
-from ocp_torch.certificate.context import Context
+from ocp_torch.certificate.contexts.context import Context
 from ocp_torch.certificate.settings import CERTIFIED
 from ocp_torch.control.policies import DENSITY, MINIMISED, VALUE, Policy, trained_policies
 from ocp_torch.fields.fields import Fields

@@ -12,13 +12,20 @@ from typing import ClassVar
 import torch
 
 from ocp_torch.certificate.checks.assumptions import Assumptions
-from ocp_torch.certificate.checks.hidden import Hidden
+from ocp_torch.certificate.checks.hidden import Hidden, hidden_divergence
 from ocp_torch.certificate.checks.observed import Observed, largest_jump
 from ocp_torch.certificate.checks.wellposed import WellPosed
-from ocp_torch.certificate.fields import FieldsContext
-from ocp_torch.certificate.upper.recorded import RecordedFit, fit_recorded
+from ocp_torch.certificate.contexts.fields import FieldsContext, in_float64
+from ocp_torch.certificate.statistics.estimate import Estimate, starting_level, starting_mean
+from ocp_torch.certificate.statistics.tails import widened
+from ocp_torch.certificate.upper.multiples import best_multiples, terms_on
+from ocp_torch.certificate.upper.policy_evaluation import Drawn, fit_closed_loop
+from ocp_torch.certificate.upper.recorded import RecordedFit, closed_loop_samples, highest_occupation
 from ocp_torch.control.policies import NETWORK
+from ocp_torch.maths.seeds import Branch, derive_seed
+from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.needs import SEARCHED
+from ocp_torch.problems.problem import MARGIN
 from ocp_torch.problems.recorded.dataset import Dataset
 from ocp_torch.problems.samples import Samples
 
@@ -121,3 +128,40 @@ def groups(samples: Samples) -> list[Samples]:
     count = max(2, min(GROUPS, len(samples) // FEWEST_SAMPLES))
     size = len(samples) // count
     return [samples.take(slice(k * size, (k + 1) * size)) for k in range(count)]
+
+
+def fit_recorded(context: RecordedContext, kind: str) -> RecordedFit:
+    """`J(mu u, mu)` of the controller ``kind``, on held-out samples, with `log mu` fitted on the training samples.
+
+    By parts `E[(f + R(u)) mu] = E[V mu0 - mu Q_u - V r]`, the same number with less scatter. `C_V` is the larger of the
+    constant's and of `sup V + sup max(-Q_u, 0)`, which bounds `V^u`, over all samples and with head-room. Raises
+    `ArithmeticError` where the fit fails.
+    """
+    problem, trained, constants, seed = context.problem, context.trained, context.constants, context.seed
+    cost, rho, stage = problem.control_cost, problem.discount, context.settings.stage
+    policy, rough = (context.policies_of(fields)[kind] for fields in (context.fields, trained.fields))
+    like = next(trained.fields.parameters())
+    training = closed_loop_samples(problem.training.to(like), rough, cost)
+    pool = Drawn(training, derive_seed(seed, Branch.POLICY_EVALUATION, 2))
+    fitted = in_float64(fit_closed_loop(problem, rough, trained.fields, trained.network, constants, stage, seed, pool))
+    value = context.value if context.value is not None else fitted.value
+    loops = [closed_loop_samples(samples, policy, cost) for samples in context.sets]
+    found = [terms_on(Generator(loop, rho, cost), value, fitted.log_occupation) for loop in loops]
+    terms, slacks, densities, fluxes = zip(*found, strict=True)
+    seen = training.to(torch.zeros((), dtype=torch.float64))
+    with torch.no_grad():
+        generator = Generator(seen, rho, cost)
+        V = generator.jet(value)
+        slack = generator.hjb_slack(V)
+    largest = max(0.0, *(float(v.max()) for v in (*(t.v for t in terms), V.value)))
+    deepest = max(0.0, *(float(-q.min()) for q in (*slacks, slack)))
+    C_V = max(constants.C_V, MARGIN * (largest + deepest))
+    excess = best_multiples(terms, lambda t, s: t.J(s, C_V))
+    level = starting_level(seen, V.value)
+    J = [starting_mean(t.samples, t.v, level) + e for t, e in zip(terms, excess, strict=True)]
+    highest = highest_occupation(torch.cat(densities), Samples.concatenate(loops), rho)
+    estimate = widened(
+        Estimate.of(J, controller=kind),
+        [t.samples.weight * (t.J(1.0, C_V) + (t.v - level) * t.samples.mu0) for t in terms],
+    )
+    return RecordedFit(estimate, C_V, highest, hidden_divergence(list(fluxes)))

@@ -1,10 +1,10 @@
 r"""`G(w) = min_mu J(w, mu)`, pointwise and in closed form where there is no drift (Lemma 2 of the paper)."""
 
-from ocp_torch.certificate.bound import UPPER, Bound
+from ocp_torch.certificate.bounds.bound import UPPER, Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions
-from ocp_torch.certificate.context import Context
-from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.contexts.context import Context
 from ocp_torch.certificate.settings import CERTIFIED
+from ocp_torch.certificate.statistics.estimate import Estimate
 from ocp_torch.control.policies import CLOSED, DENSITY, MINIMISED
 from ocp_torch.problems.needs import Need
 

@@ -13,11 +13,11 @@ import torch
 from torch import nn
 
 from ocp_torch.certificate.checks.observed import Observed, observe
-from ocp_torch.certificate.context import Context
-from ocp_torch.certificate.estimate import integral
+from ocp_torch.certificate.contexts.context import Context
+from ocp_torch.certificate.contexts.fields import in_float64
 from ocp_torch.certificate.external.black_box import BlackBox
-from ocp_torch.certificate.fields import in_float64
 from ocp_torch.certificate.simulated.candidates import Candidate
+from ocp_torch.certificate.statistics.estimate import integral
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
 from ocp_torch.control.policies import Policy, ValuePolicy

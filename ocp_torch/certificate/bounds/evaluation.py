@@ -1,10 +1,10 @@
 """What the Bellman slack of any `V` says of a given controller's performance, without divergences (1. in `lagrangian`)."""
 
-from ocp_torch.certificate.bound import PERFORMANCE, UPPER, Bound
+from ocp_torch.certificate.bounds.bound import PERFORMANCE, UPPER, Bound
+from ocp_torch.certificate.bounds.lagrangian import slack_searches
 from ocp_torch.certificate.checks.assumptions import Assumptions, found_by_search
-from ocp_torch.certificate.context import Context
-from ocp_torch.certificate.estimate import Estimate
-from ocp_torch.certificate.upper.lagrangian import slack_searches
+from ocp_torch.certificate.contexts.context import Context
+from ocp_torch.certificate.statistics.estimate import Estimate
 from ocp_torch.problems.needs import Need
 
 

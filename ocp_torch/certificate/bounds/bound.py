@@ -1,18 +1,14 @@
 """What a bound is: a number on one side of the optimum, how it is found, and what it rests on."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 from ocp_torch.certificate.checks.assumptions import Assumptions
-from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.contexts.context import Context
+from ocp_torch.certificate.contexts.recorded import RecordedContext
+from ocp_torch.certificate.statistics.estimate import Estimate
 from ocp_torch.maths.supremum import Extremum
 from ocp_torch.problems.needs import Need
-
-if TYPE_CHECKING:
-    from ocp_torch.certificate.context import Context
-    from ocp_torch.certificate.external.dataset import RecordedContext
 
 # The sides of bounds, by their names in `certificate.json`.
 LOWER = "lower"  # below `OPT`
@@ -63,7 +59,7 @@ class Bound(ABC):
 
 def recorded(context: Context) -> RecordedContext:
     """``context``, for bounds that apply only where it is `recorded`."""
-    return cast("RecordedContext", context)  # an import of the class would be circular
+    return cast(RecordedContext, context)
 
 
 def sentence_on(what: str, found: Extremum) -> str:

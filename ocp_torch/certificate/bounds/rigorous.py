@@ -1,16 +1,12 @@
 """The shifted bound of a multiple of `V`, proved over cells that cover the torus (`ocp_torch.certificate.proof`)."""
 
-from typing import TYPE_CHECKING
-
-from ocp_torch.certificate.bound import LOWER, Bound
+from ocp_torch.certificate.bounds.bound import LOWER, Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions
-from ocp_torch.certificate.context import Context
-from ocp_torch.certificate.estimate import Estimate
+from ocp_torch.certificate.contexts.context import Context
+from ocp_torch.certificate.lower.shifted import Shift
+from ocp_torch.certificate.proof.rigorous import RigorousBound
+from ocp_torch.certificate.statistics.estimate import Estimate
 from ocp_torch.problems.needs import GIVEN, Need
-
-if TYPE_CHECKING:
-    from ocp_torch.certificate.lower.shifted import Shift
-    from ocp_torch.certificate.proof.rigorous import RigorousBound
 
 # How far rounding may take a number in float64 from its value in real arithmetic, relative to 1 + its size.
 ROUNDING = 1e-9

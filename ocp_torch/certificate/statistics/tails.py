@@ -14,7 +14,7 @@ from typing import Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.estimate import Estimate, replicated_samples
+from ocp_torch.certificate.statistics.estimate import Estimate, replicated_samples
 from ocp_torch.maths.mixture_fit import concentrated
 from ocp_torch.maths.mixtures import Mixture
 from ocp_torch.maths.seeds import Branch, derive_seed

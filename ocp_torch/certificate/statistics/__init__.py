@@ -1,0 +1,1 @@
+"""Means of samples, how sure they are, and what few samples carry."""
