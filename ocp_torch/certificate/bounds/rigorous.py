@@ -1,15 +1,18 @@
 """The shifted bound of a multiple of `V`, proved over cells that cover the torus (`ocp_torch.certificate.proof`)."""
 
+from typing import TYPE_CHECKING
+
 from ocp_torch.certificate.bounds.bound import LOWER, Bound
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.contexts.context import Context
 from ocp_torch.certificate.lower.shifted import Shift
-from ocp_torch.certificate.proof.rigorous import RigorousBound
 from ocp_torch.certificate.statistics.estimate import Estimate
 from ocp_torch.problems.needs import GIVEN, Need
 
-# How far rounding may take a number in float64 from its value in real arithmetic, relative to 1 + its size.
-ROUNDING = 1e-9
+if TYPE_CHECKING:  # a proof is loaded only where one is asked for
+    from ocp_torch.certificate.proof.rigorous import RigorousBound
+
+ROUNDING = 1e-9  # largest error of a number in float64 by rounding, relative to 1 + its size
 REFUTING_LEVEL = 0.9999  # level of the interval of a sampled mean that, outside the proved one, refutes a proof
 
 

@@ -17,8 +17,7 @@ from ocp_torch.maths.plane_waves import plane_waves
 TURN = 2.0 * math.pi
 GROUPS = 32  # of states at least, whose scatter gives the standard error
 FALSE_ALARM = 1e-4  # probability that any of the tests errs
-# Differences below this part of the mean size of the terms come from rounding and difference quotients.
-MATERIAL = 1e-5
+MATERIAL = 1e-5  # part of the terms' mean size below which rounding and difference quotients explain a difference
 
 
 @dataclass(frozen=True)

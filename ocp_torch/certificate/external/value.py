@@ -22,8 +22,7 @@ from ocp_torch.problems.problem import Problem
 
 SEGMENTS = 128  # along which the gradient is integrated
 SHORTEST, LONGEST = 0.05, 0.5  # lengths of the segments
-# States on a segment, one at random in each of its equal parts: a kink makes the integral wrong by a 256th at most.
-ON_SEGMENT = 256
+ON_SEGMENT = 256  # random states, one in each of as many parts: a kink makes the integral wrong by a 256th at most
 # A gradient is another function's where its integral is off by more than this part of all that changes, on average: random
 # states make it off by a sixteenth where the sign is random.
 OFF_IN_MEAN = 0.1

@@ -23,8 +23,7 @@ from ocp_torch.problems.samples import Samples
 # Radii that are tried, from the smallest until two in a row promise less than another (one did beside a gain of .2 %).
 RADII = tuple(2.0 ** (0.5 * k) for k in range(-15, -8))
 TRIAL_STATES = 2048  # states of all sets together on which a radius is tried
-# States where the slack of V is largest, at which its averages are evaluated too, as theirs is large there.
-WORST_STATES = 2048
+WORST_STATES = 2048  # of largest slack of V, at which its averages are evaluated too, as theirs is large there
 TRIAL_ASCENTS = 8  # ascents of such a trial at most
 # A trial must promise this part of the bound for all states to be evaluated: for six oscillators that gave .45 % in 60 of
 # 230 s. For another radius it must promise as much beyond the bound that the first came to.

@@ -24,8 +24,7 @@ from ocp_torch.problems.samples import Samples
 LEAST_PROMISE = 0.0006
 # That part with noise: 1.1 to 7.3 % were promised of two dubins and a unicycle, and 1.2 to 7.5 % came.
 NOISY_LEAST_PROMISE = 0.005
-# Part of the torus with the largest slacks, whose mean stands for the supremum in that promise.
-LARGEST_PART = 0.01
+LARGEST_PART = 0.01  # of the torus, with the largest slacks: their mean stands for the supremum in that promise
 
 
 class Found(NamedTuple):

@@ -21,8 +21,7 @@ from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 
-# Divisor of the ascents from steep places for averaged functions: for six oscillators all of them took 70 s or more.
-AVERAGED_DIVISOR = 4
+AVERAGED_DIVISOR = 4  # of ascents in steep places for averages: for six oscillators all of them took 70 s or more
 
 
 class Scaling(NamedTuple):

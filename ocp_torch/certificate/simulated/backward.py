@@ -32,8 +32,7 @@ EVALUATIONS = 192  # near the densest states: more show a density that is too la
 FEWEST_PATHS = 4  # from each state, with noise
 DENSEST_STATES = 6  # of the first look, near which the density is computed again
 NEARBY_DIVISOR = 3  # of the number of all states, for the number of states near those
-# Ascents to the suprema of the a-priori bound, which is shown beside the density itself and decides nothing.
-ASCENTS = 16
+ASCENTS = 16  # to the suprema of the a-priori bound, which is shown beside the density itself and decides nothing
 ASCENT_STEPS = 20
 # Step of a difference quotient of the velocity: truncation is then about 1e-7 of its second derivatives, rounding 1e-9.
 DIFFERENCE = 1e-7

@@ -29,8 +29,7 @@ AROUND = 4  # ends of steps before and after a step between which the motion mus
 # Part of the fastest speed that the slowest must exceed there, and of the velocity that its change must stay below.
 STEADY = 0.5
 STILL = 0.05  # a speed of at most this part of the slowest around is as good as standing still
-# A coordinate that moves less in a step, in turns, is at rest.
-AT_REST = 1e-5
+AT_REST = 1e-5  # turns that a moving coordinate exceeds in a step
 
 
 def jumped_over(loop: Loop, steps: Steps, state: Tensor, taken: Tensor, seed: int) -> str:

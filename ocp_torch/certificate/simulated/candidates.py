@@ -18,8 +18,7 @@ BASELINE_PART = 4
 # Without noise so few trajectories in all take hardly longer than a part of them, and none is simulated roughly first.
 CHEAP = 256
 ROUGH_FACTOR = 200.0  # on the tolerance of rough simulations
-# Halvings of their steps at most: four, as elsewhere, took 3.5 minutes for a controller that trembled.
-ROUGH_DOUBLINGS = 1
+ROUGH_DOUBLINGS = 1  # of their steps at most: four, as elsewhere, took 3.5 minutes for a controller that trembled
 # Factor on the starts of a held control without noise: on a pendulum with limited torque the standard error fell from
 # .004 to .006 to .002 to .003, in 45 s instead of 36.
 MORE_HELD = 2

@@ -19,8 +19,7 @@ from ocp_torch.problems.starts import fits
 MUCH = 0.01  # part of the discounted time above which a warning is due
 TOLERANCE = 2e-3  # of that part for one trajectory, unless costs have a larger one
 FEWEST_TRAJECTORIES = 8  # of a set: fewer leave an interval as wide as the part itself
-# The control variate, a constant near the clock's rate in the box, so that the weights of the starts add little noise.
-VARIATE = 1.05
+VARIATE = 1.05  # a constant, near the clock's rate in the box, so that the weights of the starts add little noise
 
 
 class _Free(PowerCost):

@@ -9,8 +9,7 @@ from torch import Tensor
 from ocp_torch.certificate.simulated.loops import HeldLoop, Loop
 from ocp_torch.maths.runge_kutta import Dynamics, Switched
 
-# Exponent of the graded steps: early ones are shorter, as kinks of V are met at the start or never and late costs are small.
-GRADING = 2.0
+GRADING = 2.0  # early steps are shorter: kinks of V are met at the start or never, and late costs are small
 FEWEST_STEPS = 8  # at first, before any is halved
 STEP_TIME = 0.4  # of the longest first step, in discount times
 # Farthest that a trajectory moves in a first step, in turns: coarser steps are halved more often, finer ones cost more.

@@ -22,12 +22,10 @@ from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.problems.starts import evaluation_distribution
 
-# Default level of intervals: how often they cover the truth.
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # default level of intervals: how often they cover the truth
 WAVES = 96  # in a fit
 CHUNK = 8192  # states evaluated at once
-# Effective number of recorded starts, below which these tell no mean.
-FEWEST_STARTS = 16
+FEWEST_STARTS = 16  # effective number of recorded starts, below which these tell no mean
 
 
 @cache

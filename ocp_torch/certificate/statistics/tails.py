@@ -28,8 +28,7 @@ LEAST_KURTOSIS = 30.0  # kurtosis below which contributions are not examined
 HEAVY = 2.0  # contributions that fall off as a lower power have no variance; by one below 1 no mean
 LEAST_TAIL = 16  # of `N` contributions the largest `sqrt(N)` tell the power, if they are so many at least
 LEAST_POWER = 1.05  # assumed where the largest tell a lower one
-# Factor on what is added, as that is off by as much as the power: of 8.5, the mean of `|x|^-.8`, up to .4 was missing.
-ROOM = 2.0
+ROOM = 2.0  # factor on what is added, off by as much as the power: of 8.5, the mean of `|x|^-.8`, up to .4 was missing
 # The largest fourth of them must fall off as slowly: errors of an arm's `V` did not, and .35 % had been added to one mean.
 LARGEST_DIVISOR = 4
 MATERIAL = 1e-3  # part of the answer below which what a few carry is ignored

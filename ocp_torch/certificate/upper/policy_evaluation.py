@@ -25,31 +25,24 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import advance, short_fit
 from ocp_torch.steppers.fitting import LARGEST_RATE
 
-# Samples of a closed loop at most, which are then drawn again: their divergences cost more than a step.
-POOL = 2**15
+POOL = 2**15  # samples of a closed loop at most, then drawn again: their divergences cost more than a step
 # A largest slack above this part of `|E[V mu0]|` is steep, as beside kinks: only the last, longest round is then made.
 STEEP = 0.1
 # Factor on the batch where the slack is steep: on a torus in two dimensions the Lagrangian bound was .04 % above the optimum
 # after 800 steps of 512 states, and .06 % after rounds of 400 and 800 steps of 256.
 STEEP_FACTOR = 2
-# The ratio of the two suprema of the slack, by which the residual is weighed, is cut off here and at the inverse.
-LARGEST_RATIO = 16.0
-# The step at which a first round is checked for a collapse to `mu = 0`, where every gradient of the fit vanishes.
-COLLAPSE_STEP = 40
-# A mass of `mu` below this is a collapse, and the fit is begun anew (dubins with noise: two seeds of three).
-LEAST_MASS = 0.01
+LARGEST_RATIO = 16.0  # of the two suprema of the slack (and its inverse), beyond which the weight of the residual stays
+COLLAPSE_STEP = 40  # at which a first round is checked for a collapse to `mu = 0`, where every gradient vanishes
+LEAST_MASS = 0.01  # of `mu`: with less the fit is begun anew (dubins with noise: two seeds of three)
 RESTART_FACTOR = 0.3  # factor on the learning rate of a fit that is begun anew
 LEAST_CHECKED_RATE = 1e-3  # fits at this learning rate or less are not checked for a collapse
-# Ascents of either sign to the slack's suprema: in 64 coordinates they found 7, where 4,096 states showed .1.
-ASCENTS = 32
+ASCENTS = 32  # of either sign to the slack's suprema: in 64 coordinates they found 7, where 4,096 states showed .1
 ASCENT_STEPS = 40
-# States at which the excess of the bound is computed to decide whether a fit is good enough, and that are made at once.
-EXCESS_STATES = 4096
+EXCESS_STATES = 4096  # at which the excess is computed that says whether a fit is good enough; made at once
 # Steps after which the first round may end: in 16 coordinates the bound was 5e-6 above the optimum after 100, 5e-5 after 25.
 EXCESS_FIRST = 100
 EXCESS_EVERY = 25  # steps between two evaluations of the excess from then on
-# Part of `good_excess` at which the first round ends early: any `mu` will do where `V` solves its equation.
-EARLY_PART = 0.05
+EARLY_PART = 0.05  # of `good_excess`, at which a first round ends early: any `mu` will do where `V` solves its equation
 # That part where the slack is steep: at 1 the circle's certified gap was .002 % wider than after a round of 300 steps.
 STEEP_EARLY_PART = 0.5
 
