@@ -5,6 +5,7 @@ import logging
 import os
 import shlex
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -53,7 +54,8 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
     spare_imports()
     register_resolvers()
     logging.setLogRecordFactory(Record)
-    logging.raiseExceptions = False  # no traceback for every line of a log where the disk is full
+    logging.raiseExceptions = False  # a full disk is told once, not at every line of a log
+    threading.excepthook = unless_told  # nor by the thread that writes for TensorBoard
     # Users' modules are imported from the current folder, as `python -m` would.
     sys.path.insert(0, os.getcwd())
     command = [*typed(sys.argv[0]), *sys.argv[1:]]
@@ -179,6 +181,12 @@ def require_no_dashes(options: list[str]) -> None:
         name = option.split("=")[0]
         if "=" in option and name not in HYDRAS:
             raise InputError(f"{option} is no option; write {option.lstrip('-')}, without the dashes.")
+
+
+def unless_told(failed: threading.ExceptHookArgs) -> None:
+    """Print what ended a thread, unless it is TensorBoard's, which raises it again in whoever writes next."""
+    if not type(failed.thread).__module__.startswith("tensorboard."):
+        threading.__excepthook__(failed)
 
 
 def spare_imports() -> None:

@@ -54,6 +54,8 @@ def checked(arguments: list[str], config_name: str, check: Callable[[dict], obje
         folder = locate(Path(data["resume"]))[0] if going_on else own
         if folder is not None:
             require_unlinked(folder)
+        if folder is not None and going_on:
+            require_writable(folder, "resume")
         made = check(data)
     if own is not None and "resume" in data and not going_on:
         require_fresh(own)

@@ -40,8 +40,8 @@ def steep_peaks(
     """Peaks of ``function`` in steep places, by searches until `FRUITLESS` in a row have found nothing higher.
 
     A search climbs from the random states, at most ``starts``, within whose reach the function may be largest, if that is
-    above ``known`` by more than `NEGLIGIBLE` times ``unit``. It climbs ``rough``, the function in single precision, in half the
-    time, and then ``function`` from the highest ends. Bounds draw the same states each time; training gives another
+    above ``known`` by more than `NEGLIGIBLE` times ``unit``. It climbs ``rough``, the function in single precision, in half
+    the time, and then ``function`` from the highest ends. Bounds draw the same states each time; training gives another
     ``generator``.
     """
     found: list[Tensor] = []

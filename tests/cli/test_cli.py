@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
 import uuid
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 from ocp_torch import load_controller
 from ocp_torch.certificate import table
 from ocp_torch.cli.explain import CHECKOUT
+from ocp_torch.cli.launch import unless_told
 from support.forked import assert_succeeded, certificate_in, script
 
 # Enough for a run of its own folder and certificate, and no more.
@@ -213,3 +215,12 @@ def test_a_wrong_job_of_a_sweep_ends_alone_and_is_named_at_the_end(tmp_path):
     assert "problem.discount is -1" in errors[0]
     assert "1 job(s)" in errors[-1]
     assert certificate_in(tmp_path / "sweep" / "1_circle_dual_seed0")["method"] == "dual"
+
+
+def test_what_ends_tensorboards_thread_is_left_to_who_writes_next_and_every_other_thread_is_told(capsys):
+    from tensorboard.summary.writer.event_file_writer import _AsyncWriterThread
+
+    full = OSError(28, "No space left on device")
+    for thread, told in ((_AsyncWriterThread(None, None, 1, 1), False), (threading.Thread(), True)):
+        unless_told(threading.ExceptHookArgs((OSError, full, None, thread)))
+        assert ("No space left" in capsys.readouterr().err) == told

@@ -1,5 +1,7 @@
 """Going on without a configuration beside the checkpoint: the checkpoint's own is used, and nothing wrong is left behind."""
 
+import errno
+import os
 import shutil
 from pathlib import Path
 
@@ -7,8 +9,10 @@ import pytest
 import yaml
 
 from ocp_torch.cli import compose as composition
+from ocp_torch.cli import single
 from ocp_torch.errors import InputError
 from ocp_torch.runs.configuration import read_configuration, saved_configuration
+from ocp_torch.runs.run import training_run
 from ocp_torch.training.checkpoint import load_checkpoint
 from support.forked import TINY, completed, finished_run, train
 
@@ -69,6 +73,15 @@ def test_a_configuration_that_was_cut_short_is_told_and_the_checkpoints_taken_on
         composition.composed("train", [f"resume={run}"])
     file.unlink()
     assert composition.composed("train", [f"resume={run}"])["seed"] == 3
+
+
+def test_a_run_where_nothing_can_be_written_is_refused_before_its_log_is_opened(run, monkeypatch):
+    def forbidden(**_):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(single.tempfile, "TemporaryFile", forbidden)
+    with pytest.raises(InputError, match=f"resume is '{run}', where nothing can be written: Read-only file system"):
+        single.checked([f"resume={run}"], "train", training_run)
 
 
 def test_a_finished_run_without_configuration_is_left_with_its_own(run, tmp_path):
