@@ -9,14 +9,14 @@ from typing import NoReturn
 
 from ocp_torch.cli.outcome import fail
 from ocp_torch.cli.single import Checked
+from ocp_torch.compute.processes import FirstProcessLeft, LostError, SingleProcess
 from ocp_torch.errors import InputError
-from ocp_torch.maths.ranks import Alone, Left, LostError
 from ocp_torch.problems.blame import blamed
 from ocp_torch.steppers import NonFiniteError
 from ocp_torch.training.stopping import Preempted
 
 
-def assist(ranks: Alone, check: Callable[[], Checked], work: Callable[..., object]) -> NoReturn:
+def assist(ranks: SingleProcess, check: Callable[[], Checked], work: Callable[..., object]) -> NoReturn:
     """Do this process's share of ``work`` on what ``check`` made, then end the process.
 
     The exit status is 0 even where the run fails, unless no other process can tell the error: otherwise torchrun would kill
@@ -27,7 +27,7 @@ def assist(ranks: Alone, check: Callable[[], Checked], work: Callable[..., objec
         work(ranks.alike(check).made, Path())
     except LostError as error:
         fail(f"{str(error).rstrip('.')}; what it saved last is there to go on from.")
-    except (Left, Preempted, NonFiniteError, KeyboardInterrupt):  # the first process tells these
+    except (FirstProcessLeft, Preempted, NonFiniteError, KeyboardInterrupt):  # the first process tells these
         pass
     except (Exception, SystemExit) as error:
         told = blamed(error) or (error if isinstance(error, InputError) else None)

@@ -20,9 +20,9 @@ from omegaconf import DictConfig
 
 from ocp_torch.cli.compose import resolved, run_data
 from ocp_torch.cli.outcome import Record, fail, failed, typed
+from ocp_torch.compute.processes import LostError
 from ocp_torch.errors import InputError
 from ocp_torch.files.reading import require_unlinked
-from ocp_torch.maths.ranks import LostError
 from ocp_torch.maths.seeds import generators_kept
 from ocp_torch.problems.blame import blamed
 from ocp_torch.problems.commands import quoted

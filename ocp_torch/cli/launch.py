@@ -21,9 +21,9 @@ from ocp_torch.cli.explain import explain, is_choice
 from ocp_torch.cli.help import help_text
 from ocp_torch.cli.outcome import BROKEN_PIPE, INTERRUPTED, Record, fail, failures, typed
 from ocp_torch.cli.single import carry_out, checked, require_places_to_write
+from ocp_torch.compute.processes import FirstProcessLeft, LostError, joined
 from ocp_torch.errors import InputError, require_flag, require_section, shown
 from ocp_torch.files.reading import require_unlinked
-from ocp_torch.maths.ranks import Left, LostError, joined
 from ocp_torch.problems.commands import ForeignProblem
 from ocp_torch.training.stopping import Preempted
 
@@ -64,7 +64,7 @@ def launch(entry: Callable, config_name: str, check: Callable[[dict], object], w
     overrides = [a for a in sys.argv[1:] if not a.startswith("-")]
     try:
         ranks = joined()
-    except Left:  # the first process has left, and tells why
+    except FirstProcessLeft:  # the first process has left, and tells why
         sys.exit(0)
     except LostError as error:
         fail(str(error))

@@ -14,11 +14,11 @@ import torch
 from ocp_torch.cli.asked import Asked, data_of, flat
 from ocp_torch.cli.job import isolated
 from ocp_torch.cli.single import require_writable, told
+from ocp_torch.compute.processes import joined
 from ocp_torch.control.saved import load_controller
 from ocp_torch.errors import InputError, require_integer, shown
 from ocp_torch.files.reading import kind, read_json, require_unlinked
 from ocp_torch.files.storage import only_writer
-from ocp_torch.maths.ranks import joined
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import blamed
 from ocp_torch.runs.build import build_problem, checked_problem

@@ -20,9 +20,9 @@ from omegaconf import DictConfig, OmegaConf, read_write
 from ocp_torch.cli.compose import configuration, parsed, run_data
 from ocp_torch.cli.explain import CONFIGS
 from ocp_torch.cli.job import Job, require_fresh
+from ocp_torch.compute.processes import joined
 from ocp_torch.errors import InputError, shown
 from ocp_torch.files.reading import require_unlinked
-from ocp_torch.maths.ranks import joined
 from ocp_torch.problems.blame import blamed
 from ocp_torch.runs.configuration import locate
 

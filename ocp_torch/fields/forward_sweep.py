@@ -15,9 +15,9 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from ocp_torch.compute.decisions import decided
 from ocp_torch.fields.activations import DERIVATIVES, Derivatives
 from ocp_torch.fields.embedding import FourierEmbedding
-from ocp_torch.maths.decisions import decided
 
 # Largest condition number of noise by whose columns gradients are found: rounding grows by at most this factor.
 LARGEST_CONDITION = 100.0

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from ocp_torch.maths.cores import side_by_side
+from ocp_torch.compute.threads import side_by_side
 from ocp_torch.maths.jets import Field, Jet, jet
 
 PIECE_STATES = 512  # of a batch that is differentiated on several cores

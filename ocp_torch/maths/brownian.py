@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.cores import in_pieces
+from ocp_torch.compute.threads import in_pieces
 from ocp_torch.maths.runge_kutta import Dynamics, Switched
 from ocp_torch.maths.seeds import Branch, derive_seed
 

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ocp_torch.maths.cores import CHUNK, parted, side_by_side, spread
+from ocp_torch.compute.threads import CHUNK, parted, side_by_side, spread
 
 Field = Callable[[Tensor], Tensor]
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from ocp_torch.errors import InputError, require_number, require_numbers, shown
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.control_cost import PowerCost, norm_power, radial_part
-from ocp_torch.problems.placed import Placed
+from ocp_torch.problems.device_constants import DeviceConstants
 
 # The largest `|u|`, or a list of the largest `|u_i|`; `None` where there is no limit.
 Limit = float | Sequence[float] | None
@@ -133,7 +133,7 @@ class LimitedCost(ConstrainedCost):
         return self.gauge(w) * self.largest
 
 
-class BoxLimitedCost(ConstrainedCost, Placed):
+class BoxLimitedCost(ConstrainedCost, DeviceConstants):
     r"""`R_c(u) = |u|^2 / 2` for `|u_i| <= c_i`, else infinity: a sum over the actuators, as is its conjugate, of Huber's
     functions `R_{c_i}*(p_i)`; but the actuators share `mu`, which is at least `max_i |w_i| / c_i`.
 

@@ -15,10 +15,10 @@ from ocp_torch.maths.sampling import scrambled_sobol
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.constant_noise import column_matrix, constant_diffusion
 from ocp_torch.problems.control_limit import Limit, control_cost
+from ocp_torch.problems.device_constants import DeviceConstants
+from ocp_torch.problems.gymnasium_adapter import GymnasiumAdapter
 from ocp_torch.problems.lipschitz import Lipschitz
 from ocp_torch.problems.physical.measures import Measures
-from ocp_torch.problems.placed import Placed
-from ocp_torch.problems.played import Played
 from ocp_torch.problems.replaced import replaced
 from ocp_torch.problems.reproducible import Reproducible
 from ocp_torch.problems.samples import Samples, driven
@@ -43,7 +43,7 @@ def shipped(kind: type) -> bool:
 VectorFields = tuple[Tensor, Tensor, Tensor | None, Tensor | None]
 
 
-class Problem(Reproducible, Placed, Played):
+class Problem(Reproducible, DeviceConstants, GymnasiumAdapter):
     """Base class: override `state_cost`, and whatever else differs from `dx/dt = u` with a uniform start.
 
     All methods are batched, take states ``(N, d)``, work in the precision and on the device of their argument, and have

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from ocp_torch.compute.decisions import decided
 from ocp_torch.errors import InputError
-from ocp_torch.maths.decisions import decided
 
 if TYPE_CHECKING:
     from ocp_torch.problems.problem import Problem

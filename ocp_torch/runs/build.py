@@ -12,13 +12,13 @@ import torch
 from torch import nn
 
 from ocp_torch.certificate import CertificateSettings, StageSettings
+from ocp_torch.compute.processes import joined
 from ocp_torch.control.described import problem_name
 from ocp_torch.errors import InputError, call, nearest, require_choice, require_integer, require_number, require_section
 from ocp_torch.fields import MODELS, TRAJECTORY_VALUE, VALUE, Fields
 from ocp_torch.fields.fields import cost_unit
 from ocp_torch.fields.waves import WAVE_STATES
 from ocp_torch.files.limits import require_memory
-from ocp_torch.maths.ranks import joined
 from ocp_torch.maths.sampling import SAMPLERS, RowSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives import METHODS, Objective

@@ -85,7 +85,7 @@ def interval_figure(certificate: dict) -> Figure:
 
 
 @dataclass(frozen=True)
-class Shown:
+class FieldFigures:
     """Figures of trained ``fields``, whose `mu` follows by ``occupation`` (see `trained_policies`).
 
     The simulated density is that of the controller ``kind``, by default the first; so is the learned one if it was ``fitted``

@@ -18,7 +18,7 @@ from ocp_torch.files.storage import write_atomically
 from ocp_torch.maths.seeds import generators_kept
 from ocp_torch.problems.blame import blamed
 from ocp_torch.runs import canvas
-from ocp_torch.runs.figures import Shown, interval_figure
+from ocp_torch.runs.figures import FieldFigures, interval_figure
 from ocp_torch.runs.metrics.measures import has_metrics
 from ocp_torch.runs.metrics.trial import METRICS
 from ocp_torch.runs.pictures.picture import motion
@@ -111,7 +111,7 @@ def hand_out(
         with unless_it_failed(failure, trainer):
             how = trainer.constants, trainer.objective.occupation
             followed = certificate.followed or kind, certificate.occupation
-            figures |= Shown(trainer.problem, controller.fields, *how, *followed).figures()
+            figures |= FieldFigures(trainer.problem, controller.fields, *how, *followed).figures()
             moved = motion(trainer.problem, controller.policy, trainer.seed)
             figures |= {} if moved is None else {"motion": moved}
         drawn = canvas.drawn(figures)
@@ -124,7 +124,7 @@ def glimpse(trainer: Trainer) -> dict[str, np.ndarray]:
     """Pictures of `V`, `u` and `mu` in the middle of training, which leave the random generators as they were."""
     how = trainer.constants, trainer.objective.occupation
     with generators_kept():
-        return canvas.drawn(Shown(trainer.problem, trainer.averaged_fields, *how, quick=True).figures())
+        return canvas.drawn(FieldFigures(trainer.problem, trainer.averaged_fields, *how, quick=True).figures())
 
 
 def with_subsolution(fields: Fields, certificate: Certificate, kind: str) -> Fields:

@@ -36,7 +36,7 @@ from ocp_torch.runs.report.report import REPORT, write_report
 from ocp_torch.runs.resume import filled_from, require_same_run, result_of
 from ocp_torch.training.checkpoint import LAST
 from ocp_torch.training.monitor import Monitor
-from ocp_torch.training.observer import Silent
+from ocp_torch.training.observer import Observer
 from ocp_torch.training.state import seed_generators
 from ocp_torch.training.stopping import TARGET_GAP, Signals, postpone
 from ocp_torch.training.trainer import Trainer
@@ -140,10 +140,10 @@ def assist(trainer: Trainer) -> None:
     if trainer.fresh:
         seed_generators(trainer.seed)
     with Signals() as signals:
-        trainer.fit(Silent(), signals=signals)
+        trainer.fit(Observer(), signals=signals)
         while not trainer.ranks.from_first(bool):
             postpone(trainer.state)
-            trainer.fit(Silent(), signals=signals)
+            trainer.fit(Observer(), signals=signals)
 
 
 def handed_out(trainer: Trainer) -> str:

@@ -1,4 +1,4 @@
-"""SOAP of `pytorch_optimizer`, with steps that can be replayed (see `ocp_torch.maths.replays`)."""
+"""SOAP of `pytorch_optimizer`, with steps that can be replayed (see `ocp_torch.compute.cuda_graphs`)."""
 
 import math
 from collections.abc import Callable
@@ -8,15 +8,15 @@ import torch
 from pytorch_optimizer import SOAP
 from torch import Tensor
 
-from ocp_torch.maths.cores import side_by_side
-from ocp_torch.maths.replays import Called
+from ocp_torch.compute.cuda_graphs import Eager
+from ocp_torch.compute.threads import side_by_side
 
 
 class ReplayedSOAP(SOAP):
     """`SOAP`, whose moves may go through ``replay``: the learning rate, with its correction for a short memory, is then an
     input of a move, and new eigenbases are found after moves, every so many steps. The arithmetic is that of `SOAP`."""
 
-    replay = Called()
+    replay = Eager()
     _keeps_bases = False  # during a move
 
     @torch.no_grad()

@@ -12,10 +12,10 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
+from ocp_torch.compute.cuda_graphs import Eager
+from ocp_torch.compute.processes import SingleProcess
 from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
-from ocp_torch.maths.ranks import Alone
-from ocp_torch.maths.replays import Called
 from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers.nonfinite import BROKEN_PROBLEM, NonFiniteError, first_nonfinite
@@ -68,16 +68,16 @@ class Stepper(ABC):
         self.schedules = {player: schedule(o, self.delays[player]) for player, o in self.optimizers.items()}
         self._start = copy.deepcopy(self.state_dict())
         self._moving: dict[tuple, list[str]] = {}  # who has a loss, by the form of the phase
-        self.ranks = Alone()  # the processes that share batches
-        self.replay = Called()
+        self.ranks = SingleProcess()  # the processes that share batches
+        self.replay = Eager()
 
     @property
-    def replay(self) -> Called:
-        """How losses and moves are called (see `ocp_torch.maths.replays`)."""
+    def replay(self) -> Eager:
+        """How losses and moves are called (see `ocp_torch.compute.cuda_graphs`)."""
         return self._replay
 
     @replay.setter
-    def replay(self, replay: Called) -> None:
+    def replay(self, replay: Eager) -> None:
         self._replay = replay
         for optimizer in self.optimizers.values():
             if hasattr(optimizer, "replay"):

@@ -7,11 +7,11 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from ocp_torch.compute.cuda_graphs import Eager
+from ocp_torch.compute.processes import SingleProcess
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.errors import InputError, require_number
 from ocp_torch.fields import VALUE, Fields
-from ocp_torch.maths.ranks import Alone
-from ocp_torch.maths.replays import Called
 from ocp_torch.maths.sampling import ImportanceSampler
 from ocp_torch.maths.seeds import Branch, derive_seed
 from ocp_torch.objectives import Objective, Phase
@@ -50,7 +50,7 @@ class Batches:
     size: int
     seed: int
     visited: float | None = None
-    ranks: Alone = field(default_factory=Alone, init=False)  # the processes that share each batch
+    ranks: SingleProcess = field(default_factory=SingleProcess, init=False)  # the processes that share each batch
 
     def __post_init__(self) -> None:
         if self.visited is not None:
@@ -63,7 +63,7 @@ class Batches:
         self.generator = torch.Generator().manual_seed(derive_seed(self.seed, Branch.VISITS))
         self.states: Tensor | None = None  # (k, d), where the visited states are now
         self._noises = 0  # columns of sigma, once known
-        self.replay = Called()  # how the problem is evaluated
+        self.replay = Eager()  # how the problem is evaluated
 
     def draw(self, phase: Phase) -> Samples:
         """This process's share of the next batch, with what the objective needs at ``phase``, in the precision and on the

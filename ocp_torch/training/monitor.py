@@ -21,7 +21,7 @@ from ocp_torch.control.policies import admissible_density, occupation_density
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import StepReport
-from ocp_torch.training.observer import Silent
+from ocp_torch.training.observer import Observer
 from ocp_torch.training.running import RunningEstimates
 from ocp_torch.training.trainer import Trainer
 
@@ -53,7 +53,7 @@ def liouville_residual(trainer: Trainer, batch: Samples) -> dict[str, Tensor]:
     return {"residual_mean_absolute": samples.mean(residual.abs())}
 
 
-class Monitor(Silent):
+class Monitor(Observer):
     """Progress bar (terminals only), log lines, and TensorBoard scalars in the groups running, bounds, performance, loss, lr,
     gradient_norm, violation and throughput."""
 

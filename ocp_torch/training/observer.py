@@ -4,7 +4,7 @@ from ocp_torch.certificate import Certificate
 from ocp_torch.steppers import StepReport
 
 
-class Silent:
+class Observer:
     """Is told by the `Trainer` ``trainer``, and shows nothing: for tests, for use as a library, and to inherit from."""
 
     def stepped(self, trainer, report: StepReport, log: bool) -> None:

@@ -21,7 +21,7 @@ from ocp_torch.problems import Problem
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers.gauss_newton import refined
-from ocp_torch.training.observer import Silent
+from ocp_torch.training.observer import Observer
 
 if TYPE_CHECKING:
     from ocp_torch.training.trainer import Trainer
@@ -37,14 +37,14 @@ ENOUGH_SLACK = 5e-6  # at which the steps end: `F_M` was then .0001 to .0003 % b
 SOLVED_SLACK = 4e-5  # at which training ends: just below it `F_M` was .002 % below OPT
 
 
-class Found(NamedTuple):
+class RefinedValue(NamedTuple):
     """The weights of a refined `V`, and whether it solves the equation."""
 
     weights: dict
     solved: bool
 
 
-def refine(trainer: "Trainer", monitor: Silent, checkpoint: Path | None, stop: Callable[[], bool]) -> None:
+def refine(trainer: "Trainer", monitor: Observer, checkpoint: Path | None, stop: Callable[[], bool]) -> None:
     """Refine the averaged `V` of ``trainer``, from which training goes on, if that helps.
 
     It has to be called again where it was told to ``stop``. Before the end of a round it is all or nothing: either the
@@ -96,7 +96,7 @@ def _put(trainer: "Trainer", weights: list[dict]) -> None:
 
 def refined_value(
     problem: Problem, fields: Fields, M: float, steps: int, seed: int, stop: Callable[[], bool]
-) -> tuple[Found | None, int]:
+) -> tuple[RefinedValue | None, int]:
     """What at most ``steps`` steps on the slack of the `V` of ``fields`` find, at evenly spread states of ``seed``, and how
     many states were drawn. `None` where the steps do not help, as beside kinks or with noise, make `F_M` worse, or were told
     to ``stop``."""
@@ -117,7 +117,7 @@ def refined_value(
     found = refined(network, slack, draw, steps, ENOUGH_SLACK * unit, stop, worst)
     if found is None or bound(problem, found.network, judged, M) < bound(problem, network, judged, M):
         return None, states.count
-    return Found(found.network.state_dict(), found.residual <= SOLVED_SLACK * unit), states.count
+    return RefinedValue(found.network.state_dict(), found.residual <= SOLVED_SLACK * unit), states.count
 
 
 @torch.no_grad()

@@ -9,10 +9,10 @@ from torch import nn
 
 from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained, certify_fields
 from ocp_torch.certificate.settings import Progress, silent
+from ocp_torch.compute.cuda_graphs import replays_on
+from ocp_torch.compute.processes import LostError, SingleProcess
 from ocp_torch.errors import InputError, first_line
 from ocp_torch.fields import Fields
-from ocp_torch.maths.ranks import Alone, LostError
-from ocp_torch.maths.replays import replays_on
 from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import blamed
@@ -20,7 +20,7 @@ from ocp_torch.problems.constants import Constants
 from ocp_torch.training.checkpoint import BEST, load_checkpoint, save_checkpoint
 from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.health import sanity_warnings
-from ocp_torch.training.observer import Silent
+from ocp_torch.training.observer import Observer
 from ocp_torch.training.refinement import refine
 from ocp_torch.training.settings import TrainerSettings
 from ocp_torch.training.slack_waves import seek_waves
@@ -42,7 +42,7 @@ class Trainer:
     tell: Progress = silent  # is given the name of each stage of the full certificate
     stopped: str = STEPS  # why
     asked: bool = False  # to stop after the step in hand
-    ranks: Alone = field(default_factory=Alone)  # the processes of this run
+    ranks: SingleProcess = field(default_factory=SingleProcess)  # the processes of this run
 
     def __post_init__(self) -> None:
         state = self.state
@@ -91,7 +91,7 @@ class Trainer:
         k = self.state.round
         return Phase(self.constants, self.settings.part_done(self.step, k), self.batches.ranks.size, later=k > 0)
 
-    def fit(self, monitor: Silent, checkpoint: Path | None = None, signals: Signals | None = None) -> str:
+    def fit(self, monitor: Observer, checkpoint: Path | None = None, signals: Signals | None = None) -> str:
         """Train until there is a reason to stop, and return it; save to ``checkpoint`` on the way and at the end.
 
         The reasons: `steps` (all rounds that `settings` allow), `solved` (see `refine`), `max_seconds`, `callback` (it was
@@ -116,7 +116,7 @@ class Trainer:
         self.save(checkpoint)
         return self.stopped
 
-    def _until_stopped(self, monitor: Silent, checkpoint: Path | None, signals: Signals) -> str:
+    def _until_stopped(self, monitor: Observer, checkpoint: Path | None, signals: Signals) -> str:
         """Train until there is a reason to stop, on which all processes agree."""
         self.ranks.from_first(lambda: self._warm_up(monitor, checkpoint, signals))
         for module in (self.fields, self.state.average):
@@ -147,7 +147,7 @@ class Trainer:
     def _reason(self) -> str | None:
         return ASKED if self.asked else reason_to_stop(self.settings, self.state, late(self.settings, self.state))
 
-    def _warm_up(self, monitor: Silent, checkpoint: Path | None, signals: Signals) -> None:
+    def _warm_up(self, monitor: Observer, checkpoint: Path | None, signals: Signals) -> None:
         """Make the rounds left of the warm start; `V` then learns its best one, which itself stays a candidate."""
         state, warm = self.state, self.state.warm
         while warm is not None and not warm.done and self._reason() is None:
@@ -163,7 +163,7 @@ class Trainer:
                 self.save(checkpoint)
             signals.take()
 
-    def _advance(self, monitor: Silent, checkpoint: Path | None) -> None:
+    def _advance(self, monitor: Observer, checkpoint: Path | None) -> None:
         """Make a step, and what is due after it."""
         settings, state, started = self.settings, self.state, time.perf_counter()
         seek_waves(self)
@@ -185,7 +185,7 @@ class Trainer:
     def _due(self, every: int) -> bool:
         return every > 0 and self.step % every == 0
 
-    def evaluate(self, monitor: Silent, checkpoint: Path | None) -> bool:
+    def evaluate(self, monitor: Observer, checkpoint: Path | None) -> bool:
         """A quick evaluation: keep the state if it is the best so far, and see whether it may be good enough to end."""
         self.state.require_finite()
         certificate = self.evaluator.evaluate(self.run)

@@ -4,13 +4,13 @@ import copy
 from collections.abc import Sequence
 from typing import Any
 
-from ocp_torch.maths.ranks import Alone, LostError
+from ocp_torch.compute.processes import LostError, SingleProcess
 from ocp_torch.objectives import Phase
 from ocp_torch.steppers import StepReport, advance
 from ocp_torch.training.state import TrainState
 
 
-def whole_step(state: TrainState, phase: Phase, ranks: Alone) -> StepReport:
+def whole_step(state: TrainState, phase: Phase, ranks: SingleProcess) -> StepReport:
     """Make a step of ``state`` at ``phase``. Where others of ``ranks`` are lost in the middle of it, all that it moved is put
     back, and `LostError` raised. Raises `NonFiniteError` as `Stepper.step` does."""
     moved: Sequence[Any] = (state.batches,) if ranks.size > 1 else ()

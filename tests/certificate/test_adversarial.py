@@ -16,7 +16,7 @@ from ocp_torch.problems import Dataset
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.runs import build as config
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from support.adversarial import FAMILY, Hole, Line, Lines, dip, flat, spike, still, waves
 from support.formulas import Exactly
 from support.honesty import (
@@ -145,7 +145,7 @@ def trained(problem, method, seed, monkeypatch, steps=150):
             "certificate.stage.rounds=1",
         )
     )
-    trainer.fit(Silent())
+    trainer.fit(Observer())
     return trainer.certify(build_certificate_settings(trainer.config))
 
 

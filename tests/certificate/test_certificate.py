@@ -18,7 +18,7 @@ from ocp_torch.problems.constants import ESTIMATED, FROM_DENSITY, resolve_consta
 from ocp_torch.problems.needs import GUESSED, SEARCHED
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_trainer
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from support import zoo
 from support.formulas import Field
 from support.honesty import BARE
@@ -135,7 +135,7 @@ def rounds_of(*overrides: str):
     trainer = build_trainer(
         configured("experiment=debug", "problem=circle", "method=dual", "trainer.steps=8", *overrides)
     )
-    trainer.fit(Silent())
+    trainer.fit(Observer())
     return trainer
 
 
@@ -156,7 +156,7 @@ def test_a_run_in_its_second_round_resumes_bitwise(tmp_path):
     )
     saved = tmp_path / "last.pt"
 
-    class StopAt13(Silent):
+    class StopAt13(Observer):
         def stepped(self, trainer, report, log):
             if trainer.step == 14:
                 raise KeyboardInterrupt
@@ -168,6 +168,6 @@ def test_a_run_in_its_second_round_resumes_bitwise(tmp_path):
     )
     resumed.resume(saved)
     assert (resumed.step, resumed.state.round) == (13, 1)
-    resumed.fit(Silent())
+    resumed.fit(Observer())
     for left, right in zip(whole.averaged_fields.parameters(), resumed.averaged_fields.parameters(), strict=True):
         assert torch.equal(left, right)

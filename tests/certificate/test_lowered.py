@@ -7,7 +7,7 @@ import torch
 
 from ocp_torch.certificate.lower.slack import slack_function
 from ocp_torch.certificate.upper.lagrangian import closed_loop_bounds
-from ocp_torch.certificate.upper.lowered import UNCHANGED, Above, LoweredSlack, Lowering, Met
+from ocp_torch.certificate.upper.lowered import UNCHANGED, Above, LoweredSlack, Lowering, SampledSlack
 from ocp_torch.certificate.upper.multiples import terms_on
 from ocp_torch.certificate.upper.policy_evaluation import positive_weight
 from ocp_torch.control.policies import ValuePolicy
@@ -97,7 +97,7 @@ def test_slack_and_derivatives_of_a_function_of_v_are_those_of_that_function(who
     by_hand, own = reverse_jet(lambda x: how(V(x)), samples.x, samples.noise), how.jet(L.jet(V), samples.noise)
     for part in ("value", "gradient", "curvature"):
         torch.testing.assert_close(getattr(own, part), getattr(by_hand, part), rtol=1e-10, atol=1e-10)
-    torch.testing.assert_close(Met.at(L, V).of(how), L.hjb_slack(by_hand), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(SampledSlack.at(L, V).of(how), L.hjb_slack(by_hand), rtol=1e-9, atol=1e-9)
     assert bool((how(V(samples.x).sort().values).diff() >= 0.0).all())  # as C_V takes for granted
 
 

@@ -19,8 +19,8 @@ from ocp_torch.certificate.lower.slack import MAX_THETA, SlackParts, slack_funct
 from ocp_torch.certificate.lower.tightened import tightened
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.statistics.estimate import replicated_samples
+from ocp_torch.compute.background import BackgroundResult
 from ocp_torch.fields import Fields, PeriodicMLP, Subsolution
-from ocp_torch.maths.ahead import Ahead
 from ocp_torch.maths.jets import jet
 from ocp_torch.maths.peaks import Peaks
 from ocp_torch.problems import Circle, Simulator
@@ -290,7 +290,7 @@ def test_a_value_trained_on_for_the_bound_comes_closer_to_the_optimum_from_below
 
 
 def test_what_cannot_be_trained_on_stays_as_it_is():
-    trained = lambda value, **how: Ahead(tightened(Circle(), value, seed=0, **how)).answer()
+    trained = lambda value, **how: BackgroundResult(tightened(Circle(), value, seed=0, **how)).answer()
     assert trained(Circle().exact_value) is None
     assert trained(perturbed(Circle()), steps=0) is None
     broken = perturbed(Circle())
@@ -376,12 +376,12 @@ def test_a_second_core_gives_the_same_certificate(name, monkeypatch):
     settings_ = CertificateSettings(**small, stage=StageSettings(steps=20, rounds=1))
 
     def said(cores: int) -> dict:
-        monkeypatch.setattr("ocp_torch.maths.ahead.cores", lambda: cores)
+        monkeypatch.setattr("ocp_torch.compute.background.cores", lambda: cores)
         constants = resolve_constants(problem)
         return certify_fields(problem, trained, constants, settings_, Run("any", "dual")).to_dict()
 
-    begun = Ahead.begin
-    monkeypatch.setattr(Ahead, "begin", lambda work: (begun(work), threads.append(work._thread))[0])
+    begun = BackgroundResult.begin
+    monkeypatch.setattr(BackgroundResult, "begin", lambda work: (begun(work), threads.append(work._thread))[0])
     assert said(1) == said(2)
     assert [thread is None for thread in threads] == [True, False]
 

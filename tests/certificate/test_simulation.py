@@ -11,10 +11,10 @@ import torch
 from ocp_torch.certificate import CertificateSettings
 from ocp_torch.certificate.simulated.backward import backward_flow, settled_occupation
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, Simulation, starting_points
+from ocp_torch.compute import threads as cores
+from ocp_torch.compute.threads import in_pieces
 from ocp_torch.control.policies import ValuePolicy, zero_policy
 from ocp_torch.errors import InputError, call
-from ocp_torch.maths import cores
-from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.runge_kutta import discounted_integral, refined
 from ocp_torch.maths.sampling import evaluation_points
 from ocp_torch.problems import Circle, Pendulum, Problem
@@ -236,7 +236,7 @@ def test_a_density_followed_back_on_several_cores_is_the_same(problem, monkeypat
     x = zoo.states(problem, 48)
 
     def found(cores: int, together: bool):
-        monkeypatch.setattr("ocp_torch.maths.cores.cores", lambda: cores)
+        monkeypatch.setattr("ocp_torch.compute.threads.cores", lambda: cores)
         return settled_occupation(problem, problem.exact_control, x, 12, together)
 
     assert torch.equal(found(1, True), found(2, True))

@@ -14,7 +14,7 @@ from ocp_torch.cli.compose import composed, register_resolvers, with_own_default
 from ocp_torch.errors import InputError
 from ocp_torch.runs.build import build_problem, build_trainer
 from ocp_torch.runs.compare import performance
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from support import own_problems
 from support.forked import TINY, command, completed, train
 
@@ -203,7 +203,7 @@ def test_training_is_the_same_in_other_units(method, module):
     def weights(k: int) -> dict:
         own = (f"problem._target_={module[1]}.Wide", f"problem.k={k}", f"method={method}", "trainer.steps=12")
         trainer = build_trainer(composed("train", [*SMALL, *own]))
-        trainer.fit(Silent())
+        trainer.fit(Observer())
         return dict(trainer.averaged_fields.named_parameters())
 
     plain, wide = weights(0), weights(20)

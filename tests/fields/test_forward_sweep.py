@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from ocp_torch.compute import threads as cores
 from ocp_torch.fields import PeriodicMLP, SobolevField, mlp
 from ocp_torch.fields.activations import ACTIVATIONS
 from ocp_torch.fields.forward_sweep import Along
-from ocp_torch.maths import cores
 from ocp_torch.maths.batch_jet import PIECE_STATES, batch_jet
 from ocp_torch.maths.jets import chunked_jet, curvature, jet, reverse_jet
 

@@ -14,7 +14,7 @@ from ocp_torch.errors import InputError, StorageError
 from ocp_torch.files import storage
 from ocp_torch.runs.run import training_run
 from ocp_torch.training.checkpoint import MAGIC, SCHEMA, load_checkpoint, newest, save_checkpoint
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from support.forked import TINY, completed, train
 from support.small import small
 
@@ -209,7 +209,7 @@ def test_files_permit_what_the_user_lets_new_files_permit(tmp_path):
 def test_a_run_goes_on_from_the_newest_good_checkpoint_and_says_which_was_not(tmp_path):
     folder = tmp_path / "run"
     trainer = small("method=dual", "trainer.checkpoint_every=5", "trainer.keep=3", "trainer.steps=18")
-    trainer.fit(Silent(), folder / "checkpoints" / "last.pt")
+    trainer.fit(Observer(), folder / "checkpoints" / "last.pt")
     (folder / "checkpoints" / "last.pt").write_bytes(b"")
     run = training_run(composed("train", [f"resume={folder}"]))
     assert run.trainer.step == 15
@@ -223,7 +223,7 @@ def test_a_run_goes_on_from_the_newest_good_checkpoint_and_says_which_was_not(tm
 )
 def test_a_damaged_configuration_is_refused_in_one_sentence(content, tmp_path):
     folder = tmp_path / "run"
-    small("method=dual", "trainer.steps=2").fit(Silent(), folder / "checkpoints" / "last.pt")
+    small("method=dual", "trainer.steps=2").fit(Observer(), folder / "checkpoints" / "last.pt")
     (folder / ".hydra").mkdir()
     (folder / ".hydra" / "config.yaml").write_bytes(content)
     with pytest.raises(InputError, match=r"config\.yaml") as refused:

@@ -42,11 +42,11 @@ class Canary:
 @pytest.fixture(scope="module")
 def stranger(tmp_path_factory):
     """A good run's folder, to be made bad."""
-    from ocp_torch.training.monitor import Silent
+    from ocp_torch.training.monitor import Observer
 
     folder = tmp_path_factory.mktemp("stranger") / "run"
     trainer = small(*WAY)
-    trainer.fit(Silent(), folder / "checkpoints" / "last.pt")
+    trainer.fit(Observer(), folder / "checkpoints" / "last.pt")
     (folder / ".hydra").mkdir()
     (folder / ".hydra" / "config.yaml").write_text(yaml.safe_dump(trainer.config))
     shown = certificate(trainer.run, 0.1, 0.2)

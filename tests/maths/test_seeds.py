@@ -15,7 +15,7 @@ ROOT = Path(ocp_torch.__file__).parent
 # Where seeds come in that are not derived: the library's own, those a caller hands in, and those that define a problem.
 BARE = {
     "maths/seeds.py",  # `fixed_generator`
-    "certificate/upper/policy_evaluation.py",  # `Drawn`, handed a derived seed
+    "certificate/upper/policy_evaluation.py",  # `FixedPool`, handed a derived seed
     "fields/fields.py",  # `Fields.build`, handed a derived seed
     "maths/sampling.py",  # `evaluation_points`, whose seed is derived in the line before
     "training/state.py",  # the process's own generators, from a derived seed

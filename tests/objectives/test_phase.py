@@ -8,7 +8,7 @@ import torch
 
 from ocp_torch.objectives import Phase
 from ocp_torch.problems.samples import Samples
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from support.bits import differences
 from support.small import METHODS, small
 
@@ -48,7 +48,7 @@ def test_a_run_changes_nothing_of_its_objective(method):
     trainer = small(*METHODS[method], "trainer.steps=10", "trainer.rounds=2")
     trainer.evaluator.reaches = lambda gap, run: False  # its controllers after a few steps take long to simulate
     before = plain(trainer.objective)
-    trainer.fit(Silent())
+    trainer.fit(Observer())
     assert plain(trainer.objective) == before
     assert not any(isinstance(value, Phase) for value in before.values())
 

@@ -15,7 +15,7 @@ from ocp_torch.problems.constants import OCCUPATION_WEIGHT, resolve_constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.training.budgets import DENSITY_BATCH, fill
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from support import zoo
 from support.small import small
 
@@ -76,7 +76,7 @@ def test_a_run_tells_its_losses_that_a_round_is_over():
     trainer.evaluator.reaches = lambda gap, run: False
     seen, ask = [], trainer.objective.losses
     trainer.objective.losses = lambda fields, samples, phase: seen.append(phase.later) or ask(fields, samples, phase)
-    trainer.fit(Silent())
+    trainer.fit(Observer())
     assert seen == [False] * 2 + [True] * 4
 
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from ocp_torch import Angle, Problem, System
+from ocp_torch.compute.threads import cores
 from ocp_torch.errors import InputError
-from ocp_torch.maths.cores import cores
 from ocp_torch.problems import Simulator
 from ocp_torch.problems.checks.check import check_once
 from ocp_torch.problems.checks.mass import sampled_mass

@@ -33,10 +33,10 @@ from ocp_torch.runs import record as recording_command
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.evaluate import certify_saved, load_run
 from ocp_torch.runs.external import certify as certify_given
-from ocp_torch.runs.figures import Shown
+from ocp_torch.runs.figures import FieldFigures
 from ocp_torch.runs.frame import frame_of, in_units
 from ocp_torch.training.checkpoint import load_checkpoint
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from support import zoo
 from support.formulas import Exactly
 from support.recorded import certificate_of, record
@@ -104,7 +104,7 @@ def test_a_strangers_names_are_no_formulas_in_a_figure(tmp_path):
     np.savez(path, **arrays_of(path), units=np.frombuffer(json.dumps(units).encode(), np.uint8))
     fields = Fields({"value": PeriodicMLP(dim=1, width=8, depth=2, modes=2)})
     data = Dataset(str(path))
-    for figure in Shown(data, fields, resolve_constants(data, occupation_bound=2.0), None).figures().values():
+    for figure in FieldFigures(data, fields, resolve_constants(data, occupation_bound=2.0), None).figures().values():
         figure.canvas.draw()
         assert figure.axes[0].get_xlabel() == "$\\frac{ [rad]"
 
@@ -480,15 +480,15 @@ def test_a_resumed_run_is_the_uninterrupted_one_and_notices_other_data(tmp_path,
         "problem=dataset", f"problem.path={path}", "method=pd", f"trainer.steps={steps}"
     )
     through = build(20)
-    through.fit(Silent(), tmp_path / "whole.pt")
+    through.fit(Observer(), tmp_path / "whole.pt")
     half = build(20)
     half.settings = dataclasses.replace(half.settings, max_seconds=None)
     for _ in range(10):
-        half._advance(Silent(), None)
+        half._advance(Observer(), None)
     half.save(tmp_path / "half.pt")
     rest = build(20)
     rest.resume(tmp_path / "half.pt")
-    rest.fit(Silent(), tmp_path / "end.pt")
+    rest.fit(Observer(), tmp_path / "end.pt")
     one, other = load_checkpoint(tmp_path / "whole.pt"), load_checkpoint(tmp_path / "end.pt")
     assert all(torch.equal(one["average"][k], other["average"][k]) for k in one["average"])
     arrays = arrays_of(plain)

@@ -7,7 +7,7 @@ import torch
 
 from ocp_torch.certificate import Run
 from ocp_torch.runs import finish
-from ocp_torch.runs.figures import Shown, interval_figure
+from ocp_torch.runs.figures import FieldFigures, interval_figure
 from ocp_torch.runs.report.bracket import bracket
 from support.looks import certificate
 from support.small import session, small
@@ -35,9 +35,11 @@ def test_a_bound_that_does_not_count_is_in_no_picture():
 @pytest.mark.nightly
 def test_the_density_drawn_is_that_fitted_to_the_controller_handed_out(tmp_path, monkeypatch):
     trainer, seen = small("method=pd", "certificate.stage.steps=10"), []
-    drawn = Shown.figures
-    monkeypatch.setattr(finish, "Shown", lambda *given, **named: seen.append(Shown(*given, **named)) or seen[-1])
-    monkeypatch.setattr(Shown, "figures", lambda shown: drawn(replace(shown, quick=True)))
+    drawn = FieldFigures.figures
+    monkeypatch.setattr(
+        finish, "FieldFigures", lambda *given, **named: seen.append(FieldFigures(*given, **named)) or seen[-1]
+    )
+    monkeypatch.setattr(FieldFigures, "figures", lambda shown: drawn(replace(shown, quick=True)))
     found = session(trainer, tmp_path)
     (last,) = (shown for shown in seen if not shown.quick)
     x = torch.linspace(0.0, 1.0, 50, dtype=torch.float64).unsqueeze(1)

@@ -247,10 +247,10 @@ def test_torchrun_makes_a_run_in_one_folder(tmp_path):
 
 def dying():
     """In the child: the second process dies over its first piece of the certificate."""
-    from ocp_torch.maths.ranks import Ranks
+    from ocp_torch.compute.processes import ProcessGroup
 
     if os.environ["RANK"] == "1":
-        Ranks._attempted = lambda *_: os._exit(1)
+        ProcessGroup._attempted = lambda *_: os._exit(1)
 
 
 @pytest.mark.nightly

@@ -19,7 +19,7 @@ from ocp_torch.runs.run import train as start
 from ocp_torch.runs.run import training_run
 from ocp_torch.training.checkpoint import load_checkpoint, save_checkpoint
 from ocp_torch.training.evaluator import Evaluator
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from support.bits import differences
 from support.forked import TINY, completed, finished_run, train
 from support.looks import quick
@@ -47,7 +47,7 @@ def maker(*overrides: str):
     return lambda **trainer: build_trainer({**config, "trainer": {**config["trainer"], **trainer}})
 
 
-class Recorder(Silent):
+class Recorder(Observer):
     """Saves a checkpoint after each of ``steps``."""
 
     def __init__(self, folder, *steps: int) -> None:
@@ -70,7 +70,7 @@ def test_from_any_step_a_resumed_run_reaches_the_same_bits(way, tmp_path):
         resumed = made()
         resumed.resume(tmp_path / f"{step}.pt")
         assert resumed.step == step
-        resumed.fit(Silent())
+        resumed.fit(Observer())
         assert differences(state_of(resumed), state_of(whole)) == []
         rates = resumed.stepper.learning_rates()
         assert rates == whole.stepper.learning_rates()
@@ -87,7 +87,7 @@ def test_the_looks_so_far_are_part_of_the_state(monkeypatch, tmp_path):
         resumed = small(*way)
         resumed.resume(tmp_path / f"{step}.pt")
         assert resumed.health.best.step == best
-        resumed.fit(Silent())
+        resumed.fit(Observer())
         assert differences(state_of(resumed), state_of(whole)) == []
 
 
@@ -111,7 +111,9 @@ def test_random_numbers_that_a_problem_draws_itself_are_resumed_too(monkeypatch,
 def test_with_other_steps_a_run_is_one_of_the_new_length(method, schedule, tmp_path):
     """Learning rates and the warm start are, at every step, those of a run that had that length from the start."""
     way = (f"method={method}", f"schedule={schedule}", *(["schedule.every=3"] if schedule == "decay" else []))
-    rates = lambda seen: type("Rates", (Silent,), {"stepped": lambda _, t, r, log: seen.__setitem__(t.step, told(t))})()
+    rates = lambda seen: type(
+        "Rates", (Observer,), {"stepped": lambda _, t, r, log: seen.__setitem__(t.step, told(t))}
+    )()
     told = lambda t: (t.stepper.learning_rates(), t.objective.needs_divergences(t.phase))
     made = maker(*way)
     made(steps=10).fit(Recorder(tmp_path, 8, 10))
@@ -202,7 +204,7 @@ def test_sizes_by_dimension_are_those_the_run_began_with(tmp_path, monkeypatch):
     rest = [o for o in TINY if not o.startswith(("model.width", "trainer.batch"))]
     config = composed("train", [*rest, "trainer.steps=2"])
     run = training_run(config)
-    run.trainer.fit(Silent(), tmp_path / "run" / "checkpoints" / "last.pt")
+    run.trainer.fit(Observer(), tmp_path / "run" / "checkpoints" / "last.pt")
     (tmp_path / "run" / ".hydra").mkdir()
     (tmp_path / "run" / ".hydra" / "config.yaml").write_text(yaml.safe_dump(config))
     others = tuple(dataclasses.replace(b, batch=2 * b.batch) for b in budgets.BUDGETS)

@@ -17,7 +17,7 @@ from ocp_torch.steppers import NonFiniteError
 from ocp_torch.steppers.nonfinite import first_nonfinite
 from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.health import Evaluation, Health, best_constant
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from ocp_torch.training.stopping import postpone
 from ocp_torch.training.trainer import Trainer
 from support.looks import LOWER, certificate, quick
@@ -61,13 +61,13 @@ def test_a_run_killed_while_a_certificate_is_tried_tries_it_again(tmp_path, monk
     monkeypatch.setattr(Evaluator, "evaluate", quick(lambda t: 0.01))
     way = (*WAY, "trainer.target_gap=0.02", "trainer.steps=40")
     first = small(*way)
-    assert first.fit(Silent(), tmp_path / "last.pt") == "target_gap"
+    assert first.fit(Observer(), tmp_path / "last.pt") == "target_gap"
     second = small(*way)
     second.resume(tmp_path / "last.pt")
-    assert second.fit(Silent()) == "target_gap"
+    assert second.fit(Observer()) == "target_gap"
     assert second.step == first.step == 4
     postpone(second.state)
-    assert second.fit(Silent()) == "target_gap"
+    assert second.fit(Observer()) == "target_gap"
     assert second.step == 8
 
 
@@ -81,15 +81,15 @@ def test_no_gap_is_no_reason_to_stop(tmp_path, monkeypatch):
 def test_seconds_stop_a_run_and_those_before_a_resume_count(tmp_path):
     way = ("method=dual", "trainer.steps=100000", "trainer.max_seconds=0.3")
     trainer = small(*way)
-    assert trainer.fit(Silent(), tmp_path / "last.pt") == "max_seconds"
+    assert trainer.fit(Observer(), tmp_path / "last.pt") == "max_seconds"
     assert 0 < trainer.step < 100_000
     again = small(*way)
     again.resume(tmp_path / "last.pt")
-    assert again.fit(Silent()) == "max_seconds"
+    assert again.fit(Observer()) == "max_seconds"
     assert again.step == trainer.step
     more = small(*way[:2], "trainer.max_seconds=0.6")
     more.resume(tmp_path / "last.pt")
-    more.fit(Silent())
+    more.fit(Observer())
     assert more.step > trainer.step
 
 
@@ -119,7 +119,7 @@ def test_fields_that_became_worse_are_not_handed_out(tmp_path, monkeypatch):
     trainer = small(*WAY)
     saved = {}
 
-    class Saver(Silent):
+    class Saver(Observer):
         def evaluated(self, trainer, certificate):
             saved[trainer.step] = {n: t.clone() for n, t in trainer.averaged_fields.state_dict().items()}
 
@@ -246,7 +246,7 @@ def test_what_is_not_finite_is_named_with_the_state_where_it_is(stepper):
     trainer.problem = trainer.batches.problem = Holed()
     before = {n: t.clone() for n, t in trainer.fields.state_dict().items()}
     with pytest.raises(NonFiniteError, match=r"player 'value' .* at x = \[0\.2[3-6].*state cost") as error:
-        trainer.fit(Silent())
+        trainer.fit(Observer())
     assert "\n" not in str(error.value)
     assert trainer.step == 0
     assert all(torch.equal(t, before[n]) for n, t in trainer.fields.state_dict().items())
@@ -283,7 +283,7 @@ def test_weights_that_are_not_finite_are_never_saved(tmp_path):
     with pytest.raises(NonFiniteError, match="weights"):
         trainer.save(tmp_path / "last.pt")
     with pytest.raises(NonFiniteError, match="not finite at any x: the weights of"):
-        trainer.fit(Silent(), tmp_path / "last.pt")
+        trainer.fit(Observer(), tmp_path / "last.pt")
     assert (tmp_path / "last.pt").read_bytes() == good
 
 

@@ -8,7 +8,7 @@ import torch
 from ocp_torch import load_controller
 from ocp_torch.certificate.report import table
 from ocp_torch.problems import Circle, Pendulum, Unicycle
-from ocp_torch.runs.figures import Shown
+from ocp_torch.runs.figures import FieldFigures
 from ocp_torch.runs.frame import frame_of
 from ocp_torch.runs.metrics.trial import metrics, random_starts
 from ocp_torch.runs.pictures.picture import motion
@@ -57,7 +57,9 @@ def test_its_certificate_says_what_part_of_the_time_is_outside(run):
 
 def test_its_figures_have_names_and_units_on_their_axes(run):
     _, trainer = run
-    figures = Shown(trainer.problem, trainer.averaged_fields, trainer.constants, trainer.objective.occupation).figures()
+    figures = FieldFigures(
+        trainer.problem, trainer.averaged_fields, trainer.constants, trainer.objective.occupation
+    ).figures()
     (axis, *_) = figures["value"].axes
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("angle [rad]", "velocity [rad/s]")
     assert axis.get_ylim() == pytest.approx((-10.0, 10.0))

@@ -20,7 +20,7 @@ from ocp_torch.studies.kernel.bernoulli import BernoulliKernel, bernoulli_polyno
 from ocp_torch.studies.kernel.iterations import Iteration, step_sizes
 from ocp_torch.studies.kernel.rules import RULES, Datum
 from ocp_torch.studies.paper.runs import circle
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from support import zoo
 
 
@@ -246,7 +246,7 @@ def test_the_trainer_makes_the_paper_s_steps(method):
     steps = 40
     config = composed("train", [f"experiment=paper_{method}", f"trainer.steps={steps}", "model.modes=12", "seed=5"])
     trainer = build_trainer(config)
-    trainer.fit(Silent())
+    trainer.fit(Observer())
     features = SobolevFeatures(1, modes=12)
     iteration = Iteration(trainer.problem, method, trainer.constants, (5,), features=features)
     iteration.advance(step_sizes(config["optimizer"]["lr"], steps))

@@ -22,7 +22,7 @@ from ocp_torch.studies.kernel.bernoulli import BernoulliKernel
 from ocp_torch.studies.kernel.iterations import Iteration, step_sizes
 from ocp_torch.studies.kernel.rules import RULES, DualRule
 from ocp_torch.studies.paper.runs import circle, truth
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from support import zoo
 
 PROBLEMS = {
@@ -132,7 +132,7 @@ def test_the_trainer_makes_the_same_steps():
     overrides = ["experiment=paper_dual", "trainer.steps=40", "model.modes=12", "seed=5"]
     config = composed("train", [*overrides, "problem.noise=0.01", "model.regularity=3"])
     trainer = build_trainer(config)
-    trainer.fit(Silent())
+    trainer.fit(Observer())
     iteration = Iteration(trainer.problem, "dual", trainer.constants, (5,), features=SobolevFeatures(1, 3, modes=12))
     iteration.advance(step_sizes(config["optimizer"]["lr"], 40))
     theta = iteration.expansions[VALUE].theta[0, :, 0]

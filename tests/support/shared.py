@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch.distributed as dist
 
-from ocp_torch.maths.ranks import joined
+from ocp_torch.compute.processes import joined
 from support.forked import Command, Ended
 
 STORES: list[dist.Store] = []  # one for each run, kept by the tests as torchrun keeps its own

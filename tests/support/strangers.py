@@ -11,7 +11,7 @@ import yaml
 
 from ocp_torch.runs.finish import controller_of
 from ocp_torch.training.checkpoint import MAGIC, SCHEMA, load_checkpoint
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from support.looks import certificate
 from support.small import small
 
@@ -19,7 +19,7 @@ from support.small import small
 def make_run(folder: Path, *way: str) -> Path:
     """A finished run: checkpoint, configuration, certificate, controller."""
     trainer = small(*way)
-    trainer.fit(Silent(), folder / "checkpoints" / "last.pt")
+    trainer.fit(Observer(), folder / "checkpoints" / "last.pt")
     (folder / ".hydra").mkdir()
     (folder / ".hydra" / "config.yaml").write_text(yaml.safe_dump({**trainer.config, "resume": None}))
     (folder / "train.log").write_text("a line\n")

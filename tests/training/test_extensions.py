@@ -12,7 +12,7 @@ from ocp_torch.fields import MODELS
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.runs.run import run_to_end
 from ocp_torch.steppers import STEPPERS, Stepper, StepReport
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from support.bits import differences
 from support.small import SMALL, configured, small, state_of
 
@@ -38,7 +38,7 @@ def test_a_stepper_of_ones_own_trains_averages_and_resumes(monkeypatch, tmp_path
     monkeypatch.setitem(STEPPERS, "alternating", Alternating)
     made = lambda: small("method=pd", "stepper.name=alternating", "trainer.steps=10", "trainer.checkpoint_every=6")
     whole, start = made(), made().fields
-    whole.fit(Silent(), tmp_path / "last.pt")
+    whole.fit(Observer(), tmp_path / "last.pt")
     assert whole.samples == 2 * 16 * 10
     for name, network in whole.fields.networks.items():
         assert differences(network.state_dict(), start.networks[name].state_dict()) != []
@@ -46,7 +46,7 @@ def test_a_stepper_of_ones_own_trains_averages_and_resumes(monkeypatch, tmp_path
     resumed = made()
     resumed.resume(tmp_path / "last-1.pt")
     assert resumed.step == 6
-    resumed.fit(Silent())
+    resumed.fit(Observer())
     assert differences(state_of(resumed), state_of(whole)) == []
 
 

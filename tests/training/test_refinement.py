@@ -11,7 +11,7 @@ from ocp_torch.runs.build import build_trainer
 from ocp_torch.steppers.gauss_newton import Refined
 from ocp_torch.training import refinement
 from ocp_torch.training.budgets import fill
-from ocp_torch.training.observer import Silent
+from ocp_torch.training.observer import Observer
 from ocp_torch.training.stopping import SOLVED, Preempted, Signals
 from support.bits import differences
 from support.small import configured, small, state_of
@@ -58,11 +58,11 @@ def test_both_the_average_and_the_next_round_take_them(halved):
     trainer, plain = small(*LITTLE), small(*LITTLE, "trainer.newton_steps=0", "trainer.rounds=1")
     seen = []
 
-    class Seeing(Silent):
+    class Seeing(Observer):
         def evaluated(self, trainer, certificate):
             seen.append((trainer.step, weights(trainer.averaged_fields)))
 
-    plain.fit(Silent())
+    plain.fit(Observer())
     trainer.fit(Seeing())
     assert len(drawn) == 2
     assert not torch.equal(*drawn)  # each round has states of its own
@@ -75,7 +75,7 @@ def test_both_the_average_and_the_next_round_take_them(halved):
 
 @pytest.mark.nightly
 def test_a_run_goes_on_to_the_same_bits_from_anywhere(halved, tmp_path):
-    class Saving(Silent):
+    class Saving(Observer):
         def stepped(self, trainer, report, log):
             trainer.save(tmp_path / f"{trainer.step}.pt")
 
@@ -87,7 +87,7 @@ def test_a_run_goes_on_to_the_same_bits_from_anywhere(halved, tmp_path):
     for name in ("20", "after", "21"):
         resumed = small(*LITTLE)
         resumed.resume(tmp_path / f"{name}.pt")
-        resumed.fit(Silent())
+        resumed.fit(Observer())
         assert differences(state_of(resumed), state_of(whole)) == [], name
 
 
@@ -96,7 +96,7 @@ def test_those_that_make_the_bound_worse_are_not_taken(halved, monkeypatch):
     bounds = iter((1.0, 2.0))  # of the refined, of the other
     monkeypatch.setattr(refinement, "bound", lambda *_: next(bounds))
     for run in (trainer, plain):
-        run.fit(Silent())
+        run.fit(Observer())
     assert torch.equal(weights(trainer.averaged_fields), weights(plain.averaged_fields))
 
 
@@ -112,7 +112,7 @@ def test_those_that_make_the_bound_worse_are_not_taken(halved, monkeypatch):
 def test_what_ends_them_ends_them_soon_and_they_are_made_anew(halved, how, tmp_path):
     _, stopping = halved
     whole = small(*LITTLE)
-    whole.fit(Silent())
+    whole.fit(Observer())
     trainer, signals = small(*LITTLE), Signals()
 
     def come():
@@ -124,16 +124,16 @@ def test_what_ends_them_ends_them_soon_and_they_are_made_anew(halved, how, tmp_p
 
     stopping.append(come)
     if how == "asked to stop":
-        trainer.fit(Silent(), tmp_path / "last.pt")
+        trainer.fit(Observer(), tmp_path / "last.pt")
     else:
         with pytest.raises(Preempted):
-            trainer.fit(Silent(), tmp_path / "last.pt", signals)
+            trainer.fit(Observer(), tmp_path / "last.pt", signals)
     stopping.clear()
     assert trainer.step == 20
     assert trainer.state.refined == (how == "late")
     resumed = small(*LITTLE)
     resumed.resume(tmp_path / "last.pt")
-    resumed.fit(Silent())
+    resumed.fit(Observer())
     assert differences(state_of(resumed), state_of(whole)) == []
 
 
@@ -141,7 +141,7 @@ def test_they_end_where_a_run_has_no_seconds_left():
     trainer = small(*LITTLE, "trainer.max_seconds=1000")
     trainer.state.step, trainer.state.elapsed = 20, 999.999
     before = weights(trainer.averaged_fields)
-    refinement.refine(trainer, Silent(), None, lambda: False)
+    refinement.refine(trainer, Observer(), None, lambda: False)
     assert not trainer.state.refined
     assert torch.equal(weights(trainer.averaged_fields), before)
 
@@ -208,7 +208,7 @@ def agreeing(trainer, does):
 
 def test_training_ends_once_the_equation_is_solved(solved, tmp_path):
     trainer = agreeing(small(*EARLY), True)
-    assert trainer.fit(Silent(), tmp_path / "last.pt") == SOLVED
+    assert trainer.fit(Observer(), tmp_path / "last.pt") == SOLVED
     assert trainer.step == 7
     assert trainer.samples == 7 * trainer.settings.batch + refinement.COMPARISON_STATES + 4
     assert not trainer.averaged_fields.value.head.weight.any()
@@ -216,15 +216,15 @@ def test_training_ends_once_the_equation_is_solved(solved, tmp_path):
     assert "solve the Hamilton-Jacobi-Bellman equation" in trainer.why_stopped
     resumed = small(*EARLY)
     resumed.resume(tmp_path / "last.pt")
-    assert resumed.fit(Silent()) == SOLVED
+    assert resumed.fit(Observer()) == SOLVED
     assert resumed.step == 7
 
 
 def test_a_resume_that_asks_for_all_steps_makes_them(solved, tmp_path):
-    agreeing(small(*EARLY), True).fit(Silent(), tmp_path / "last.pt")
+    agreeing(small(*EARLY), True).fit(Observer(), tmp_path / "last.pt")
     resumed = small("method=dual", "trainer.newton_steps=0", "trainer.newton_after=0")
     resumed.resume(tmp_path / "last.pt")
-    assert resumed.fit(Silent()) == "steps"
+    assert resumed.fit(Observer()) == "steps"
     assert resumed.step > 7
 
 
@@ -241,7 +241,7 @@ def test_else_training_goes_on_as_if_nothing_had_been_tried(solved, monkeypatch,
         trainer.evaluator.reaches = lambda gap, run: gap > 1e-9
     seen = {trainer: {}, plain: {}}
 
-    class Seeing(Silent):
+    class Seeing(Observer):
         def stepped(self, trainer, report, log):
             seen[trainer][trainer.step] = torch.cat([weights(trainer.fields), weights(trainer.averaged_fields)])
 
@@ -256,7 +256,7 @@ def test_else_training_goes_on_as_if_nothing_had_been_tried(solved, monkeypatch,
 @pytest.mark.parametrize("how", ["a signal", "asked to stop"])
 def test_early_steps_that_are_cut_off_are_made_anew(solved, monkeypatch, how, tmp_path):
     whole = agreeing(small(*EARLY), True)
-    whole.fit(Silent())
+    whole.fit(Observer())
     trainer, signals, exact = agreeing(small(*EARLY), True), Signals(), refinement.refined
 
     def cut(network, residual, draw, steps, enough, stop, worst):
@@ -268,15 +268,15 @@ def test_early_steps_that_are_cut_off_are_made_anew(solved, monkeypatch, how, tm
 
     monkeypatch.setattr(refinement, "refined", cut)
     if how == "asked to stop":
-        trainer.fit(Silent(), tmp_path / "last.pt")
+        trainer.fit(Observer(), tmp_path / "last.pt")
     else:
         with pytest.raises(Preempted):
-            trainer.fit(Silent(), tmp_path / "last.pt", signals)
+            trainer.fit(Observer(), tmp_path / "last.pt", signals)
     assert (trainer.step, trainer.state.refined) == (7, False)
     monkeypatch.setattr(refinement, "refined", exact)
     resumed = agreeing(small(*EARLY), True)
     resumed.resume(tmp_path / "last.pt")
-    resumed.fit(Silent())
+    resumed.fit(Observer())
     assert differences(state_of(resumed), state_of(whole)) == []
 
 
@@ -285,7 +285,7 @@ def test_early_steps_that_are_cut_off_are_made_anew(solved, monkeypatch, how, tm
 def test_smooth_problems_are_solved_early_and_well(dim, more):
     overrides = ("problem=manufactured", f"problem.dim={dim}", f"problem.seed={dim}", "method=dual", *more)
     trainer = build_trainer(configured("trainer.device=cpu", *overrides))
-    assert trainer.fit(Silent()) == SOLVED
+    assert trainer.fit(Observer()) == SOLVED
     x = torch.rand(4096, dim, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     exact = trainer.problem.exact_value(x)
     error = (trainer.averaged_fields.value.double()(x) - exact).abs().mean() / exact.std()
@@ -304,7 +304,7 @@ def test_a_smooth_problem_is_solved_to_many_more_digits():
                 "trainer.device=cpu", "problem=manufactured", "problem.dim=1", "method=dual", "trainer.steps=300", *more
             )
         )
-        trainer.fit(Silent())
+        trainer.fit(Observer())
         with torch.no_grad():
             samples = trainer.problem.independent_samples(4096)
             generator = trainer.objective.generator(samples)

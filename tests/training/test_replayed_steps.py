@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from ocp_torch.maths.replays import CudaRecorder, Replays
+from ocp_torch.compute.cuda_graphs import CudaGraphs, CudaRecorder
 from ocp_torch.problems import PROBLEMS
 from ocp_torch.steppers import advance, optimizer_maker
 from ocp_torch.steppers.soap import ReplayedSOAP
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("quick_composition")
 
 def replays(trainer):
     recorder = CudaRecorder() if trainer.settings.torch_device.type == "cuda" else Rerun()
-    trainer.stepper.replay, trainer.batches.replay = Replays(recorder), Replays(recorder)
+    trainer.stepper.replay, trainer.batches.replay = CudaGraphs(recorder), CudaGraphs(recorder)
     return trainer
 
 
@@ -79,7 +79,7 @@ def test_replayed_soap_is_soap(device):
     start = [torch.randn(6, 4, generator=torch.Generator().manual_seed(1)).double(), torch.ones(5).double()]
     goals = [torch.randn(p.shape, generator=torch.Generator().manual_seed(2)).double().to(device) for p in start]
     ways = []
-    for replay in (None, Replays(CudaRecorder() if device.type == "cuda" else Rerun())):
+    for replay in (None, CudaGraphs(CudaRecorder() if device.type == "cuda" else Rerun())):
         own = [nn.Parameter(p.clone().to(device)) for p in start]
         optimizer = optimizer_maker("soap", 0.1, precondition_frequency=3)(own)
         assert isinstance(optimizer, ReplayedSOAP)

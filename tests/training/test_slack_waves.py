@@ -6,7 +6,7 @@ import torch
 from ocp_torch.fields import VALUE, Fields, PeriodicMLP
 from ocp_torch.problems import Manufactured
 from ocp_torch.runs.build import build_trainer
-from ocp_torch.training.observer import Silent
+from ocp_torch.training.observer import Observer
 from ocp_torch.training.slack_waves import add_waves, missed_waves
 from support.bits import differences
 from support.small import configured, state_of
@@ -98,7 +98,7 @@ def test_a_run_takes_them_and_goes_on_from_any_step_to_the_same_bits(method, mon
     problem = ("problem=manufactured", "problem.dim=2", f"method={method}", "model.waves=24", "model.width=16")
     config = configured("trainer.device=cpu", "trainer.steps=7", "trainer.rounds=1", "trainer.batch=64", *problem)
 
-    class Saving(Silent):
+    class Saving(Observer):
         def stepped(self, trainer, report, log):
             trainer.save(tmp_path / f"{trainer.step}.pt")
 
@@ -111,7 +111,7 @@ def test_a_run_takes_them_and_goes_on_from_any_step_to_the_same_bits(method, mon
     for step in (2, 3, 4):  # before they are sought for the first time, just before, and after
         resumed = build_trainer(config)
         resumed.resume(tmp_path / f"{step}.pt")
-        resumed.fit(Silent())
+        resumed.fit(Observer())
         assert differences(state_of(resumed), state_of(whole)) == []
 
 

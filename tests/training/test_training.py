@@ -14,7 +14,7 @@ from ocp_torch.errors import InputError
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.finish import glimpse
 from ocp_torch.training.checkpoint import load_checkpoint
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from support.bits import differences
 from support.small import METHODS, session, small, state_of
 
@@ -34,7 +34,7 @@ WAYS = [
 ]
 
 
-class Interruption(Silent):
+class Interruption(Observer):
     """Kills a run in the middle of it."""
 
     def __init__(self, step: int) -> None:
@@ -48,7 +48,7 @@ class Interruption(Silent):
 def test_equal_seeds_give_equal_bits_and_another_seed_does_not():
     first, second, other = (small(f"seed={seed}") for seed in (3, 3, 4))
     for trainer in (first, second, other):
-        trainer.fit(Silent())
+        trainer.fit(Observer())
     assert differences(state_of(first), state_of(second)) == []
     changed = differences(state_of(first)["fields"], state_of(other)["fields"])
     assert any(name.endswith("weight") for name in changed)
@@ -59,7 +59,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(way, tmp_path):
     way = (*way, "trainer.steps=12", "trainer.checkpoint_every=5")
     whole = small(*way)
     start = {k: v.clone() for k, v in whole.fields.state_dict().items()}
-    whole.fit(Silent())
+    whole.fit(Observer())
     assert differences(start, whole.fields.state_dict()) != []
     file = tmp_path / "last.pt"
     with pytest.raises(KeyboardInterrupt):
@@ -67,7 +67,7 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(way, tmp_path):
     resumed = small(*way)
     resumed.resume(file)
     assert resumed.step == 5
-    resumed.fit(Silent())
+    resumed.fit(Observer())
     assert resumed.step == whole.step == 12
     assert differences(state_of(resumed), state_of(whole)) == []
 
@@ -94,7 +94,7 @@ def test_no_state_of_a_training_batch_is_ever_used_for_evaluation(sampler, seed,
 
     monkeypatch.setattr(trainer.problem, "state_cost", state_cost)
     monkeypatch.setattr(trained, "fit_closed_loop", fit_closed_loop)
-    trainer.fit(Silent())
+    trainer.fit(Observer())
     phase.append("evaluation")
     trainer.certify(build_certificate_settings(trainer.config))
     assert len(met["training"]) == 20 * 16
@@ -106,7 +106,7 @@ def test_no_state_of_a_training_batch_is_ever_used_for_evaluation(sampler, seed,
 def test_looking_at_the_bounds_on_the_way_changes_nothing():
     once, often = small(), small("trainer.evaluate_every=10")
     for trainer in (once, often):
-        trainer.fit(Silent())
+        trainer.fit(Observer())
     changed = differences(state_of(once), state_of(often))
     assert all(name.startswith("/watch/") for name in changed), changed
 
@@ -123,7 +123,7 @@ def test_a_run_that_may_stop_at_a_look_has_one_on_the_way():
 
 @pytest.mark.nightly
 def test_a_round_ends_with_a_look_but_the_last_one_which_a_certificate_follows():
-    class Looks(Silent):
+    class Looks(Observer):
         def __init__(self):
             self.at = []
 
@@ -304,7 +304,7 @@ def test_a_run_that_diverges_says_so_and_never_saves_what_is_not_finite(tmp_path
 
 def test_a_checkpoint_that_cannot_be_read_is_refused_in_one_sentence(tmp_path):
     file = tmp_path / "last.pt"
-    small("trainer.steps=2").fit(Silent(), file)
+    small("trainer.steps=2").fit(Observer(), file)
     whole = file.read_bytes()
     torch.save({"weights": torch.zeros(2)}, tmp_path / "foreign.pt")
     broken = [b"", whole[:1000], whole[: len(whole) // 2], b"PK" + bytes(500), (tmp_path / "foreign.pt").read_bytes()]
@@ -319,7 +319,7 @@ def test_a_checkpoint_that_cannot_be_read_is_refused_in_one_sentence(tmp_path):
 
 def test_one_flipped_bit_in_a_checkpoint_is_noticed(tmp_path):
     file = tmp_path / "last.pt"
-    small("method=dual", "trainer.steps=2").fit(Silent(), file)
+    small("method=dual", "trainer.steps=2").fit(Observer(), file)
     whole = file.read_bytes()
     for position in range(0, len(whole), 101):
         damaged = bytearray(whole)

@@ -25,7 +25,7 @@ from ocp_torch.problems import PROBLEMS
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.runs.run import run_to_end
 from ocp_torch.training import evaluator
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 from ocp_torch.training.warm_start.grid import GridValues
 from ocp_torch.training.warm_start.iteration import GRADIENT_LENGTH, ValueIteration
 from ocp_torch.training.warm_start.pieces import Trajectories, lambda_returns, roll
@@ -118,7 +118,7 @@ def test_returns_along_noisy_pieces_have_the_value_as_their_mean(problem):
     assert (off.mean(dim=1).abs() < 4.0 * se + 0.005 * float(ran.values[0].std())).all()
 
 
-class Stop(Silent):
+class Stop(Observer):
     """Kills a run in the middle of its warm start, a round after a trial."""
 
     def warmed(self, trainer, looked):
@@ -138,7 +138,7 @@ ON_A_GRID = (*SWING, "method=dual", "warm_start.rounds=42")
 def test_a_run_that_is_killed_in_its_warm_start_goes_on_to_the_same_bits(way, tmp_path):
     way = (*WARM, *way, "trainer.steps=3")
     whole = small(*way)
-    whole.fit(Silent())
+    whole.fit(Observer())
     assert whole.state.warm.done
     assert whole.step == 3
     with pytest.raises(KeyboardInterrupt):
@@ -146,7 +146,7 @@ def test_a_run_that_is_killed_in_its_warm_start_goes_on_to_the_same_bits(way, tm
     resumed = small(*way)
     resumed.resume(tmp_path / "last.pt")
     assert (resumed.state.warm.round, resumed.fresh) == (resumed.state.warm.source.trial_every, False)
-    resumed.fit(Silent(), tmp_path / "last.pt")
+    resumed.fit(Observer(), tmp_path / "last.pt")
     assert differences(state_of(resumed), state_of(whole)) == []
     again = small(*way)
     again.resume(tmp_path / "last.pt")
@@ -239,7 +239,7 @@ def test_auto_stays_out_where_mass_cannot_gather_and_changes_no_bit_there():
     before = copy.deepcopy(configured(*SMALL))
     del before["warm_start"]  # as in runs from before there was one
     for trainer in (*runs, older := build_trainer(before)):
-        trainer.fit(Silent())
+        trainer.fit(Observer())
         assert trainer.state.warm is None
     assert differences(state_of(runs[0]), state_of(runs[1])) == differences(state_of(runs[0]), state_of(older)) == []
     auto = lambda *way: small(*way, "method=dual", "warm_start.mode=auto").state.warm

@@ -19,7 +19,7 @@ from ocp_torch.certificate.contexts.fields import FieldsContext, in_float64
 from ocp_torch.certificate.statistics.estimate import Estimate, starting_level, starting_mean
 from ocp_torch.certificate.statistics.tails import widened
 from ocp_torch.certificate.upper.multiples import best_multiples, terms_on
-from ocp_torch.certificate.upper.policy_evaluation import Drawn, fit_closed_loop
+from ocp_torch.certificate.upper.policy_evaluation import FixedPool, fit_closed_loop
 from ocp_torch.certificate.upper.recorded import RecordedFit, closed_loop_samples, highest_occupation
 from ocp_torch.control.policies import NETWORK
 from ocp_torch.maths.seeds import Branch, derive_seed
@@ -142,7 +142,7 @@ def fit_recorded(context: RecordedContext, kind: str) -> RecordedFit:
     policy, rough = (context.policies_of(fields)[kind] for fields in (context.fields, trained.fields))
     like = next(trained.fields.parameters())
     training = closed_loop_samples(problem.training.to(like), rough, cost)
-    pool = Drawn(training, derive_seed(seed, Branch.POLICY_EVALUATION, 2))
+    pool = FixedPool(training, derive_seed(seed, Branch.POLICY_EVALUATION, 2))
     fitted = in_float64(fit_closed_loop(problem, rough, trained.fields, trained.network, constants, stage, seed, pool))
     value = context.value if context.value is not None else fitted.value
     loops = [closed_loop_samples(samples, policy, cost) for samples in context.sets]

@@ -14,8 +14,8 @@ from ocp_torch.certificate.lower.mollified import mollified_shift
 from ocp_torch.certificate.lower.shifted import Shift, highest
 from ocp_torch.certificate.lower.slack import SlackParts
 from ocp_torch.certificate.lower.tightened import tightened
+from ocp_torch.compute.background import BackgroundResult
 from ocp_torch.fields.subsolution import Subsolution
-from ocp_torch.maths.ahead import Ahead
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
@@ -27,7 +27,7 @@ NOISY_LEAST_PROMISE = 0.005
 LARGEST_PART = 0.01  # of the torus, with the largest slacks: their mean stands for the supremum in that promise
 
 
-class Found(NamedTuple):
+class BestShift(NamedTuple):
     """The best ``shift``, and the ``subsolution`` that it is made of, `None` where that is `V`."""
 
     shift: Shift
@@ -89,13 +89,13 @@ class SampledValue:
             self._best.stop()
 
     @cached_property
-    def _best(self) -> Ahead[Found]:
-        return Ahead(self._found())
+    def _best(self) -> BackgroundResult[BestShift]:
+        return BackgroundResult(self._found())
 
     @property
     def tightened(self) -> Subsolution | None:
         """`V` trained on for its bound; `None` where that promises too little."""
-        return Ahead(self._trained_on()).answer()
+        return BackgroundResult(self._trained_on()).answer()
 
     def _trained_on(self) -> Generator[None, None, Subsolution | None]:
         if not worth(self.own, NOISY_LEAST_PROMISE if self.problem.noisy else LEAST_PROMISE):
@@ -103,9 +103,9 @@ class SampledValue:
         batch = len(self.sets[0])  # states a step: a small certificate trains on few
         return (yield from tightened(self.problem, self.value, self.seed, batch, self.steps))
 
-    def _found(self) -> Generator[None, None, Found]:
+    def _found(self) -> Generator[None, None, BestShift]:
         if not self.search:
-            return Found(self.own)
+            return BestShift(self.own)
         best, W = self.own, self.kept
         if W is None:
             W = yield from self._trained_on()
@@ -113,7 +113,7 @@ class SampledValue:
             beside = [*self.own.beside, *([self.problem.samples(W.worst, divergences=False)] if len(W.worst) else [])]
             best = highest([self.own, replace(self.own, value=W.network, name="V tightened", beside=beside)])
         used = None if best is self.own else W
-        return Found(best if self.problem.noisy else mollified_shift(best), used)
+        return BestShift(best if self.problem.noisy else mollified_shift(best), used)
 
 
 def worth(shift: Shift, least: float) -> bool:

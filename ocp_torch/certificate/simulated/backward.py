@@ -6,9 +6,9 @@ from typing import cast
 import torch
 from torch import Tensor
 
+from ocp_torch.compute.threads import in_pieces
 from ocp_torch.control.policies import Policy, ValuePolicy, is_even
 from ocp_torch.maths.brownian import Grid, discounted, increments, path_integral
-from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.runge_kutta import Dynamics, discounted_integral
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.sums import summed

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ocp_torch.certificate.simulated.loops import HeldLoop
 from ocp_torch.certificate.statistics.estimate import Estimate
-from ocp_torch.maths.cores import in_pieces
+from ocp_torch.compute.threads import in_pieces
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.runge_kutta import (
     AUDIT_FACTOR,

@@ -12,8 +12,8 @@ from ocp_torch.certificate.simulated.held import held_integrals
 from ocp_torch.certificate.simulated.loops import FeedbackLoop, HeldLoop, Loop, Sliding
 from ocp_torch.certificate.simulated.steps import Steps
 from ocp_torch.certificate.statistics.estimate import Estimate
+from ocp_torch.compute.threads import in_pieces
 from ocp_torch.maths.brownian import Grid, Multilevel, at_random_times, discounted
-from ocp_torch.maths.cores import in_pieces
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.runge_kutta import (
     AUDITED,

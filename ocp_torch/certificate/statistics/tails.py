@@ -92,14 +92,14 @@ def widened(estimate: Estimate, contributions: list[Tensor]) -> Estimate:
     return replace(estimate, bias=(estimate.bias or 0.0) + rare) if rare > 0.0 else estimate
 
 
-class Judged(Protocol):
+class HasContributions(Protocol):
     """A result with the weighted integrands per set of each of its means, as parts of the answer."""
 
     @property
     def contributions(self) -> list[list[Tensor]]: ...
 
 
-R = TypeVar("R", bound=Judged)
+R = TypeVar("R", bound=HasContributions)
 
 
 def sharpened(evaluate: Callable[[list[Samples]], R], problem: Problem, sets: list[Samples], seed: int) -> R:

@@ -84,7 +84,7 @@ def spread(sigma: Tensor, V: Jet) -> Tensor:
     return 0.5 * pull_back(sigma, V.gradient).square().sum(-1)
 
 
-class Met(NamedTuple):
+class SampledSlack(NamedTuple):
     """States ``(N, d)``, and there `V`, its slack, `L^u V / rho` and its `spread` over `rho`, each ``(N,)``."""
 
     x: Tensor
@@ -94,7 +94,7 @@ class Met(NamedTuple):
     spread: Tensor
 
     @classmethod
-    def at(cls, loop: Generator, value: Field) -> "Met":
+    def at(cls, loop: Generator, value: Field) -> "SampledSlack":
         samples, V = loop.data, loop.chunked_jet(value)
         moved, zero = loop.transport(V), torch.zeros_like(V.value)
         varied = zero if samples.noise is None else spread(samples.noise, V) / loop.rho
@@ -119,7 +119,7 @@ class LoweredSlack:
         self, loop: ClosedLoop, value: Field, samples: Samples, odd: Tensor | None = None, sought: Peaks | None = None
     ) -> None:
         self.loop, self.value, self.samples = loop, value, samples
-        self.sampled = self.met = Met.at(Generator.of(loop, samples), value)
+        self.sampled = self.met = SampledSlack.at(Generator.of(loop, samples), value)
         self.sought = sought or Peaks(samples.x[:0], 0)
         self.initial = integral(samples, self.sampled.v * samples.mu0)
         low, high = (float(v) for v in self.sampled.v.aminmax())
@@ -132,7 +132,7 @@ class LoweredSlack:
     def _meet(self, x: Tensor) -> None:
         """Include the states ``x`` ``(K, d)`` in the suprema from now on."""
         there = Generator.of(self.loop, Samples.of(self.loop, x, divergences=False))
-        self.met = Met(*map(torch.cat, zip(self.met, Met.at(there, self.value), strict=True)))
+        self.met = SampledSlack(*map(torch.cat, zip(self.met, SampledSlack.at(there, self.value), strict=True)))
 
     @property
     def unit(self) -> float:

@@ -73,7 +73,7 @@ def fit_closed_loop(
     constants: Constants,
     settings: StageSettings,
     seed: int,
-    pool: "Pool | Drawn | None" = None,
+    pool: "Pool | FixedPool | None" = None,
 ) -> Fields:
     """Fit `log mu^u`, and `V^u` where ``fields`` hold no `V`, to the closed loop of ``policy``; return the fitted fields.
 
@@ -115,7 +115,7 @@ class ClosedLoopFit:
         loop: ClosedLoop,
         start: Fields,
         value: Field | None,
-        pool: "Pool | Drawn",
+        pool: "Pool | FixedPool",
         constants: Constants,
         settings: StageSettings,
     ) -> None:
@@ -196,7 +196,7 @@ class Pool:
         return self.samples.take(index)
 
 
-class Drawn:
+class FixedPool:
     """A fixed set of samples that is drawn from with replacement: the `Pool` of a closed loop that cannot be sampled anew."""
 
     def __init__(self, samples: Samples, seed: int) -> None:

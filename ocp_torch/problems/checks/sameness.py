@@ -7,8 +7,8 @@ import time
 import torch
 from torch import Tensor
 
+from ocp_torch.compute.threads import CHUNK, cores, side_by_side
 from ocp_torch.errors import ProblemError
-from ocp_torch.maths.cores import CHUNK, cores, side_by_side
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.blame import words
 from ocp_torch.problems.checks.functions import Functions

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ocp_torch.problems.placed import Placed
+from ocp_torch.problems.device_constants import DeviceConstants
 
 TURN = 2.0 * math.pi
 # Amplitude of an entry of a matrix, relative to its mean: below 1, so that no entry changes its sign.
@@ -18,7 +18,7 @@ MOST_COSINES = 2**18
 
 
 @dataclass(frozen=True)
-class TrigonometricPolynomial(Placed):
+class TrigonometricPolynomial(DeviceConstants):
     """`p(x) = c + sum_j b_j cos(2 pi k_j . x + theta_j)` with integer wave vectors `k_j != 0`.
 
     ``waves`` ``(J, d)``, ``amplitudes`` and ``phases`` ``(J,)``, all float64; evaluated in the precision of `x`.
@@ -88,7 +88,7 @@ class TrigonometricPolynomial(Placed):
         return torch.einsum("nj,ji,jk->nik", curvatures, waves, waves)
 
 
-class TrigonometricField(Placed):
+class TrigonometricField(DeviceConstants):
     """A vector field whose ``components`` are polynomials of equally many terms."""
 
     def __init__(self, components: list[TrigonometricPolynomial]) -> None:
@@ -139,7 +139,7 @@ def _random_waves(dim: int, interaction: int, count: int, generator: torch.Gener
     return waves
 
 
-class WavyMatrix(Placed):
+class WavyMatrix(DeviceConstants):
     r"""`B_ik(x) = M_ik (1 + DEPTH cos 2 pi (x_c + phase))` with a coordinate `c` and a phase for each entry, or `B = M`.
 
     ``mean`` is `M` ``(d, m)``; ``phase`` ``(d, m)`` in turns; ``coordinate`` ``(d, m)``; without ``varies`` it is constant.

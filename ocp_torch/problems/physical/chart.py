@@ -5,8 +5,8 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError
 from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.problems.device_constants import DeviceConstants
 from ocp_torch.problems.physical.coordinates import Coordinate, Interval
-from ocp_torch.problems.placed import Placed
 
 # Coordinates of a state that a sentence shows.
 MOST_SHOWN = 8
@@ -25,7 +25,7 @@ def smooth_step(z: Tensor) -> Tensor:
     return (t**3 * (10.0 - 15.0 * t + 6.0 * t**2)).clamp_max(1.0)
 
 
-class Chart(Placed):
+class Chart(DeviceConstants):
     """The map `x_i = (s_i - centre_i) / length_i` mod 1 of ``coordinates``; an interval's seam is at `x_i = 1/2`. Physical
     states begin at ``start``, in turns from the centre."""
 

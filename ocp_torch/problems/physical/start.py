@@ -11,9 +11,9 @@ from ocp_torch.errors import InputError, nearest, require_numbers, shown
 from ocp_torch.maths.mixture_fit import FITTED_PART, fitted_mixture
 from ocp_torch.maths.mixtures import WIDEST, Mixture
 from ocp_torch.maths.seeds import Branch, derive_seed
+from ocp_torch.problems.device_constants import DeviceConstants
 from ocp_torch.problems.physical.chart import Chart, smooth_step
 from ocp_torch.problems.physical.coordinates import Interval
-from ocp_torch.problems.placed import Placed
 
 # Part of a range over which a density rises at either end of it: a jump would have no divergence.
 EDGE = 0.1
@@ -65,7 +65,7 @@ def start_density(chart: Chart, start: object) -> Density:
     )
 
 
-class _Ranges(Placed):
+class _Ranges(DeviceConstants):
     def __init__(self, chart: Chart, ranges: Mapping) -> None:
         names = [c.name for c in chart.coordinates]
         for name in ranges:
@@ -105,7 +105,7 @@ class _Ranges(Placed):
         return _normal(self.chart, self.middle.unsqueeze(0), widths)
 
 
-class _Bumps(Placed):
+class _Bumps(DeviceConstants):
     def __init__(self, chart: Chart, points: Points) -> None:
         coordinates, states = chart.coordinates, points.states
         spread = require_numbers("the spread of Points", _listed(points.spread), len(coordinates), above=0.0)

@@ -21,7 +21,7 @@ from ocp_torch.problems.constants import Constants
 from ocp_torch.runs.build import build_certificate_settings, build_trainer
 from ocp_torch.studies.benchmark.measure import Curve, Judge, Point, due
 from ocp_torch.studies.kernel.iterations import Iteration, step_sizes
-from ocp_torch.training.monitor import Silent
+from ocp_torch.training.monitor import Observer
 
 OCCUPATION = {"dual": None, "primal": policies.CLOSED, "pd": policies.SADDLE}
 # The paper's schedules: constant for one player, 25 % less every 20,000 steps for two.
@@ -83,7 +83,7 @@ class KernelContender:
         return Curve(self.name, seed, points, certified.gap["certified"], time.process_time() - started)
 
 
-class Recorder(Silent):
+class Recorder(Observer):
     """Keeps the averaged fields at growing sample counts, with the CPU seconds of training until then."""
 
     def __init__(self) -> None:

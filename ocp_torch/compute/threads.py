@@ -15,7 +15,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from ocp_torch.maths.ranks import here
+from ocp_torch.compute.processes import here
 
 T = TypeVar("T")
 S = TypeVar("S")

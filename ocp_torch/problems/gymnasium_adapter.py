@@ -5,7 +5,7 @@ import numpy as np
 from ocp_torch.errors import InputError
 
 
-class Played:
+class GymnasiumAdapter:
     """Override both methods for the Gymnasium environments a problem is a model of; those of this package need neither."""
 
     def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:

@@ -5,8 +5,8 @@ import threading
 import pytest
 import torch
 
-from ocp_torch.maths import cores
-from ocp_torch.maths.cores import CHUNK, in_pieces, parted, side_by_side
+from ocp_torch.compute import threads as cores
+from ocp_torch.compute.threads import CHUNK, in_pieces, parted, side_by_side
 
 
 @pytest.mark.parametrize(("count", "together"), [(1, True), (2, True), (4, True), (4, False)])

@@ -2,7 +2,7 @@
 
 The first writes, prints and decides; the others take their shares of each batch, and of what the first has to do while they
 wait for it. Collectives are for the main thread alone: two threads would begin theirs in another order on every process.
-Without torchrun a process is `Alone`, at no cost.
+Without torchrun a process is `SingleProcess`, at no cost.
 """
 
 import os
@@ -17,8 +17,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from ocp_torch.compute.packing import packed, unpacked
 from ocp_torch.errors import InputError, ProblemError
-from ocp_torch.maths.packing import packed, unpacked
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -35,11 +35,11 @@ class LostError(InputError):
     """Another process of the run ended without a word, or does not answer."""
 
 
-class Left(BaseException):
+class FirstProcessLeft(BaseException):
     """The first process needs the others no more. No `Exception`: nothing on the way may swallow it."""
 
 
-class Alone:
+class SingleProcess:
     """A run's only process."""
 
     first, size, share = True, 1, slice(None)
@@ -78,7 +78,7 @@ class Alone:
 
     def alike(self, work: Callable[[], T]) -> T:
         """The result of ``work`` here, once all processes have done it; where it fails in any, the first one raises that
-        error, and the others raise `Left`."""
+        error, and the others raise `FirstProcessLeft`."""
         return work()
 
     def fail(self, sentence: str) -> None:
@@ -88,9 +88,9 @@ class Alone:
         """Part from the other processes for good, and end their waiting."""
 
 
-class Ranks(Alone):
-    """One of several processes. Joining, and each collective, raise `LostError` where others are lost, and `Left` where the
-    first one left."""
+class ProcessGroup(SingleProcess):
+    """One of several processes. Joining, and each collective, raise `LostError` where others are lost, and `FirstProcessLeft`
+    where the first one left."""
 
     def __init__(self, store: Any, rank: int, size: int) -> None:
         self.first, self.size, self.share = rank == 0, size, slice(rank, None, size)
@@ -194,7 +194,7 @@ class Ranks(Alone):
             error = raised
         failed = [told for told in self.gathered(None if error is None else str(error)) if told is not None]
         if failed:
-            raise (error or InputError(failed[0])) if self.first else Left()
+            raise (error or InputError(failed[0])) if self.first else FirstProcessLeft()
         return made[0]
 
     def fail(self, sentence: str) -> None:
@@ -219,7 +219,7 @@ class Ranks(Alone):
         try:
             if not self.first:
                 self._store.wait([LEFT_KEY], FAREWELL_TIMEOUT)
-                return Left()
+                return FirstProcessLeft()
             if self._store.check([FAILED_KEY]):
                 return ProblemError(self._store.get(FAILED_KEY).decode())
         except RuntimeError:  # it is not so, or torchrun itself is gone
@@ -233,16 +233,16 @@ class Ranks(Alone):
 
 
 @cache
-def joined() -> Alone:
+def joined() -> SingleProcess:
     """This process among those that torchrun started with it, each with a GPU of its own where there are enough. Raises as
-    `Ranks` does."""
+    `ProcessGroup` does."""
     if "TORCHELASTIC_RUN_ID" not in os.environ or int(os.environ.get("WORLD_SIZE", "1")) < 2:
-        return Alone()
+        return SingleProcess()
     if torch.cuda.is_available():
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]) % torch.cuda.device_count())
-    return Ranks(*next(dist.rendezvous("env://", timeout=timedelta(minutes=5))))
+    return ProcessGroup(*next(dist.rendezvous("env://", timeout=timedelta(minutes=5))))
 
 
-def here() -> Alone:
-    """This process as `joined` gave it, else `Alone`: a distributed program that only loads a controller does not join."""
-    return joined() if joined.cache_info().currsize else Alone()
+def here() -> SingleProcess:
+    """This process as `joined` gave it, else `SingleProcess`: a program that only loads a controller does not join others."""
+    return joined() if joined.cache_info().currsize else SingleProcess()

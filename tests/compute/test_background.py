@@ -6,8 +6,8 @@ import time
 import pytest
 import torch
 
-from ocp_torch.maths import ahead
-from ocp_torch.maths.ahead import Ahead
+from ocp_torch.compute import background as ahead
+from ocp_torch.compute.background import BackgroundResult
 
 DEADLINE = 60.0
 
@@ -25,7 +25,7 @@ def counting(count: int, done: list, gate: threading.Event | None = None):
 def test_the_answer_is_that_of_the_work_wherever_it_is_done(monkeypatch, count):
     monkeypatch.setattr(ahead, "cores", lambda: count)
     done: list = []
-    work = Ahead(counting(5, done))
+    work = BackgroundResult(counting(5, done))
     work.begin()
     assert work.answer() == work.answer() == 10
     threads = {thread for _, thread in done}
@@ -41,14 +41,14 @@ def test_a_sum_begun_before_is_bitwise_that_of_whoever_asked(monkeypatch):
         return left.T @ right
 
     monkeypatch.setattr(ahead, "cores", lambda: 2)
-    work = Ahead(product())
+    work = BackgroundResult(product())
     work.begin()
     assert torch.equal(work.answer(), left.T @ right)
 
 
 def test_without_a_beginning_whoever_asks_does_the_work():
     done: list = []
-    assert Ahead(counting(3, done)).answer() == 3
+    assert BackgroundResult(counting(3, done)).answer() == 3
     assert {thread for _, thread in done} == {threading.current_thread()}
 
 
@@ -59,7 +59,7 @@ def test_an_error_reaches_whoever_asks(monkeypatch):
         yield
         raise ArithmeticError("no number")
 
-    work = Ahead(failing())
+    work = BackgroundResult(failing())
     work.begin()
     for _ in range(2):
         with pytest.raises(ArithmeticError, match="no number"):
@@ -70,7 +70,7 @@ def test_what_is_stopped_ends_after_its_piece_and_may_be_asked_for_later(monkeyp
     monkeypatch.setattr(ahead, "cores", lambda: 2)
     done: list = []
     gate = threading.Event()
-    work = Ahead(counting(1000, done, gate))
+    work = BackgroundResult(counting(1000, done, gate))
     work.begin()
     opener = threading.Timer(0.05, gate.set)
     opener.start()

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 
-class Placed:
+class DeviceConstants:
     """Keeps a copy of its constant tensors for every precision and device that they were asked for in."""
 
     def _like(self, x: Tensor, name: str, constant: Tensor) -> Tensor:

@@ -1,7 +1,8 @@
 """What a computation asks of the numbers it computes with, and the constants it makes: noted, to run it again without either.
 
 A CUDA graph runs operators alone: no number can be looked at on the way, and nothing be brought from the host. So a function
-that is to be captured is called once while both are noted (`Noted`), and captured while it is told what was noted (`Told`).
+that is to be captured is called once while both are noted (`DecisionRecorder`), and captured while it is told what was noted
+(`DecisionReplayer`).
 """
 
 import contextvars
@@ -23,7 +24,7 @@ def decided(asked: Tensor) -> int:
     return int(asked) if listener is None else listener.answer(asked)
 
 
-class Noted(TorchFunctionMode):
+class DecisionRecorder(TorchFunctionMode):
     """A context within which answers and constants are noted, in their order."""
 
     def __init__(self) -> None:
@@ -42,10 +43,10 @@ class Noted(TorchFunctionMode):
         return found
 
 
-class Told(TorchFunctionMode):
+class DecisionReplayer(TorchFunctionMode):
     """A context within which answers and constants are those that were ``noted``; ``questions`` are kept, to be checked."""
 
-    def __init__(self, noted: Noted) -> None:
+    def __init__(self, noted: DecisionRecorder) -> None:
         super().__init__()
         self.answers, self.constants = iter(noted.answers), iter(noted.constants)
         self.questions: list[Tensor] = []
@@ -60,7 +61,9 @@ class Told(TorchFunctionMode):
         return func(*args, **(kwargs or {}))
 
 
-_listener: contextvars.ContextVar[Noted | Told | None] = contextvars.ContextVar("listener", default=None)
+_listener: contextvars.ContextVar[DecisionRecorder | DecisionReplayer | None] = contextvars.ContextVar(
+    "listener", default=None
+)
 
 
 @contextmanager

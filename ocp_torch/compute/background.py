@@ -6,12 +6,12 @@ from typing import Generic, TypeVar
 
 import torch
 
-from ocp_torch.maths.cores import cores
+from ocp_torch.compute.threads import cores
 
 T = TypeVar("T")
 
 
-class Ahead(Generic[T]):
+class BackgroundResult(Generic[T]):
     """The value that the generator ``work`` returns, whose yields part it into pieces after which it can be stopped.
 
     A call of `answer` does the work, unless it was begun before in a thread of its own. The answer is the same: ``work`` must

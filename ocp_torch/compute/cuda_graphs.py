@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ocp_torch.compute.decisions import DecisionRecorder, DecisionReplayer, listening
 from ocp_torch.errors import first_line
-from ocp_torch.maths.decisions import Noted, Told, listening
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +34,7 @@ CHANGED = (
 )
 
 
-class Called:
+class Eager:
     """Calls functions as they are."""
 
     captures = False
@@ -48,7 +48,7 @@ class Called:
         """``value``, which changes from call to call, as an input of a function."""
         return value
 
-    def fresh(self) -> "Called":
+    def fresh(self) -> "Eager":
         """A new one of this kind."""
         return self
 
@@ -56,7 +56,7 @@ class Called:
         """Drop all captures, since what they read has been replaced."""
 
 
-class Replays(Called):
+class CudaGraphs(Eager):
     """Captures functions at their third call. Inputs are copied to where the capture found them, unless they are there; what
     is returned stays in place, and is overwritten by the next call. A function that cannot be captured is called."""
 
@@ -73,16 +73,16 @@ class Replays(Called):
     def number(self, value: float, like: Tensor) -> Tensor:
         return torch.full((), value, dtype=like.dtype, device=like.device)
 
-    def fresh(self) -> "Replays":
-        return Replays(self.recorder)
+    def fresh(self) -> "CudaGraphs":
+        return CudaGraphs(self.recorder)
 
     def forget(self) -> None:
         self._functions.clear()
 
 
-def replays_on(device: torch.device) -> Called:
-    """`Replays` where ``device`` is a GPU, which alone has graphs; else `Called`."""
-    return Replays() if device.type == "cuda" else Called()
+def replays_on(device: torch.device) -> Eager:
+    """`CudaGraphs` where ``device`` is a GPU, which alone has graphs; else `Eager`."""
+    return CudaGraphs() if device.type == "cuda" else Eager()
 
 
 class _Replayed:
@@ -117,7 +117,7 @@ class _Replayed:
         return found
 
     def _called(self, function: Function, inputs: Columns) -> list[Tensor | None]:
-        noted = Noted()
+        noted = DecisionRecorder()
         with listening(noted):
             found = self.recorder.call(lambda: list(function(*inputs)))
         self.noted = noted
@@ -128,7 +128,7 @@ class _Replayed:
         self.captures, self.replays, self.inputs = self.captures + 1, 0, list(inputs)
 
         def whole() -> list[Tensor | None]:
-            told = Told(self.noted)
+            told = DecisionReplayer(self.noted)
             with listening(told):
                 found = list(function(*self.inputs))
             return [*found, torch.stack(told.questions) if told.questions else None]

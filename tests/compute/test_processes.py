@@ -8,18 +8,18 @@ import torch
 import torch.distributed as dist
 
 from ocp_torch.certificate.simulated.performance import Simulation
+from ocp_torch.compute.processes import FirstProcessLeft, LostError, SingleProcess, here, joined
+from ocp_torch.compute.threads import cores, in_pieces, spread
 from ocp_torch.control.policies import ValuePolicy
 from ocp_torch.errors import InputError, ProblemError
-from ocp_torch.maths.cores import cores, in_pieces, spread
 from ocp_torch.maths.jets import chunked_jet
-from ocp_torch.maths.ranks import Alone, Left, LostError, here, joined
 from ocp_torch.problems import Circle
 from support.zoo import rough_network
 
 
 def test_a_process_alone_gives_back_what_it_is_given():
     alone, tensors = joined(), [torch.ones(2), torch.zeros(())]
-    assert type(alone) is Alone
+    assert type(alone) is SingleProcess
     assert all(mean is given for mean, given in zip(alone.mean(tensors), tensors, strict=True))
     assert alone.agree([True, False]) == [True, False]
     assert alone.from_first(lambda: 3) == alone.alike(lambda: 3) == 3
@@ -33,14 +33,14 @@ def test_whoever_has_not_joined_is_alone_in_a_distributed_program_too(monkeypatc
     joined.cache_clear()
     try:
         assert cores() == len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else cores() >= 1
-        assert type(here()) is Alone
+        assert type(here()) is SingleProcess
         assert not dist.is_initialized()
     finally:
         joined.cache_clear()
 
 
 def test_only_equal_shares_are_shares():
-    alone = Alone()
+    alone = SingleProcess()
     alone.size = 3
     alone.require_shares("trainer.batch", 9)
     with pytest.raises(InputError, match="trainer.batch is 10, which 3 processes cannot share equally"):
@@ -98,7 +98,7 @@ def test_who_fails_is_told_of_by_the_first_and_the_others_leave():
     def play(ranks, rank):
         ranks.fail("f is wrong.") if rank == 1 else step(ranks)
 
-    assert parted(3, play) == [ProblemError.__name__, "None", Left.__name__]
+    assert parted(3, play) == [ProblemError.__name__, "None", FirstProcessLeft.__name__]
 
 
 @pytest.mark.nightly
@@ -107,7 +107,7 @@ def test_a_death_is_known_to_all_at_once(dies):
     def play(ranks, rank):
         os._exit(1) if rank == dies else step(ranks)
 
-    others = [LostError.__name__] * 2 if dies == 0 else [LostError.__name__, Left.__name__]
+    others = [LostError.__name__] * 2 if dies == 0 else [LostError.__name__, FirstProcessLeft.__name__]
     assert [told for rank, told in enumerate(parted(3, play)) if rank != dies] == others
 
 
@@ -115,7 +115,7 @@ def test_what_is_wrong_in_one_process_alone_is_raised_by_the_first():
     def play(ranks, rank):
         return ranks.alike(lambda: rank if rank != 1 else int("one"))
 
-    assert parted(2, play) == [InputError.__name__, Left.__name__]
+    assert parted(2, play) == [InputError.__name__, FirstProcessLeft.__name__]
 
 
 def test_those_that_wait_for_the_first_take_their_share_of_its_pieces():

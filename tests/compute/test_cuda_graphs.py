@@ -1,13 +1,13 @@
-"""Replays of functions; where there is no GPU, of functions that are run again."""
+"""CudaGraphs of functions; where there is no GPU, of functions that are run again."""
 
 import math
 
 import pytest
 import torch
 
-from ocp_torch.maths import replays
-from ocp_torch.maths.decisions import decided
-from ocp_torch.maths.replays import CudaRecorder, Replays
+from ocp_torch.compute import cuda_graphs as replays
+from ocp_torch.compute.cuda_graphs import CudaGraphs, CudaRecorder
+from ocp_torch.compute.decisions import decided
 from support.rerun import Rerun
 from support.waiting import Waits
 
@@ -17,7 +17,7 @@ def recorder(device):
 
 
 def test_from_the_third_call_on_it_is_replayed_into_the_same_tensors(device):
-    replay = Replays(recorder(device))
+    replay = CudaGraphs(recorder(device))
     found = [
         replay("square", lambda x, _: [x * x, None], [torch.full((3,), float(k), device=device), None])
         for k in range(6)
@@ -30,7 +30,7 @@ def test_from_the_third_call_on_it_is_replayed_into_the_same_tensors(device):
 
 def test_captures_are_of_one_function_and_one_form_of_inputs():
     counted = Rerun()
-    replay = Replays(counted)
+    replay = CudaGraphs(counted)
     for _ in range(5):
         assert float(replay("a", lambda x: [x.sum()], [torch.ones(2)])[0]) == 2.0
         assert float(replay("a", lambda x: [x.sum()], [torch.ones(3)])[0]) == 3.0
@@ -42,7 +42,7 @@ def test_captures_are_of_one_function_and_one_form_of_inputs():
 
 
 def test_what_is_expanded_is_placed_once(device):
-    replay = Replays(recorder(device))
+    replay = CudaGraphs(recorder(device))
     column = lambda k: torch.full((1, 2), float(k), device=device).expand(5, 2)
     for k in range(5):
         assert float(replay("sum", lambda x: [x.sum()], [column(k)])[0]) == 10.0 * k
@@ -50,7 +50,7 @@ def test_what_is_expanded_is_placed_once(device):
 
 def test_a_course_that_changes_is_taken_as_it_is(device):
     """Also where the first answers were others, and where they change again and again."""
-    replay = Replays(recorder(device))
+    replay = CudaGraphs(recorder(device))
     function = lambda x: [x + 1.0 if decided((x > 0).all()) else x - 1.0]
     for sign in (1, 1, 1, 1, -1, 1, -1, -1, -1, -1, 1, 1, -1, 1, -1, 1, -1):
         assert float(replay("sign", function, [torch.full((2,), float(sign), device=device)])[0][0]) == 2.0 * sign
@@ -65,7 +65,7 @@ def test_constants_are_made_once(device):
         twice *= 2.0
         return [x * twice + torch.tensor(3.0, device=x.device) + host.to(x) + torch.as_tensor(x)]
 
-    replay = Replays(recorder(device))
+    replay = CudaGraphs(recorder(device))
     at = lambda k: torch.full((2,), float(k), device=device)
     for k in range(4):
         assert torch.equal(replay("linear", function, [at(k)])[0].cpu(), torch.tensor([8.0 + 3.0 * k, 10.0 + 5.0 * k]))
@@ -84,7 +84,7 @@ def test_what_cannot_be_captured_is_called(caplog):
         def capture(self, function):
             raise RuntimeError("operation not permitted when stream is capturing")
 
-    replay = Replays(Unable())
+    replay = CudaGraphs(Unable())
     with caplog.at_level("DEBUG", logger=replays.__name__):
         for k in range(6):
             assert float(replay("square", lambda x: [x * x], [torch.tensor(float(k))])[0]) == k * k
@@ -97,7 +97,7 @@ def test_what_cannot_be_captured_is_called(caplog):
 def test_what_draws_random_numbers_is_called(function):
     """A replay would draw the same again; here it is seen as it differs from a call."""
     counted = Rerun()
-    replay = Replays(counted)
+    replay = CudaGraphs(counted)
     found = {float(replay("noisy", function, [torch.zeros(())])[0]) for _ in range(12)}
     assert len(found) == 12
     assert counted.captures == 1
@@ -107,7 +107,7 @@ NUMBERS = iter(range(1000))
 
 
 def test_an_impure_function_runs_once_a_call(device):
-    replay, total = Replays(recorder(device)), torch.zeros((), device=device)
+    replay, total = CudaGraphs(recorder(device)), torch.zeros((), device=device)
 
     def add(x):
         total.add_(x)
@@ -121,7 +121,7 @@ def test_an_impure_function_runs_once_a_call(device):
 def test_what_changes_later_for_another_reason_is_noticed_and_said(monkeypatch, caplog):
     """A problem whose parameters somebody sets, or a loss that reads a clock."""
     monkeypatch.setattr(replays, "CHECK_EVERY", 5)
-    replay, factor = Replays(Rerun()), [2.0]
+    replay, factor = CudaGraphs(Rerun()), [2.0]
     scaled = lambda x: [x * torch.tensor(factor[0])]
     once = lambda: float(replay("scaled", scaled, [torch.ones(())])[0])
     assert [once() for _ in range(6)] == [2.0] * 6
