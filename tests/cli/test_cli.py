@@ -221,6 +221,6 @@ def test_what_ends_tensorboards_thread_is_left_to_who_writes_next_and_every_othe
     from tensorboard.summary.writer.event_file_writer import _AsyncWriterThread
 
     full = OSError(28, "No space left on device")
-    for thread, told in ((_AsyncWriterThread(None, None, 1, 1), False), (threading.Thread(), True)):
+    for thread, told in ((_AsyncWriterThread(None, None, 1), False), (threading.Thread(), True)):
         unless_told(threading.ExceptHookArgs((OSError, full, None, thread)))
         assert ("No space left" in capsys.readouterr().err) == told
