@@ -40,7 +40,7 @@ def certify(context: Context) -> Certificate:
     """The certificate of ``context``. Raises `ProblemError` where a function of its problem is not finite."""
     bounds = [bound for bound in BOUNDS if bound.applies(context)]
     evaluated = lambda side: {bound.name: shown(bound, context) for bound in bounds if bound.side == side}
-    _ = context.posed  # first of all, to refuse functions that are not finite
+    _ = context.well_posed  # first of all, to refuse functions that are not finite
     with context.ahead:
         simulated, zero = context.simulated  # before the upper side, which is of the best of them
         upper, perf_lower = evaluated(UPPER), evaluated(PERFORMANCE)
@@ -53,20 +53,20 @@ def certify(context: Context) -> Certificate:
         exact=context.problem.exact_optimum,
         lower=lower,
         upper=upper,
-        perf=dict.fromkeys(context.listed) | {name: found.perf for name, found in simulated.items()},
+        perf=dict.fromkeys(context.always_listed) | {name: found.perf for name, found in simulated.items()},
         baseline={"zero": zero},
         assumptions=assumptions,
         warnings=[
             *context.constants.warnings,
             *context.checked.warnings,
-            *context.notes,
+            *context.first_warnings,
             *(note for bound in bounds for note in bound.notes(context, sides[bound.side][bound.name])),
             *(
                 f"a few sampled states carry {name}: its interval is widened by {estimate.bias:.2g}."
                 for name, estimate in (upper | lower).items()
                 if estimate is not None and estimate.bias
             ),
-            *context.remarks,
+            *context.last_warnings,
             *(note for name, found in simulated.items() for note in unseen(name, found)),
         ],
         searches=list(dict.fromkeys(line for bound in bounds for line in bound.searches(context))),
@@ -91,7 +91,7 @@ def unseen(name: str, found: Simulated) -> list[str]:
 
 def handed_out(certificate: Certificate, context: Context) -> Certificate:
     """``certificate`` with the controller that is handed out as its subject, and what is computed for that one alone."""
-    choose = context.settings.prefer == CERTIFIED and not context.settled
+    choose = context.settings.prefer == CERTIFIED and not context.controller_fixed
     best = certificate.best_certified if choose else None
     subject = certificate.subject if best is None else best
     outside, held_for = context.outside(subject), context.held_for(subject)
@@ -176,7 +176,9 @@ def certify_policy(
     which ``kept`` was trained before. ``network`` makes the networks for `V^u` and `mu^u`. Raises `InputError` where the
     policy fails."""
     shared = problem, constants, settings, run, progress
-    certificate = certify(ControllerContext(*shared, policy=policy, value=value, network=network, kept=kept))
+    certificate = certify(
+        ControllerContext(*shared, policy=policy, value=value, network=network, saved_subsolution=kept)
+    )
     if isinstance(policy, BlackBox):  # after calls at many states
         policy.require_still()
     return certificate

@@ -24,7 +24,7 @@ class MinimisedPrimal(Bound):
         """`G` takes the divergence of `B w`: `w` is smooth, so that only jumps of the problem make it wrong."""
         jump = context.observed.jump
         jumps = jump is not None and jump.in_problem
-        return context.hidden is None and not jumps and context.posed.smooth_seam
+        return context.hidden is None and not jumps and context.well_posed.smooth_seam
 
     def about(self, context: Context) -> str | None:
         """`w` over the `mu` of Lemma 2, whose performance `G` bounds where none of its simulated values exceeds `C_V`."""

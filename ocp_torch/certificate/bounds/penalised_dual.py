@@ -20,7 +20,7 @@ class PenalisedDual(Bound):
         return not context.recorded
 
     def evaluate(self, context: Context) -> Estimate | None:
-        V, constants = context.sampled_value, context.informed
+        V, constants = context.sampled_value, context.effective_constants
         if V is None:
             return None
         # Training aimed at the bound without M, to which the constant in V means nothing.
@@ -37,4 +37,4 @@ class RecordedDual(PenalisedDual):
         if context.value is None:
             return None
         problem, sets = recorded(context).problem, recorded(context).sets
-        return penalised_on_records(problem, sets, context.value, context.informed.M)
+        return penalised_on_records(problem, sets, context.value, context.effective_constants.M)

@@ -20,7 +20,7 @@ class PenalisedPrimal(Bound):
         return not context.recorded
 
     def evaluate(self, context: Context) -> Estimate | None:
-        if context.closed_loop and context.takes_fitted_J:
+        if context.closed_loop and context.shows_fitted_J:
             return None if context.coarse else context.closed_loop.J
         return context.densities.J if context.densities else None
 
@@ -29,7 +29,7 @@ class PenalisedPrimal(Bound):
 
     def about(self, context: Context) -> str | None:
         """The controller whose closed loop was fitted if that `J` is shown, or `w / mu` if that is the one followed."""
-        return context.followed if context.takes_fitted_J or context.followed == DENSITY else None
+        return context.followed if context.shows_fitted_J or context.followed == DENSITY else None
 
     def notes(self, context: Context, shown: Estimate | None) -> list[str]:
         notes = []
@@ -37,7 +37,7 @@ class PenalisedPrimal(Bound):
             notes.append(f"{context.divergent} are not used: {context.hidden.sentence}.")
         if context.fitted is not None and context.coarse:
             notes.append("J is left out: the controller computes in float32, too coarse for its divergence.")
-        found = context.closed_loop if context.takes_fitted_J and context.densities else None
+        found = context.closed_loop if context.shows_fitted_J and context.densities else None
         if found is not None and not context.checked.value_holds:
             notes.append(f"the J shown is that of the closed loop, with C_V = {found.C_V:.4g} proved for it.")
         return notes

@@ -51,7 +51,7 @@ def _proved(context: Context) -> tuple[Estimate | None, list[str], list[str]]:
     from ocp_torch.certificate.proof.rigorous import obstacle, rigorous_lower_bound  # only where it is asked for
 
     context.progress("proof")
-    why, own = obstacle(context.problem, V.value, context.odd), V.own
+    why, own = obstacle(context.problem, V.value, context.narrow_states), V.own
     if why is not None:
         return None, [f"no rigorous lower bound: {why}."], []
     bound = rigorous_lower_bound(context.problem, V.value, theta=own.theta, sampled_slack=own.largest.value)

@@ -55,7 +55,7 @@ class Context:
 
     recorded = external = False  # whether it is of recorded samples, or of a given controller
     divergent = ""  # which bounds take a divergence, in words
-    listed: ClassVar[tuple[str, ...]] = ()  # controllers that a certificate names even if they were not simulated
+    always_listed: ClassVar[tuple[str, ...]] = ()  # controllers that are named even if they were not simulated
     if TYPE_CHECKING:  # each kind gives these itself, as a field, a constant or a property
 
         @property
@@ -69,7 +69,7 @@ class Context:
         @property
         def observed(self) -> Observed: ...
         @property
-        def remarks(self) -> list[str]: ...
+        def last_warnings(self) -> list[str]: ...
 
     @property
     def followed(self) -> str | None:
@@ -77,7 +77,7 @@ class Context:
         return self.kind
 
     @property
-    def settled(self) -> bool:
+    def controller_fixed(self) -> bool:
         """Whether the controller that is handed out was chosen before."""
         return False
 
@@ -91,12 +91,12 @@ class Context:
         return found is None or value_holds(found.largest_value, self.constants)
 
     @property
-    def kept(self) -> Subsolution | None:
+    def saved_subsolution(self) -> Subsolution | None:
         """The function that the lower bound was of before: `V` need not be trained on for it again."""
         return None
 
     @property
-    def notes(self) -> list[str]:
+    def first_warnings(self) -> list[str]:
         return []
 
     @property
@@ -118,26 +118,26 @@ class Context:
         return self.run.seed
 
     @cached_property
-    def wide(self) -> list[Samples]:
+    def value_samples(self) -> list[Samples]:
         """Independent sets of many states, for expectations and suprema of `V` and its slack."""
         return replicated_samples(self.problem, self.settings.points, self.settings.replicates, self.seed, False)
 
     @cached_property
-    def few(self) -> list[Samples]:
+    def divergence_samples(self) -> list[Samples]:
         """Independent sets of fewer states, for bounds that take divergences."""
         count = max(1, self.settings.points // max(DIVERGENCE_PART, self.problem.dim // 2))
         return replicated_samples(self.problem, count, self.settings.replicates, self.seed, not self.external)
 
     @cached_property
-    def odd(self) -> Tensor | None:
+    def narrow_states(self) -> Tensor | None:
         """States ``(K, d)`` where the problem's data are unlike elsewhere: narrow features that sampled states miss."""
         scanned = self.problem.scan_factor * max(self.settings.points * self.settings.replicates, LEAST_SCANNED)
         return odd_states(self.problem, scanned, self.seed)
 
     @cached_property
-    def posed(self) -> WellPosed:
+    def well_posed(self) -> WellPosed:
         """What the checks of the problem itself found."""
-        return check_problem(self.problem, self.wide, lambda: self.odd)
+        return check_problem(self.problem, self.value_samples, lambda: self.narrow_states)
 
     @cached_property
     def sampled_value(self) -> SampledValue | None:
@@ -145,8 +145,10 @@ class Context:
         if self.value is None:
             return None
         search = self.settings.searches(self.constants)
-        how = self.settings.ascents, search, self.seed, self.odd, self.kept, self.settings.bound_steps
-        return SampledValue(self.problem, self.value, self.wide, *how)
+        odd, kept, s = self.narrow_states, self.saved_subsolution, self.settings
+        return SampledValue(
+            self.problem, self.value, self.value_samples, s.ascents, search, self.seed, odd, kept, s.bound_steps
+        )
 
     @property
     def ahead(self) -> contextlib.AbstractContextManager[None]:
@@ -167,7 +169,8 @@ class Context:
         self.progress("simulation")
         # Where the controller with the best certified bound is handed out, none can be left out.
         how = self.settings, self.seed, not self.external and self.settings.prefer != CERTIFIED
-        return simulate_candidates(self.problem, candidates, *how, self.remembered, self.kind if self.settled else None)
+        chosen = self.kind if self.controller_fixed else None
+        return simulate_candidates(self.problem, candidates, *how, self.remembered, chosen)
 
     def outside(self, name: str | None) -> Estimate | None:
         """The part of the discounted time that the controller ``name`` spends outside the box of a system."""
@@ -185,23 +188,23 @@ class Context:
             before = sought[-1] if sought else None
             at = loop.samples_of(sets)
             found = closed_loop_bounds(
-                loop, value, log_occupation, at, ascents, self.followed, initial, self.odd, before
+                loop, value, log_occupation, at, ascents, self.followed, initial, self.narrow_states, before
             )
             sought.append(found.sought)
             return found
 
-        return sharpened(judge, self.problem, self.few, self.seed)
+        return sharpened(judge, self.problem, self.divergence_samples, self.seed)
 
     @property
-    def densest(self) -> float | None:
+    def largest_density(self) -> float | None:
         """The largest density met under the controller that is nearest to the optimal one."""
         return self.observed.sup_occupation
 
     @cached_property
-    def informed(self) -> Constants:
+    def effective_constants(self) -> Constants:
         """The constants by which bounds are computed: an `M` that was not given follows from the density met."""
         guessed = self.constants.basis("M") == GUESSED  # else the density need not be computed
-        return self.constants.informed(self.densest) if guessed else self.constants
+        return self.constants.informed(self.largest_density) if guessed else self.constants
 
     @property
     def hidden(self) -> Hidden | None:
@@ -217,7 +220,7 @@ class Context:
     @cached_property
     def checked(self) -> Assumptions:
         """The assumptions as the checks leave them."""
-        return check_assumptions(self.problem, self.informed, self.posed, self.observed, self.uses)
+        return check_assumptions(self.problem, self.effective_constants, self.well_posed, self.observed, self.uses)
 
     @cached_property
     def closed_loop(self) -> ClosedLoopBounds | None:
@@ -227,7 +230,7 @@ class Context:
         return self.fitted if usable else None
 
     @cached_property
-    def takes_fitted_J(self) -> bool:
+    def shows_fitted_J(self) -> bool:
         """Whether the `J` of the closed loop is shown: unless the `J` of the trained densities is of the same controller,
         with a `C_V` that holds, and no larger."""
         if self.closed_loop is None:
@@ -240,5 +243,5 @@ class Context:
         """What the bounds rest on, after all checks."""
         found = self.checked if self.hidden is None else replace(self.checked, regular_holds=False)
         # A C_V proved for a given controller stands whatever its divergence; for trained fields it is used with their J.
-        proved = self.fitted if self.external else self.closed_loop if self.takes_fitted_J else None
+        proved = self.fitted if self.external else self.closed_loop if self.shows_fitted_J else None
         return found if proved is None else found.with_value_bound(proved.C_V)

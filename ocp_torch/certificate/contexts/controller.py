@@ -37,7 +37,7 @@ class ControllerContext(Context):
     policy: Policy
     value: Field | None
     network: Callable[..., nn.Module]
-    kept: Subsolution | None = None
+    saved_subsolution: Subsolution | None = None
 
     external = True
     kind = GIVEN
@@ -71,7 +71,7 @@ class ControllerContext(Context):
         if self._fit is None:
             return None
         with torch.no_grad():
-            return [integral(s, self._fit.value(s.x) * s.mu0) for s in self.wide]
+            return [integral(s, self._fit.value(s.x) * s.mu0) for s in self.value_samples]
 
     @cached_property
     def fitted(self) -> ClosedLoopBounds | None:
@@ -91,15 +91,15 @@ class ControllerContext(Context):
     def observed(self) -> Observed:
         found, _ = self.simulated
         self.progress("assumptions")
-        met = observe(self.problem, self.policy, found.get(GIVEN), self.few, 0)
+        met = observe(self.problem, self.policy, found.get(GIVEN), self.divergence_samples, 0)
         if self.value is None or "value" not in found:
             return met
         # M is about the optimal controller, to which the one from V is nearer than the given one.
         best, states = ValuePolicy(self.problem, self.value), self.settings.occupation_states
-        near = observe(self.problem, best, found["value"], self.few, states)
+        near = observe(self.problem, best, found["value"], self.divergence_samples, states)
         return replace(met, sup_occupation=near.sup_occupation, a_priori_occupation=near.a_priori_occupation)
 
     @property
-    def remarks(self) -> list[str]:
+    def last_warnings(self) -> list[str]:
         notes = [] if self.value is not None else ["no lower bound: there is no V to give one."]
         return notes + self._attempt[1]

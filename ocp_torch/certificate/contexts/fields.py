@@ -44,7 +44,7 @@ class FieldsContext(Context):
 
     trained: Trained
 
-    listed = (VALUE, DENSITY)
+    always_listed = (VALUE, DENSITY)
 
     @property
     def occupation(self) -> str | None:
@@ -61,7 +61,7 @@ class FieldsContext(Context):
         return self.fields.value
 
     @property
-    def kept(self) -> Subsolution | None:
+    def saved_subsolution(self) -> Subsolution | None:
         return self.fields.subsolution
 
     def policies_of(self, fields: Fields) -> dict[str, Policy]:

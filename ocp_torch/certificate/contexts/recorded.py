@@ -85,7 +85,7 @@ class RecordedContext(FieldsContext):
         return self.value is not None, self.fit is not None and self.hidden is None
 
     @cached_property
-    def posed(self) -> WellPosed:
+    def well_posed(self) -> WellPosed:
         """The result of the checks made on reading the file; samples cannot show a jump at the seam."""
         samples, recording = self.problem.held_out, self.problem.recording
         mass = float(recording.samples.mean(recording.samples.mu0))
@@ -107,7 +107,7 @@ class RecordedContext(FieldsContext):
         return replace(self.checked, C_V=C_V, basis=self.checked.basis | {"C_V": SEARCHED})
 
     @property
-    def notes(self) -> list[str]:
+    def first_warnings(self) -> list[str]:
         weighted = bool((self.problem.held_out.weight != 1.0).any())
         return [
             f"from {sum(map(len, self.sets)):,} held-out samples, taken for independent draws from "
@@ -117,7 +117,7 @@ class RecordedContext(FieldsContext):
         ]
 
     @property
-    def remarks(self) -> list[str]:
+    def last_warnings(self) -> list[str]:
         if not self.settings.rigorous:
             return []
         return ["no rigorous lower bound: samples say nothing about the states between them."]

@@ -40,8 +40,9 @@ class TrainedContext(FieldsContext):
     divergent = "J, G and the Lagrangian bound"
 
     @cached_property
-    def posed(self) -> WellPosed:
-        return check_problem(self.problem, self.few if self.value is None else self.wide, lambda: self.odd)
+    def well_posed(self) -> WellPosed:
+        sets = self.divergence_samples if self.value is None else self.value_samples
+        return check_problem(self.problem, sets, lambda: self.narrow_states)
 
     @cached_property
     def candidates(self) -> dict[str, Candidate]:
@@ -91,7 +92,7 @@ class TrainedContext(FieldsContext):
         return self.trained.kind or self._best_of(list(self.policies))
 
     @property
-    def settled(self) -> bool:
+    def controller_fixed(self) -> bool:
         return self.trained.kind is not None
 
     @cached_property
@@ -115,7 +116,9 @@ class TrainedContext(FieldsContext):
 
     @cached_property
     def densities(self) -> DensityBounds | None:
-        return sharpened(self.densities_on, self.problem, self.few, self.seed) if self.has_densities else None
+        if not self.has_densities:
+            return None
+        return sharpened(self.densities_on, self.problem, self.divergence_samples, self.seed)
 
     def densities_on(self, sets: list[Samples]) -> DensityBounds:
         """`J` and `G` of the trained `w` and `mu` on ``sets``."""
@@ -150,7 +153,7 @@ class TrainedContext(FieldsContext):
         return self._fit[0]
 
     @property
-    def densest(self) -> float | None:
+    def largest_density(self) -> float | None:
         """The largest of the fitted density and of the one found backwards in time; `None` where neither is known."""
         fitted = None if self.fitted is None or self.hidden is not None else self.fitted.sup_occupation
         return max((d for d in (fitted, self.observed.sup_occupation) if d is not None), default=None)
@@ -163,10 +166,11 @@ class TrainedContext(FieldsContext):
         states, together = self.settings.occupation_states, self.problem.concurrent  # networks of ours are pure
         upper = self.has_densities or self.settings.stage.steps > 0  # bounds that a jump would spoil
         rounded = self.policies_of(self.fields.rounded)[self.followed]
-        return observe(self.problem, self.policies[self.followed], usable, self.few, states, together, upper, rounded)
+        policy, sets = self.policies[self.followed], self.divergence_samples
+        return observe(self.problem, policy, usable, sets, states, together, upper, rounded)
 
     @property
-    def notes(self) -> list[str]:
+    def first_warnings(self) -> list[str]:
         notes = list(self._fit[1])
         # The forms of `mu` of those density players' controllers that may be handed out.
         forms = {DENSITY: self.occupation} if self.followed == DENSITY else {}
@@ -180,10 +184,10 @@ class TrainedContext(FieldsContext):
     def _is_empty_somewhere(self, occupation: str | None) -> bool:
         """Whether the `mu` that fields give by ``occupation`` is 0 at a sampled state."""
         mu = occupation_density(occupation, self.problem, self.fields, self.constants)
-        return any(bool((mu(samples.x[:CHECKED_STATES]) <= 0.0).any()) for samples in self.few)
+        return any(bool((mu(samples.x[:CHECKED_STATES]) <= 0.0).any()) for samples in self.divergence_samples)
 
     @property
-    def remarks(self) -> list[str]:
+    def last_warnings(self) -> list[str]:
         """Warnings about the controllers themselves."""
         found, zero = self.simulated
         notes = [
