@@ -88,15 +88,28 @@ def fill(config: dict, problem: Problem) -> dict:
     for name in ("model", "trainer", "optimizer", "certificate"):
         require_section(name, config.get(name))
     filled = copy.deepcopy(config)
-    budget = next(b for b in BUDGETS if problem.dim <= b.dim)
-    effort = require_number("trainer.effort", config["trainer"].get("effort", 1.0), **EFFORTS)
-    scaled = lambda steps: max(1, round(effort * steps))
     method = require_section("method", config.get("method") or {})
     model = MODELS[require_choice("model.name", config["model"].get("name"), MODELS)]
     unbounded = is_unbounded(problem, method.get("occupation_bound"))
-    method_name = method.get("name")
-    ours = config["optimizer"].get("name") == "soap" and model is MODELS["mlp"]
-    if not ours or problem.noisy or unbounded or not problem.has_simulator:
+    swept = config["optimizer"].get("name") == "soap" and model is MODELS["mlp"]
+    budget = _budget(problem, unbounded, solvable=swept and problem.has_simulator)
+    defaults = {
+        **{f"model.{name}": value for name, value in model.defaults(problem.dim, unbounded, problem.noisy).items()},
+        "optimizer.lr": LEARNING_RATE if unbounded else budget.lr,
+        "sampler.name": WORST_STATE_SAMPLER if unbounded else SAMPLER,
+        **_efforts(config, problem, budget),
+    }
+    if unbounded and method.get("name") == "pd" and config["trainer"].get("batch") is None:
+        defaults["method.density_batch"] = DENSITY_BATCH
+    for path, value in defaults.items():
+        _put(filled, path, value)
+    return filled
+
+
+def _budget(problem: Problem, unbounded: bool, solvable: bool) -> Budget:
+    """The row for ``problem``; Gauss-Newton steps only where `V` is smooth, and ``solvable`` by them."""
+    budget = next(b for b in BUDGETS if problem.dim <= b.dim)
+    if not solvable or problem.noisy or unbounded:
         budget = replace(budget, newton_steps=0, newton_after=0)
     if problem.noisy:
         budget = replace(budget, steps=NOISY_STEPS.get(problem.dim, budget.steps))
@@ -104,36 +117,40 @@ def fill(config: dict, problem: Problem) -> dict:
         steps = NOISY_UNBOUNDED_STEPS.get(problem.dim, budget.steps) if problem.noisy else UNBOUNDED_STEPS
         batch = NOISY_UNBOUNDED_BATCH if problem.noisy or not problem.has_simulator else UNBOUNDED_BATCH
         budget = replace(budget, batch=max(budget.batch, batch), steps=steps)
-    defaults: dict[str, object] = {
-        **{f"model.{name}": value for name, value in model.defaults(problem.dim, unbounded, problem.noisy).items()},
-        "trainer.rounds": 2 if config["trainer"].get("steps") is None else 1,
+    return budget
+
+
+def _efforts(config: dict, problem: Problem, budget: Budget) -> dict[str, object]:
+    """How long each part goes on, by the path of its field; steps are multiplied by `trainer.effort`."""
+    trainer = config["trainer"]
+    effort = require_number("trainer.effort", trainer.get("effort", 1.0), **EFFORTS)
+    scaled = lambda steps: max(1, round(effort * steps))
+    given = trainer.get("steps")
+    steps = given if isinstance(given, int) and given > 0 else scaled(budget.steps)
+    early = given is None and (config.get("method") or {}).get("name") == "dual" and steps > budget.newton_after
+    apart = EVALUATE_EVERY if trainer.get("target_gap") is None else EVALUATE_EVERY_FOR_TARGET
+    warm = {} if config.get("warm_start") is None else {"warm_start.rounds": scaled(WARM_ROUNDS)}
+    return {
+        "trainer.rounds": 2 if given is None else 1,
         "trainer.good_gap": budget.good_gap,
         "trainer.steps": scaled(budget.steps),
         "trainer.batch": budget.batch,
-        "optimizer.lr": LEARNING_RATE if unbounded else budget.lr,
-        "sampler.name": WORST_STATE_SAMPLER if unbounded else SAMPLER,
+        "trainer.newton_steps": budget.newton_steps if steps >= LEAST_STEPS_FOR_NEWTON else 0,
+        "trainer.newton_after": budget.newton_after if early else 0,
+        "trainer.evaluate_every": math.ceil(steps / math.ceil(steps / apart)),
         "certificate.occupation_states": min(OCCUPATION_STATES, OCCUPATION_DIFFERENCES // (problem.dim + 1)),
         "certificate.bound_steps": scaled(plan_of(problem, None)[1]),
         "certificate.stage.steps": scaled(budget.stage_steps),
         "certificate.stage.lr": budget.stage_lr,
+        **warm,
     }
-    if unbounded and method_name == "pd" and config["trainer"].get("batch") is None:
-        defaults["method.density_batch"] = DENSITY_BATCH
-    given = config["trainer"].get("steps")
-    steps = given if isinstance(given, int) and given > 0 else scaled(budget.steps)
-    defaults["trainer.newton_steps"] = budget.newton_steps if steps >= LEAST_STEPS_FOR_NEWTON else 0
-    early = given is None and method_name == "dual"
-    defaults["trainer.newton_after"] = budget.newton_after if early and steps > budget.newton_after else 0
-    apart = EVALUATE_EVERY if config["trainer"].get("target_gap") is None else EVALUATE_EVERY_FOR_TARGET
-    defaults["trainer.evaluate_every"] = math.ceil(steps / math.ceil(steps / apart))
-    if config.get("warm_start") is not None:
-        defaults["warm_start.rounds"] = scaled(WARM_ROUNDS)
-    for path, value in defaults.items():
-        *groups, field = path.split(".")
-        section = filled
-        for depth, group in enumerate(groups, start=1):
-            require_section(".".join(groups[:depth]), section.setdefault(group, {}))
-            section = section[group]
-        if section.get(field) is None:
-            section[field] = value
-    return filled
+
+
+def _put(config: dict, path: str, value: object) -> None:
+    """Set the field at ``path`` of ``config``, where it is null."""
+    *groups, field = path.split(".")
+    for depth, group in enumerate(groups, start=1):
+        require_section(".".join(groups[:depth]), config.setdefault(group, {}))
+        config = config[group]
+    if config.get(field) is None:
+        config[field] = value
