@@ -119,4 +119,4 @@ class Pendulum(System):
         return np.array([np.arctan2(sine, cosine), velocity])
 
     def action(self, control: np.ndarray) -> np.ndarray:
-        return control
+        return np.clip(control, -self.max_torque, self.max_torque)
