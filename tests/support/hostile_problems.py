@@ -365,6 +365,9 @@ LEGAL = {
     "a jumps": lambda: with_(drift=lambda self, x: steps_of(self, x).expand_as(x)),
     "B jumps": lambda: with_(control_matrix=lambda self, x: steps_of(self, x)[:, :, None] * torch.eye(2, dtype=x.dtype)),
     "rough": lambda: with_(state_cost=wobbly),
+    "rough below the steps of differences": lambda: with_(state_cost=lambda self, x: 4.0 + sum(
+        0.5**k * torch.cos(TURN * 7**k * x[:, 0]) for k in range(8))),
+    "a hash": lambda: with_(state_cost=lambda self, x: (4e4 * torch.sin(TURN * (20.0 * x[:, 0] + x[:, 1]))).remainder(1.0)),
     "kinks": lambda: with_(drift=lambda self, x: torch.sin(TURN * x).abs().sqrt()),
     "a step of a detached state": lambda: with_(state_cost=lambda self, x: step_of(x[:, 0].detach())),
     "f in steps of .001": lambda: with_(state_cost=lambda self, x: (1e3 * plain_cost(self, x)).round() / 1e3),

@@ -23,6 +23,9 @@ SLOPE_DESIGN = 9  # of the states (see `functions.FIRST_DESIGN`)
 # Part of the states where something changes that may be at odds, as a function may be asked right beside a kink. Where most
 # states settle nothing, as of a rough function, nothing is said.
 FORGIVEN = 0.25
+# The step of differences that acquit a claim: a rough function may change by its derivative over no more than this. Sums of
+# cosines with up to five million waves a turn, and a hash, were refused without them.
+SMALLEST_DIFFERENCE = 1e-8
 
 
 def require_slopes(functions: Functions) -> None:
@@ -39,10 +42,13 @@ def require_slopes(functions: Functions) -> None:
         mixed = lambda at, name=name, weights=weights: (functions.ask(name, at) * weights).flatten(1).sum(dim=-1)
         scalar = mixed if weights.ndim else lambda at, name=name: functions.ask(name, at)
         claimed = (value_and_gradient(scalar, x)[1] * along).sum(dim=-1)
-        coarse, fine = (_change(scalar, x, step * along) / (2.0 * step) for step in DIFFERENCES)
+        coarse, fine, finest = (
+            _change(scalar, x, step * along) / (2.0 * step) for step in (*DIFFERENCES, SMALLEST_DIFFERENCE)
+        )
         sizes, apart, off = torch.maximum(fine.abs(), claimed.abs()), (coarse - fine).abs(), (claimed - fine).abs()
         settled, some = apart <= AGREE * sizes.max(), sizes > LEAST_ERROR * sizes.max()
         wrong = settled & some & (off > RELATIVE_ERROR * sizes) & (off > ERROR_OVER_SPREAD * apart)
+        wrong &= (claimed - finest).abs() >= RELATIVE_ERROR * claimed.abs()  # a claim of 0 is never acquitted
         if 2 * int(settled.sum()) > len(x) and int(wrong.sum()) > FORGIVEN * int((settled & some).sum()):
             at = int((off * wrong).argmax())
             raise ProblemError(
