@@ -10,7 +10,9 @@ from ocp_torch.compute.threads import cores
 from ocp_torch.errors import InputError
 from ocp_torch.problems import Simulator
 from ocp_torch.problems.checks.check import check_once
+from ocp_torch.problems.checks.functions import MOST_ENTRIES, Functions
 from ocp_torch.problems.checks.mass import sampled_mass
+from ocp_torch.problems.checks.sameness import BATCHES, require_concurrency
 from ocp_torch.runs.build import build_problem
 from support import hostile_problems
 from support.hostile_problems import LEGAL, REFUSED, TURN, Good, column, with_
@@ -88,6 +90,18 @@ def test_what_two_threads_may_ask_at_once_is_held_against_one():
         "state_cost of .*Mine changes when two threads call the functions at once, which concurrent = True allows"
     ):
         check_once(with_(state_cost=kept, concurrent=True))
+
+
+@pytest.mark.skipif(cores() < 2, reason="nothing is asked side by side on one core")
+def test_all_that_two_threads_are_given_at_once_fits_the_memory_of_any_other_check():
+    asked = []
+
+    def matrix(self, x):
+        asked.append(x.shape[0])
+        return x.new_ones(1, 64, 64).expand(len(x), 64, 64)
+
+    require_concurrency(Functions(with_(64, control_matrix=matrix, concurrent=True), simulator=False))
+    assert max(asked) * 64**2 * BATCHES <= MOST_ENTRIES
 
 
 def test_the_check_leaves_random_numbers_as_they_were():

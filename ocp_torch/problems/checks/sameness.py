@@ -11,7 +11,7 @@ from ocp_torch.compute.threads import CHUNK, cores, side_by_side
 from ocp_torch.errors import ProblemError
 from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.problems.blame import words
-from ocp_torch.problems.checks.functions import Functions
+from ocp_torch.problems.checks.functions import MOST_ENTRIES, Functions
 
 # Answers are the same within this part of the largest; rounding in single precision stays below.
 SAME = 1e-5
@@ -66,7 +66,9 @@ def require_concurrency(functions: Functions) -> None:
     if functions.simulator or not functions.problem.concurrent or cores() < 2:
         return
     asked = lambda x: {name: functions.ask(name, x) for name in functions.data}
-    pieces = functions.states(BATCHES * min(CHUNK, functions.count), BATCHES_DESIGN).chunk(BATCHES)
+    entries = functions.problem.dim * functions.problem.control_dim
+    size = max(1, min(CHUNK, MOST_ENTRIES // (BATCHES * entries)))
+    pieces = functions.states(BATCHES * size, BATCHES_DESIGN).split(size)
     alone, until = [asked(x) for x in pieces], time.monotonic() + SECONDS
     while True:
         try:
