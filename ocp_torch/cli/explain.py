@@ -28,8 +28,12 @@ def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -
         if group == "hydra/launcher":
             brings = "'.[parallel]' brings joblib, '.[cluster]' submitit_slurm and submitit_local"
             return f"{group} is {choice!r}, which is not installed; pip install -e {brings}."
+        group, _, choice = f"{group}/{choice}".partition("/")  # as in problem=./mine.py
         known = choices(group)
-        return f"{group} is {choice!r}, but must be one of {', '.join(known)}{nearest(choice, known)}."
+        hint = nearest(choice, known)
+        if group == "problem" and not hint:
+            hint = f"; a class of your own in the folder you start from is problem._target_={own_class(choice)}"
+        return f"{group} is {choice!r}, but must be one of {', '.join(known)}{hint}."
     override = re.search(r"Could not override '([\w.@/-]+)'", text)
     if isinstance(error, ConfigCompositionException) and override:
         field = override.group(1)
@@ -47,6 +51,12 @@ def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -
         quoted = "quote a value that holds signs of its own, within the quotes of the shell, as in \"run='my runs/1'\""
         return f"{error.override!r} cannot be read; write field=value, and {quoted}."
     return " ".join(text.split()).rstrip(".") + "."
+
+
+def own_class(given: str) -> str:
+    """How a class is written that was meant by `mine.py`, `./mine.py:Class` or `mine.Class`, as far as ``given`` says it."""
+    module, _, name = given.rpartition("/")[2].replace(".py", "").replace(":", ".").partition(".")
+    return f"{module or 'my_module'}.{name or 'MyProblem'}"
 
 
 def is_choice(override: str) -> bool:

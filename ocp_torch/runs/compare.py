@@ -102,11 +102,15 @@ def _shown(value, form: str) -> str:
 
 def compare(paths: Iterable[Path]) -> Comparison:
     """All runs in ``paths`` (run folders, or folders of them), sorted by the certified gap, then by the simulated one."""
-    rows, unfinished, folders = [], {}, list[Path]()
+    rows, unfinished, folders = list[dict](), dict[str, str](), list[Path]()
     for path in paths:
         if kind(path) != FOLDER:
             raise InputError(f"{path} is not a folder; give runs' folders, or folders that hold some.")
-        folders += run_folders(path)
+        found = run_folders(path)
+        folders += found
+        unfinished |= {} if found else {printable(path): "no run is in it."}
+    if unfinished and not folders:
+        raise InputError(f"no run is in {', '.join(unfinished)}; give runs' folders, or folders that hold some.")
     places = named(list(dict.fromkeys(folders)))
     for folder, name in places.items():
         try:

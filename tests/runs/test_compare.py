@@ -102,8 +102,20 @@ def test_the_script_prints_and_writes_what_it_is_asked_for(outputs, tmp_path):
     "arguments", [("nowhere",), (".", "cvs=a.csv"), (".", "plot=a.txt"), (".", "html=a.txt"), (".", "csv=")]
 )
 def test_a_slip_is_told_in_one_sentence(arguments, tmp_path):
+    finished(tmp_path / "run", 0.1)
     assert command("compare", *arguments, cwd=tmp_path).sentence
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_folders_without_runs_are_named_and_alone_give_no_empty_table(tmp_path):
+    (tmp_path / "empty").mkdir()
+    said = command("compare", "empty", "csv=a.csv", cwd=tmp_path).sentence
+    assert "no run is in empty; give runs' folders" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["empty"]
+    finished(tmp_path / "run", 0.1)
+    found = compare([tmp_path / "run", tmp_path / "empty"])
+    assert [row["run"] for row in found.rows] == ["run"]
+    assert found.table().endswith(f"not in the table: {tmp_path / 'empty'}: no run is in it.")
 
 
 def test_a_folder_that_is_not_there_is_an_input_error(tmp_path):
