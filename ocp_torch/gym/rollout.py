@@ -17,6 +17,7 @@ from ocp_torch.errors import InputError, first_line, require_integer
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.gym.environment import require_gymnasium
 from ocp_torch.problems.blame import in_their_words
+from ocp_torch.problems.problem import Problem
 from ocp_torch.runs.evaluate import load_run
 
 log = logging.getLogger(__name__)
@@ -123,7 +124,7 @@ class RolloutJob:
         mine = self.controller.problem
         with closing(self.environment()) as env:
             theirs = getattr(env.unwrapped, "problem", mine)
-            if type(theirs) is not type(mine):
+            if isinstance(theirs, Problem) and type(theirs) is not type(mine):  # a stranger's may be anything
                 said = "warning: %s is of the problem %s, but the controller is for %s."
                 log.warning(said, self.env, type(theirs).__name__, type(mine).__name__)
             found = play(self.controller, env, self.env, self.episodes, self.seed)

@@ -8,12 +8,12 @@ import torch
 from ocp_torch import Angle, Problem, System
 from ocp_torch.compute.threads import cores
 from ocp_torch.errors import InputError
-from ocp_torch.problems import Simulator
+from ocp_torch.problems import Circle, Simulator
 from ocp_torch.problems.checks.check import check_once
 from ocp_torch.problems.checks.functions import MOST_ENTRIES, Functions
 from ocp_torch.problems.checks.mass import sampled_mass
 from ocp_torch.problems.checks.sameness import BATCHES, require_concurrency
-from ocp_torch.runs.build import build_problem
+from ocp_torch.runs.build import build_problem, checked_problem
 from support import hostile_problems
 from support.hostile_problems import LEGAL, REFUSED, TURN, Good, column, with_
 from support.refusals import refused
@@ -46,6 +46,14 @@ def test_functions_of_the_object_itself_count_as_those_of_its_class():
     problem.initial_density = lambda x: 1.5 * torch.ones_like(x[:, 0])
     with refused("initial_density of .*Plain integrates to 1.5"):
         check_once(problem)
+
+
+def test_a_function_set_on_an_object_of_the_package_is_refused_as_files_would_lose_it():
+    problem = Circle()
+    checked_problem(problem)
+    problem.drift = lambda x: 0.5 * torch.ones_like(x)
+    with refused("drift is set on an object of .*Circle, whose files name only this class"):
+        checked_problem(problem)
 
 
 class Plain(Problem):

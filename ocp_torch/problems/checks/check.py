@@ -136,6 +136,12 @@ def require_made(problem: Problem) -> None:
             f"{named(problem)} changes exponent or control_limit after super().__init__, which has made the control cost of "
             "them; give both to super().__init__."
         )
+    replaced = [name for name in (*OF_SYSTEMS, *OF_PROBLEMS) if name in vars(problem)]
+    if replaced and shipped(type(problem)):  # whose name is all that the files of a run have of it
+        raise ProblemError(
+            f"{replaced[0]} is set on an object of {named(problem)}, whose files name only this class of the package, "
+            "without it; write a subclass that has it."
+        )
     for name in DECLARED:
         bound = getattr(problem, name, None)
         infinite = name == "occupation_bound" and bound == math.inf

@@ -7,7 +7,7 @@ from ocp_torch.runs.report.words import NEEDS, number, percent, sentence
 
 
 def certified(certificate: dict) -> bool:
-    """Whether the certificate bounds how far from optimal the controller is, by a gap of at most `MEANS`."""
+    """Whether the certificate bounds how far from optimal the controller is, by a gap of at most `WIDE`."""
     found = _at_most(certificate)
     return certificate["contradiction"] is None and found is not None and found[0] <= WIDE
 
