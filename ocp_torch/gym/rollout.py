@@ -15,6 +15,7 @@ from ocp_torch.control.controller import Controller
 from ocp_torch.control.policies import TRAJECTORIES
 from ocp_torch.errors import InputError, first_line, require_integer
 from ocp_torch.files.storage import write_atomically
+from ocp_torch.gym.agreement import Agreement
 from ocp_torch.gym.environment import require_gymnasium
 from ocp_torch.problems.blame import in_their_words
 from ocp_torch.problems.problem import Problem
@@ -56,6 +57,8 @@ class Agent:
         else:
             self._state = partial(controller.problem.from_observation, name)
             self._action = partial(controller.problem.to_action, name)
+        theirs = not hasattr(own, "from_observation")
+        self.agreement = Agreement(controller.problem, self.step, self.space) if theirs and self.step else None
 
     def act(self, observation) -> np.ndarray:
         """The action for ``observation``."""
@@ -80,7 +83,16 @@ class Agent:
         action = within.astype(self.space.dtype)
         if np.issubdtype(action.dtype, np.integer) and (action != within).any():
             raise InputError(f"to_action gave {given} for {self.name}, but must give whole numbers.")
+        if self.agreement is not None:
+            self.agreement.acted(state, control, action)
         return action
+
+    def ended(self) -> None:
+        """Say, after the first episode, where the environment moved otherwise than the model."""
+        if self.agreement is not None and (difference := self.agreement.difference()):
+            look = "compare parameters, the order of observations, actions and the unit of time"
+            log.warning("warning: %s does not move as the model: %s; %s.", self.name, difference, look)
+        self.agreement = None
 
 
 def step_of(env) -> float | None:
@@ -170,6 +182,7 @@ def play(controller: Controller, env, name: str, episodes: int, seed: int, frame
         endless += not over
         returns.append(total)
         lengths.append(count)
+        agent.ended()
     if endless:
         log.warning(
             "warning: %s: %d of %d episodes had no end within %s steps.", name, endless, episodes, f"{MOST_STEPS:,}"

@@ -1,0 +1,83 @@
+"""Whether somebody else's environment moves as the model of the controller does: each of its steps beside the model's."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ocp_torch.problems.physical.system import System
+from ocp_torch.problems.problem import Problem
+
+# Part of its motion by which a coordinate may be off. Pendulum-v1 and MountainCarContinuous-v0 are off by 2e-4 at most, a
+# pendulum with a mass or a length that is 10 % wrong by 0.003 to 0.07, with cosine for sine by 2.
+AGREES = 2e-3
+AT_END = 1e-4  # part of its half by which a state may be off the end of an interval to be at it
+FEWEST = 10  # steps that say something
+# Turns that a coordinate may be off in a step, as observations are in single precision.
+ROUNDING = 1e-6
+# Standard deviations of the noise of the model that a step may be off by besides.
+NOISE = 3.0
+
+
+class Agreement:
+    """Steps of an environment that holds an action for ``step`` units of time, in which ``problem`` says how states move.
+
+    The mean velocity in a step is between the model's at its start, in its middle and at its end, up to the fourth order of
+    the step where the environment is exact, and in all that explicit or implicit steps of the first order give.
+    """
+
+    def __init__(self, problem: Problem, step: float, actions) -> None:
+        self.problem, self.step, self.actions = problem, step, actions
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self.steps: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # from, control, to
+
+    def acted(self, state: np.ndarray, control: np.ndarray, action: np.ndarray) -> None:
+        """In ``state`` ``(d,)`` of the torus, to which the step before led, ``action`` applies ``control`` ``(m,)``; at a
+        limit of the ``actions``, or where these are counted, it may be another one."""
+        if self._last is not None:
+            self.steps.append((*self._last, state))
+        low, high = (getattr(self.actions, side, action) for side in ("low", "high"))
+        self._last = (state, control) if bool(((action > low) & (action < high)).all()) else None
+
+    @torch.no_grad()
+    def difference(self) -> str:
+        """Where environment and model differ, in words; empty where they agree."""
+        if len(self.steps) < FEWEST:
+            return ""
+        x, u, y = (torch.as_tensor(np.stack(part), dtype=torch.float64) for part in zip(*self.steps, strict=True))
+        kept = self._inside(x) & self._inside(y)
+        if int(kept.sum()) < FEWEST:
+            return ""
+        x, u, y = x[kept], u[kept], y[kept]
+        moved = (y - x + 0.5).remainder(1.0) - 0.5
+        model = self.step * torch.stack([self.problem.velocity(at, u) for at in (x, x + 0.5 * moved, y)])
+        low, high = model.amin(dim=0), model.amax(dim=0)
+        beyond = torch.maximum(low - moved, moved - high) - ROUNDING - NOISE * self._kick(x)
+        off = beyond.clamp_min(0.0)
+        part = off.sum(dim=0) / moved.abs().sum(dim=0).clamp_min(ROUNDING * len(x))
+        i = int(part.argmax())
+        if not float(part[i]) > AGREES:
+            return ""
+        row = int(off[:, i].argmax())
+        ends = (float(v[row, i]) for v in (moved, low, high))
+        return f"{self._told(i, *ends)} ({100.0 * float(part[i]):.2g} % of its motion apart on average)"
+
+    def _told(self, i: int, moved: float, low: float, high: float) -> str:
+        """How coordinate ``i`` ``moved`` in a step, and from ``low`` to ``high`` in the model, in its unit."""
+        name, unit, length = f"coordinate {i}", "turns", 1.0
+        if isinstance(self.problem, System):
+            c = self.problem.coordinates[i]
+            name, unit, length = c.name, c.unit, float(self.problem.chart.length[i])
+        says = f"{length * low:.4g}" if high - low < 1e-3 * abs(high) else f"{length * low:.4g} to {length * high:.4g}"
+        return f"in a step of {self.step:g} {name} changed by {length * moved:.4g} {unit}, where the model says {says}"
+
+    def _inside(self, x: Tensor) -> Tensor:
+        """Whether states ``(N, d)`` are off the ends of intervals, where environments stop or clip what moves, ``(N,)``."""
+        if not isinstance(self.problem, System):
+            return torch.ones(len(x), dtype=torch.bool)
+        chart = self.problem.chart
+        return ~chart.outside(chart.centre + (1.0 + AT_END) * (chart.from_torus(x) - chart.centre))
+
+    def _kick(self, x: Tensor) -> Tensor | float:
+        """The standard deviation of a step by the noise of the model, ``(N, d)``."""
+        sigma = self.problem.noise(x)
+        return 0.0 if sigma is None else self.step**0.5 * sigma.norm(dim=-1)
