@@ -19,6 +19,7 @@ from ocp_torch.certificate.lower.slack import slack_function
 from ocp_torch.certificate.proof.activated import activate
 from ocp_torch.certificate.proof.activations import SERIES
 from ocp_torch.certificate.proof.cover import cell_models
+from ocp_torch.certificate.proof.declared import too_small
 from ocp_torch.certificate.proof.enclosures import Enclosure, enclosure
 from ocp_torch.certificate.proof.models import Box, absolute, power, reciprocal
 from ocp_torch.certificate.proof.network_model import embed, network_model, product
@@ -376,7 +377,7 @@ def test_what_cannot_be_proved_is_refused_in_words():
         (RaisedAgain(), V, "inherits"),
         (patched, V, "inherits"),
         (zoo.Swing(), V2, "lipschitz"),
-        (Declared(state_cost=4.5), V2, "lipschitz"),
+        (Declared(state_cost=4.5), V2, "constants of drift and control_matrix and initial_density (lipschitz)"),
         (Declared(**{**SWING, "state_cost": 0.1}), V2, "state_cost"),
     ]
     for problem, value, words in refusals:
@@ -405,6 +406,35 @@ def test_what_is_not_overridden_needs_no_lipschitz_constant():
     assert obstacle(problem, V) is None
     problem.initial_density = lambda x: 1.0 + 0.5 * torch.cos(TURN * x[:, 0])  # on the instance: no constant any more
     assert "lipschitz" in obstacle(problem, V)
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.99, 0.9, 0.5, 1.0 / TURN])
+def test_a_lipschitz_constant_that_is_a_little_too_small_is_refused(factor):
+    """In units of the torus it is 2 pi; per radian, which a `System` has, it would be 1."""
+    problem = Flat()
+    problem.lipschitz = Lipschitz(state_cost=factor * TURN)
+    why = obstacle(problem, network(1, 0))
+    if factor == 1.0:
+        assert why is None
+    else:
+        assert f"says {factor * TURN:.4g} at most" in why
+        assert "state_cost changes by 6.283 for each turn of the torus, at x = [" in why
+
+
+def test_constants_that_are_exact_at_a_kink_and_across_entries_are_not_refused():
+    class Kinked(Problem):
+        lipschitz = Lipschitz(state_cost=2.0**0.5, drift=1.0)
+
+        def state_cost(self, x):
+            return (x - x.round()).abs().sum(dim=-1)
+
+        def drift(self, x):
+            return torch.stack([(x[:, 0] - x[:, 0].round()).abs(), -(x[:, 1] - x[:, 1].round()).abs()], dim=-1)
+
+    problem, odd = Kinked(dim=2), torch.tensor([[0.0, 0.5], [0.3, 1e-9]], dtype=torch.float64)
+    assert too_small(problem, odd) is None
+    problem.lipschitz = Lipschitz(state_cost=2.0**0.5, drift=0.999)
+    assert "drift changes by 1 " in too_small(problem, odd)
 
 
 @pytest.mark.nightly
@@ -462,7 +492,7 @@ class Holed(Wavy):
 def test_a_lipschitz_constant_that_a_narrow_hole_refutes_proves_nothing(monkeypatch):
     certificate = certificate_of(Holed(), network(1, 0), True)
     assert certificate.lower["rigorous"] is None
-    assert any("enclosure does not hold its own state_cost" in w for w in certificate.warnings)
+    assert any("no rigorous lower bound: state_cost changes by" in w for w in certificate.warnings)
     # And where nobody had looked there: what was met of the slack is more than what is proved of it.
     monkeypatch.setattr("ocp_torch.certificate.proof.rigorous.obstacle", lambda *_: None)
     certificate = certificate_of(Holed(), network(1, 0), True)

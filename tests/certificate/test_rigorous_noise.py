@@ -228,8 +228,8 @@ def test_noise_without_a_model_is_refused_in_words():
         (patched, V, "inherits"),
         (Forgetful(noise=0.01), V, "does not hold its own noise"),
         (zoo.NoisySwing(), V2, "lipschitz"),
-        (Declared(), V2, "lipschitz"),
-        (Declared(noise=0.02), V2, "does not hold its own noise"),
+        (Declared(), V2, "constants of noise (lipschitz)"),
+        (Declared(noise=0.02), V2, "noise changes by 1.885 for each turn"),
     ]:
         assert words in obstacle(problem, value)
         assert rigorous_lower_bound(problem, value) is None

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ocp_torch.certificate.lower.slack import slack_function
 from ocp_torch.certificate.proof.cover import Cover, degree
+from ocp_torch.certificate.proof.declared import missing, too_small
 from ocp_torch.certificate.proof.enclosures import EVALUATION, Enclosure, conjugate_model, enclosure
 from ocp_torch.certificate.proof.models import Box, equal_cells
 from ocp_torch.certificate.proof.network_model import is_known
@@ -81,14 +82,17 @@ def obstacle(problem: Problem, value: Field, odd: Tensor | None = None) -> str |
     generator = fixed_generator()
     box = equal_cells(problem.dim, SPOT_CELLS, degree(problem))
     if enclosure(problem, box) is None:
-        return "the problem gives neither an enclosure of its data nor their Lipschitz constants (lipschitz)"
+        lacks = f" of {' and '.join(missing(problem))}" if problem.lipschitz is not None else ""
+        return f"the problem gives neither an enclosure of its data nor their Lipschitz constants{lacks} (lipschitz)"
+    odd = box.centre[:0] if odd is None else odd
+    if (wrong := too_small(problem, odd)) is not None:
+        return wrong
     for size in SPOT_SIZES:
         small = Box(box.centre, size * box.half, box.degree)
         t = 2.0 * torch.rand(box.centre.shape, generator=generator, dtype=torch.float64) - 1.0
         wrong = contradiction(problem, small, enclosure(problem, small), t)
         if wrong is not None:
             return f"the problem's enclosure does not hold its own {wrong}"
-    odd = box.centre[:0] if odd is None else odd
     for cells in ODD_CELLS if len(odd) else ():
         half = odd.new_full(odd.shape, 0.5 / cells)
         around = Box((2.0 * (cells * odd).floor() + 1.0) * half, half, box.degree)
