@@ -9,7 +9,7 @@ import torch
 from ocp_torch import Circle, InputError, Manufactured
 from ocp_torch.export import lowered
 from ocp_torch.export.casadi_function import casadi_function
-from ocp_torch.studies.horizons import GymnasiumAdapter, horizons, play
+from ocp_torch.studies.horizons import Played, horizons, play
 from support.controllers import controllers
 from support.systems import Swing
 
@@ -96,7 +96,7 @@ def test_starts_are_drawn_from_the_start_density(tmp_path, monkeypatch):
     controller.save(tmp_path / "controller.safetensors")
     met = []
     monkeypatch.setattr(
-        "ocp_torch.studies.horizons.play", lambda p, u, x0, *_: met.append(x0) or GymnasiumAdapter(x0[:, 0], 1.0)
+        "ocp_torch.studies.horizons.play", lambda p, u, x0, *_: met.append(x0) or Played(x0[:, 0], 1.0)
     )
     horizons(asked(tmp_path / "controller.safetensors", starts=64))()
     density = controller.problem.initial_density(torch.as_tensor(met[0]))
