@@ -95,9 +95,7 @@ def test_starts_are_drawn_from_the_start_density(tmp_path, monkeypatch):
     (controller,) = controllers("dual", "problem=double_integrator")
     controller.save(tmp_path / "controller.safetensors")
     met = []
-    monkeypatch.setattr(
-        "ocp_torch.studies.horizons.play", lambda p, u, x0, *_: met.append(x0) or Played(x0[:, 0], 1.0)
-    )
+    monkeypatch.setattr("ocp_torch.studies.horizons.play", lambda p, u, x0, *_: met.append(x0) or Played(x0[:, 0], 1.0))
     horizons(asked(tmp_path / "controller.safetensors", starts=64))()
     density = controller.problem.initial_density(torch.as_tensor(met[0]))
     assert len(met) == 3
