@@ -109,7 +109,7 @@ def test_the_density_of_the_controller_gives_a_conditional_bound_near_the_optimu
 def test_a_density_that_is_far_too_small_enters_nothing_that_counts(solved, monkeypatch):
     """`E[Z mu0] = E[q mu*]`: with `q` where `mu*` is above an `M` that is too small, `V* + t Z` has its `F_M` above `OPT`."""
     V, mu, inverse = solved
-    monkeypatch.setattr(TrainedContext, "densest", 1.0)
+    monkeypatch.setattr(TrainedContext, "largest_density", 1.0)
     found = certificate_of(V + 0.05 * inverse((mu - OBSERVED_ROOM).clamp_min(0.0)))
     said = found.to_dict()
     assert found.assumptions.M == OBSERVED_ROOM
