@@ -7,15 +7,13 @@ from torch import Tensor
 from ocp_torch.problems.physical.system import System
 from ocp_torch.problems.problem import Problem
 
-# Part of its motion by which a coordinate may be off. Pendulum-v1 and MountainCarContinuous-v0 are off by 2e-4 at most, a
-# pendulum with a mass or a length that is 10 % wrong by 0.003 to 0.07, with cosine for sine by 2.
-AGREES = 2e-3
-AT_END = 1e-4  # part of its half by which a state may be off the end of an interval to be at it
-FEWEST = 10  # steps that say something
-# Turns that a coordinate may be off in a step, as observations are in single precision.
-ROUNDING = 1e-6
-# Standard deviations of the noise of the model that a step may be off by besides.
-NOISE = 3.0
+# Part of its motion by which a coordinate may differ from the model: exact models of Pendulum-v1 and MountainCarContinuous-v0
+# differ by 2e-4 at most, a pendulum whose mass or length is 10 % wrong by 0.003 to 0.07, with cosine for sine by 2.
+LARGEST_DIFFERENCE = 2e-3
+AT_END = 1e-4  # distance from the end of an interval, as a part of half its length, below which a state is at the end
+FEWEST_STEPS = 10  # below which nothing is said (not tuned)
+ROUNDING = 1e-6  # turns in a step, as observations are in single precision
+NOISE_DEVIATIONS = 3.0  # standard deviations of the model's noise that a step may differ by besides (not tuned)
 
 
 class Agreement:
@@ -31,8 +29,9 @@ class Agreement:
         self.steps: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # from, control, to
 
     def acted(self, state: np.ndarray, control: np.ndarray, action: np.ndarray) -> None:
-        """In ``state`` ``(d,)`` of the torus, to which the step before led, ``action`` applies ``control`` ``(m,)``; at a
-        limit of the ``actions``, or where these are counted, it may be another one."""
+        """Note the ``state`` ``(d,)`` of the torus at the end of the step before, and the ``control`` ``(m,)`` that the
+        ``action`` applies from there on. A step is left out where the environment may apply another control: at a limit
+        of its actions, and where it counts them."""
         if self._last is not None:
             self.steps.append((*self._last, state))
         low, high = (getattr(self.actions, side, action) for side in ("low", "high"))
@@ -41,21 +40,21 @@ class Agreement:
     @torch.no_grad()
     def difference(self) -> str:
         """Where environment and model differ, in words; empty where they agree."""
-        if len(self.steps) < FEWEST:
+        if len(self.steps) < FEWEST_STEPS:
             return ""
         x, u, y = (torch.as_tensor(np.stack(part), dtype=torch.float64) for part in zip(*self.steps, strict=True))
         kept = self._inside(x) & self._inside(y)
-        if int(kept.sum()) < FEWEST:
+        if int(kept.sum()) < FEWEST_STEPS:
             return ""
         x, u, y = x[kept], u[kept], y[kept]
         moved = (y - x + 0.5).remainder(1.0) - 0.5
         model = self.step * torch.stack([self.problem.velocity(at, u) for at in (x, x + 0.5 * moved, y)])
         low, high = model.amin(dim=0), model.amax(dim=0)
-        beyond = torch.maximum(low - moved, moved - high) - ROUNDING - NOISE * self._kick(x)
+        beyond = torch.maximum(low - moved, moved - high) - ROUNDING - NOISE_DEVIATIONS * self._kick(x)
         off = beyond.clamp_min(0.0)
         part = off.sum(dim=0) / moved.abs().sum(dim=0).clamp_min(ROUNDING * len(x))
         i = int(part.argmax())
-        if not float(part[i]) > AGREES:
+        if not float(part[i]) > LARGEST_DIFFERENCE:
             return ""
         row = int(off[:, i].argmax())
         ends = (float(v[row, i]) for v in (moved, low, high))
@@ -71,7 +70,7 @@ class Agreement:
         return f"in a step of {self.step:g} {name} changed by {length * moved:.4g} {unit}, where the model says {says}"
 
     def _inside(self, x: Tensor) -> Tensor:
-        """Whether states ``(N, d)`` are off the ends of intervals, where environments stop or clip what moves, ``(N,)``."""
+        """Whether states ``(N, d)`` are away from the ends of intervals, ``(N,)``: there environments stop or clip motion."""
         if not isinstance(self.problem, System):
             return torch.ones(len(x), dtype=torch.bool)
         chart = self.problem.chart

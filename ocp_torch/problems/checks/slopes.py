@@ -30,7 +30,8 @@ SMALLEST_DIFFERENCE = 1e-8
 
 def require_slopes(functions: Functions) -> None:
     """Raise where autograd has lost the derivative of data along lines, which central differences of two steps settle: bounds
-    climb to suprema by it. Steps, whose derivative is 0, are none of these."""
+    climb to suprema by it. Steps pass, as their derivative is 0 where a difference does not straddle one; data with a step in
+    nearly every difference, as a cost rounded to five digits, do not."""
     if functions.simulator:  # whose own are differences
         return
     x, draw = functions.exact_states(COMPARED, SLOPE_DESIGN), partial(torch.randn, generator=fixed_generator())
