@@ -138,6 +138,15 @@ def test_half_the_effort_is_half_of_all_steps_that_nobody_set(problem):
         assert (filled["trainer"]["steps"], filled["certificate"]["bound_steps"]) == (7, 9)
 
 
+@pytest.mark.parametrize(("effort", "starts"), [(4.0, 256), (1.0, 256), (0.5, 128), (0.3, 64), (0.01, 32)])
+def test_less_effort_simulates_from_fewer_starts(effort, starts):
+    config = composed("train", [f"trainer.effort={effort}"])
+    problem = build_problem(config["problem"])
+    assert fill(config, problem)["certificate"]["trajectories"] == starts
+    config["certificate"]["trajectories"] = 100
+    assert fill(config, problem)["certificate"]["trajectories"] == 100
+
+
 @pytest.mark.parametrize("effort", ["0", "-1", "1e9", "nan", "much", "null"])
 def test_an_effort_that_is_none_is_refused_by_name(effort):
     assert "trainer.effort" in outcome(f"trainer.effort={effort}")

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from ocp_torch.certificate.lower.shifted import Shift, highest
 from ocp_torch.certificate.lower.slack import SlackParts
-from ocp_torch.certificate.statistics.estimate import integral
 from ocp_torch.fields.rounded import rounded
 from ocp_torch.maths.jets import Field, Jet, jet
 from ocp_torch.maths.seeds import fixed_generator
@@ -29,7 +28,9 @@ TRIAL_ASCENTS = 8  # ascents of such a trial at most
 # 230 s. For another radius it must promise as much beyond the bound that the first came to.
 LEAST_PROMISE = 3e-4
 DIRECTIONS = 8  # directions at most along which neighbours lie
-EVALUATIONS = 2**20  # evaluations of V at most for the values at all sampled states
+# Evaluations of V at most for the averages at sampled states: with four times as many a bound of dubins was the same to 2e-6,
+# in 33 s instead of 19.
+EVALUATIONS = 2**18
 
 
 class Mollified:
@@ -86,21 +87,12 @@ def mollified_shift(own: Shift) -> Shift:
 
     def averaged(radius: float, sets: list[Samples], ascents: int) -> Shift:
         W = Mollified(own.value, own.problem.dim, radius)
-        return replace(own, value=W, sets=W.fitting(sets), ascents=ascents, beside=beside, radius=radius)
+        return replace(own, value=W, sets=W.fitting(sets), ascents=ascents, beside=beside, radius=radius, variate=own)
 
     ascents = min(own.ascents, TRIAL_ASCENTS)
-    initial, by_V = sum(own.initial) / len(own.initial), replace(own, sets=few).parts
-
-    def promise(radius: float) -> float:
-        """By how much the bound rises on few states: the error of `E[V mu0]` there cancels against that of `E[W mu0]`."""
-        tried = averaged(radius, few, ascents)
-        changes = [integral(s, p.initial - v.initial) for s, p, v in zip(few, tried.parts, by_V, strict=True)]
-        theta, _, largest = tried.looked
-        return theta * (initial + sum(changes) / len(changes)) - largest.value - own.bound
-
     promised: dict[float, float] = {}
     for radius in RADII:
-        promised[radius] = promise(radius)
+        promised[radius] = averaged(radius, few, ascents).looked.bound - own.bound
         if max([*promised.values()][-2:]) < max(promised.values()):
             break
     best, too_much = own, 0.0

@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from ocp_torch.certificate.lower.slack import MAX_THETA, Scaled, SlackParts, slack_function
-from ocp_torch.certificate.statistics.estimate import Estimate, integrals
+from ocp_torch.certificate.statistics.estimate import Estimate, integral, integrals
 from ocp_torch.fields.rounded import rounded
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.peaks import NEGLIGIBLE, STEEP_ASCENTS, Peaks, climbed_from, steep_peaks
@@ -43,7 +43,8 @@ class Shift:
 
     The supremum of the slack is climbed from the ``ascents`` worst of all states, those ``beside`` included, and sought in
     steep places by `STEEP_ASCENTS` times as many ascents in each search. ``name`` is `W` in words; it is averaged over
-    neighbours at ``radius``, unless that is 0. Properties are computed when they are first asked for.
+    neighbours at ``radius``, unless that is 0. ``variate`` is the bound of a function near `W`, on more states of the same
+    sets, from which `E[W mu0]` then starts. Properties are computed when they are first asked for.
     """
 
     problem: Problem
@@ -53,6 +54,7 @@ class Shift:
     beside: list[Samples]
     name: str = "V"
     radius: float = 0.0
+    variate: "Shift | None" = None
 
     @cached_property
     def parts(self) -> list[SlackParts]:
@@ -64,7 +66,14 @@ class Shift:
 
     @cached_property
     def initial(self) -> list[float]:
-        """`E[W mu0]`, per set."""
+        """`E[W mu0]`, per set; by the mean of its difference from a ``variate``, where there is one."""
+        if self.variate is not None:
+            known = zip(self.variate.initial, self.variate.parts, strict=True)
+            own = zip(self.sets, self.parts, strict=True)
+            return [
+                mean + integral(samples, parts.initial - others.initial[: len(parts.initial)])
+                for (samples, parts), (mean, others) in zip(own, known, strict=True)
+            ]
         return integrals([s.x for s in self.sets], [p.initial for p in self.parts], [s.weight for s in self.sets])
 
     @cached_property
