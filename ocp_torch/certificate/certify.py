@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
+from typing import NamedTuple
 
 import torch
 from torch import nn
@@ -34,6 +35,20 @@ from ocp_torch.problems.recorded.dataset import Dataset
 CONTRADICTION_LEVEL = 0.999
 # by more than this part of their size: equal numbers may differ in the last digits of float64 and of what was given.
 ROUNDING = 1e-9
+
+
+class Ordered(NamedTuple):
+    """Two numbers with their names, of which ``under`` is never above ``over`` if what they rest on is true."""
+
+    low: str
+    under: Estimate
+    high: str
+    over: Estimate
+
+    def is_apart(self, level: float) -> bool:
+        """Whether their intervals at ``level`` say that it is above nevertheless."""
+        most = self.over.interval(level)[1] + ROUNDING * abs(self.over.value)
+        return self.under.interval(level)[0] > most
 
 
 def certify(context: Context) -> Certificate:
@@ -111,37 +126,51 @@ def examined(certificate: Certificate) -> Certificate:
     this way is dropped, with a warning, and the rest stands."""
     if not certificate.stands:
         return certificate
-    truth = {} if certificate.exact is None else {"OPT": Estimate(certificate.exact, 0.0)}
-    # Whatever any controller costs, doing nothing included, OPT does not exceed it.
-    above = {n: e for n, e in known_of(certificate.upper).items() if certificate.counts(n)}
-    above |= {f"Perf ({n})": e for n, e in known_of(certificate.perf | certificate.baseline).items()}
-    lower = known_of(certificate.lower)
-    below = {n: e for n, e in lower.items() if certificate.counts(n)}
-    sound = [*product(below.items(), (above | truth).items()), *product(truth.items(), above.items())]
-    own = {f"Perf ({n})": e for n, e in known_of(certificate.perf).items() if n == certificate.controller}
-    least = {n: e for n, e in known_of(certificate.perf_lower).items() if certificate.counts(n)}
-    sound += product(least.items(), own.items())
-    supposed = {n: e for n, e in lower.items() if certificate.conditional(n)}
-    guessed = [*product(supposed.items(), (above | truth).items())]
+    sound, guessed = _ordered(certificate)
     level = 1.0 - (1.0 - CONTRADICTION_LEVEL) / max(1, len(sound) + len(guessed))
-    apart = lambda under, over: under.interval(level)[0] > over.interval(level)[1] + ROUNDING * abs(over.value)
-    for (low, under), (high, over) in sound:
-        if apart(under, over):
-            needs = [need for name in (low, high) for need in certificate.needs(name)]
-            conditions = " or not ".join(dict.fromkeys(need.condition for need in needs))
-            doubts = f"either not {conditions}, or " if conditions else ""
-            sentence = (
-                f"nothing is certified: {low} = {under.value:.6g}, a lower bound, contradicts {high} = {over.value:.6g}, an "
-                f"upper one; {doubts}the problem's functions or constants are not what they are said to be."
-            )
+    for pair in sound:
+        if pair.is_apart(level):
+            sentence = _contradiction(certificate, pair)
             return replace(certificate, contradiction=sentence, warnings=[sentence, *certificate.warnings])
-    for (low, under), (high, over) in guessed:
-        if apart(under, over):
-            condition = " and ".join(need.condition for need in certificate.needs(low))
-            note = f"{low} = {under.value:.6g} is above {high} = {over.value:.6g}: it is not so that {condition}."
-            wrong = {need.name for need in certificate.needs(low) if need.basis == GUESSED}
+    for pair in guessed:
+        if pair.is_apart(level):
+            needs = certificate.needs(pair.low)
+            condition = " and ".join(need.condition for need in needs)
+            low, high = f"{pair.low} = {pair.under.value:.6g}", f"{pair.high} = {pair.over.value:.6g}"
+            note = f"{low} is above {high}: it is not so that {condition}."
+            wrong = {need.name for need in needs if need.basis == GUESSED}
             return replace(certificate, refuted=certificate.refuted | wrong, warnings=[*certificate.warnings, note])
     return certificate
+
+
+def _ordered(certificate: Certificate) -> tuple[list[Ordered], list[Ordered]]:
+    """All pairs of what counts in ``certificate``; and those whose lower bound supposes a guess."""
+    pairs = lambda below, above: [Ordered(*under, *over) for under, over in product(below.items(), above.items())]
+    counting = lambda found: {name: e for name, e in known_of(found).items() if certificate.counts(name)}
+    costs = {f"Perf ({name})": e for name, e in known_of(certificate.perf | certificate.baseline).items()}
+    truth = {} if certificate.exact is None else {"OPT": Estimate(certificate.exact, 0.0)}
+    # Whatever any controller costs, doing nothing included, OPT does not exceed it.
+    above = counting(certificate.upper) | costs
+    own = f"Perf ({certificate.controller})"
+    own_cost = {own: costs[own]} if own in costs else {}
+    sound = [
+        *pairs(counting(certificate.lower), above | truth),
+        *pairs(truth, above),
+        *pairs(counting(certificate.perf_lower), own_cost),
+    ]
+    supposed = {name: e for name, e in known_of(certificate.lower).items() if certificate.conditional(name)}
+    return sound, pairs(supposed, above | truth)
+
+
+def _contradiction(certificate: Certificate, pair: Ordered) -> str:
+    """Why nothing is certified where the two of ``pair`` are apart."""
+    needs = [need for name in (pair.low, pair.high) for need in certificate.needs(name)]
+    conditions = " or not ".join(dict.fromkeys(need.condition for need in needs))
+    doubts = f"either not {conditions}, or " if conditions else ""
+    return (
+        f"nothing is certified: {pair.low} = {pair.under.value:.6g}, a lower bound, contradicts {pair.high} = "
+        f"{pair.over.value:.6g}, an upper one; {doubts}the problem's functions or constants are not what they are said to be."
+    )
 
 
 def certify_fields(

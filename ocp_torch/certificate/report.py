@@ -29,6 +29,14 @@ CONTROLLERS = {
     "subsolution": "controller from V trained on for its bound",
     "given": "this controller",
 }
+# What the table calls the trained ones, in the order of its rows.
+ROWS = {
+    "value": "controller from V",
+    "density": "controller w/mu",
+    "minimised": "w/mu, mu of Lemma 2",
+    "trajectories": "from trajectories",
+    "subsolution": "from V trained on",
+}
 
 
 def to_dict(certificate: Certificate) -> dict:
@@ -79,43 +87,61 @@ def _form(numbers: Sequence[float]) -> str:
 def table(certificate: dict, searches: Sequence[str] = ()) -> str:
     """The certificate (as a dict of its schema) for the terminal: what it comes to, the numbers as a table, and how its
     suprema were found."""
-    exact = certificate["exact"]
     name = lambda key: visible(certificate[key], LONGEST_NAME)
-    lines = [f"{name('problem')} / {name('method')}, seed {certificate['seed']}", *in_words(certificate), ""]
+    title = f"{name('problem')} / {name('method')}, seed {certificate['seed']}"
     covered = f"± {100.0 * certificate['confidence']:.6g} %" if "confidence" in certificate else "± se"
-    header = f"{'':26}{'value':>14}{covered:>11}{'of it bias':>11}" + (f"{'vs OPT':>12}" if exact else "")
-    lines += [header, "-" * len(header)]
+    header = f"{'':26}{'value':>14}{covered:>11}{'of it bias':>11}" + (
+        f"{'vs OPT':>12}" if certificate["exact"] else ""
+    )
+    rule = "-" * len(header)
+    warnings = [f"warning: {warning}" for warning in dict.fromkeys(map(visible, certificate["warnings"]))]
+    numbers = [header, rule, *_rows(certificate), rule]
+    return "\n".join([title, *in_words(certificate), "", *numbers, *_gaps(certificate), *searches, *warnings])
+
+
+def _rows(certificate: dict) -> list[str]:
+    """The numbers of ``certificate``, from below to above, a line each."""
+    exact, perf = certificate["exact"], certificate["perf"]
     form = _form([e["value"] for side in (LOWER, "perf", UPPER) for e in certificate[side].values() if e])
 
-    def row(label: str, estimate: dict | None) -> None:
+    def row(label: str, estimate: dict | None) -> list[str]:
         if estimate is None:
-            return
+            return []
         bias = f"{estimate['bias']:11.1e}" if "bias" in estimate else " " * 11
         against = _against(estimate["value"] / exact) if exact else ""
         half = estimate["interval"][1] - estimate["value"] if "interval" in estimate else estimate["se"]
-        lines.append(f"{label:26}{estimate['value']:{form}}{half:11.1e}{bias}{against}")
+        return [f"{label:26}{estimate['value']:{form}}{half:11.1e}{bias}{against}"]
 
-    def rows(side: str, order=list) -> None:
-        for kind, listed in order(bounds.on(side).items()):
-            found = certificate[side].get(kind)
-            counts = found is None or found.get("counts", True)
-            row(f"{side}: {listed.label}{'' if counts else ', if' if 'if' in found else ', not used'}", found)
+    def of_side(side: str) -> list[list[str]]:
+        found = [(listed.label, certificate[side].get(kind)) for kind, listed in bounds.on(side).items()]
+        return [row(f"{side}: {label}{_standing(estimate)}", estimate) for label, estimate in found]
 
-    rows(LOWER)
-    if exact is not None:
-        lines.append(f"{'OPT (exact)':26}{exact:{form}}")
-    row("Perf: controller from V", certificate["perf"].get("value"))
-    row("Perf: controller w/mu", certificate["perf"].get("density"))
-    row("Perf: w/mu, mu of Lemma 2", certificate["perf"].get("minimised"))
-    row("Perf: from trajectories", certificate["perf"].get("trajectories"))
-    row("Perf: from V trained on", certificate["perf"].get("subsolution"))
-    for kind, estimate in certificate.get(PERFORMANCE, {}).items():
-        row(f"Perf, at least: {visible(kind, LONGEST_NAME)}", estimate)
-    row("Perf: this controller", certificate["perf"].get("given"))
-    rows(UPPER, reversed)  # the sharper ones stand late in the list
-    row("Perf: doing nothing", certificate["baseline"]["zero"])
-    lines.append("-" * len(header))
-    gap, share = certificate["gap"], certificate["share"]
+    least = [
+        row(f"Perf, at least: {visible(kind, LONGEST_NAME)}", e) for kind, e in certificate.get(PERFORMANCE, {}).items()
+    ]
+    trained = [row(f"Perf: {label}", perf.get(kind)) for kind, label in ROWS.items()]
+    parts = [
+        *of_side(LOWER),
+        [] if exact is None else [f"{'OPT (exact)':26}{exact:{form}}"],
+        *trained,
+        *least,
+        row("Perf: this controller", perf.get("given")),
+        *reversed(of_side(UPPER)),  # the sharper ones stand late in the list
+        row("Perf: doing nothing", certificate["baseline"]["zero"]),
+    ]
+    return [line for part in parts for line in part]
+
+
+def _standing(estimate: dict | None) -> str:
+    """What a row says behind a bound that does not count."""
+    if estimate is None or estimate.get("counts", True):
+        return ""
+    return ", if" if "if" in estimate else ", not used"
+
+
+def _gaps(certificate: dict) -> list[str]:
+    """The gaps between the numbers of ``certificate`` in sentences, and the part of time outside the box."""
+    gap, share, lines = certificate["gap"], certificate["share"], []
     for kind in ("certified", "simulated"):
         if gap[kind] is not None:
             had = share[kind] is not None and share[kind] > 0.0
@@ -129,12 +155,9 @@ def table(certificate: dict, searches: Sequence[str] = ()) -> str:
         lines.append(f"gap, if {' and '.join(guesses)}: {gap_in_words(gap['conditional'])}, which rests on a guess")
     if (outside := certificate.get("outside_box")) is not None:
         half = min(outside["interval"][1] - outside["value"], 1.0)
-        lines.append(
-            f"outside the box: {100.0 * outside['value']:.3g} % of the discounted time (+- {100.0 * half:.3g})"
-        )
-    lines += searches
-    lines += [f"warning: {warning}" for warning in dict.fromkeys(map(visible, certificate["warnings"]))]
-    return "\n".join(lines)
+        time = f"{100.0 * outside['value']:.3g} % of the discounted time (+- {100.0 * half:.3g})"
+        lines.append(f"outside the box: {time}")
+    return lines
 
 
 def gap_in_words(gap: float) -> str:

@@ -54,50 +54,71 @@ def check_problem(problem: Problem, sets: list[Samples], odd: Callable[[], Tenso
 
     Raises `ProblemError` where a function is not finite.
     """
-    for samples in sets:
-        for name, column in _columns(samples).items():
-            bad = ~torch.isfinite(column).reshape(len(samples), -1).all(dim=-1)
-            if bool(bad.any()):
-                at = place(samples.x[bad][0])
-                raise ProblemError(f"{NAMES[name]} is not finite at {at}; it must be finite on the whole torus.")
-    warnings: list[str] = []
+    _require_finite(sets)
     columns = [_columns(samples) for samples in sets]
     sizes = {name: max(float(column[name].abs().max()) for column in columns) for name in columns[0]}
     x = scrambled_sobol(PROBES, problem.dim, 2, torch.float64)
     whole_numbers = torch.randint(-2, 4, x.shape, generator=fixed_generator()).to(x)
     shifted = _differences(problem, x, x + whole_numbers, ROUNDING, sizes)
     seams = _seams(problem, sizes)
-    for name, size in shifted.items():
-        warnings.append(
-            f"no bound is used: {NAMES[name]} is not periodic, it changes by {size:.3g} when whole numbers are added to x."
-        )
-    for name in (n for n in seams if n not in shifted):
-        cost = ": bounds that take its divergence are not used" if name in DIFFERENTIATED else ", as a function may"
-        warnings.append(f"{NAMES[name]} jumps by {seams[name]:.3g} where a coordinate passes from 1 to 0{cost}.")
     narrow = odd()
     smallest = _smallest(problem.state_cost, sets, "f", narrow)
     nonnegative = smallest >= -ROUNDING * sizes["f"]
-    if not nonnegative:
-        warnings.append(f"J and G are not used: the state cost falls to {smallest:.3g}, but they need f >= 0.")
     mass = Estimate.of([integral(samples, samples.mu0) for samples in sets])
-    least = _smallest(problem.initial_density, sets, "mu0", narrow)
-    positive = least >= -ROUNDING * abs(mass.value)
-    if not positive:
-        warnings.append(f"no bound is used: the initial density falls to {least:.3g}, but must not be negative.")
+    improper = _improper(mass, _smallest(problem.initial_density, sets, "mu0", narrow), sets)
+    warnings = [
+        *(
+            f"no bound is used: {NAMES[name]} is not periodic, it changes by {size:.3g} when whole numbers are added to x."
+            for name, size in shifted.items()
+        ),
+        *(_jump_at_seam(name, size) for name, size in seams.items() if name not in shifted),
+        *(
+            []
+            if nonnegative
+            else [f"J and G are not used: the state cost falls to {smallest:.3g}, but they need f >= 0."]
+        ),
+        *(f"no bound is used: {sentence}." for sentence in improper),
+    ]
+    return WellPosed(
+        sound=not shifted and not improper,
+        nonnegative=nonnegative,
+        smooth_seam=not DIFFERENTIATED & seams.keys(),
+        smallest_cost=smallest,
+        mass=mass.value,
+        warnings=warnings,
+    )
+
+
+def _require_finite(sets: list[Samples]) -> None:
+    for samples in sets:
+        for name, column in _columns(samples).items():
+            bad = ~torch.isfinite(column).reshape(len(samples), -1).all(dim=-1)
+            if bool(bad.any()):
+                at = place(samples.x[bad][0])
+                raise ProblemError(f"{NAMES[name]} is not finite at {at}; it must be finite on the whole torus.")
+
+
+def _jump_at_seam(name: str, size: float) -> str:
+    cost = ": bounds that take its divergence are not used" if name in DIFFERENTIATED else ", as a function may"
+    return f"{NAMES[name]} jumps by {size:.3g} where a coordinate passes from 1 to 0{cost}."
+
+
+def _improper(mass: Estimate, least: float, sets: list[Samples]) -> list[str]:
+    """Why `mu0`, of this ``mass`` and ``least`` value, is no probability density, or cannot be known to be one."""
+    found = []
+    if not least >= -ROUNDING * abs(mass.value):
+        found.append(f"the initial density falls to {least:.3g}, but must not be negative")
     carried = effective_part(torch.cat([s.weight * s.mu0 for s in sets]).clamp_min(0.0))
-    whole = abs(mass.value - 1.0) <= MASS_TOLERANCE + mass.half_width(MASS_LEVEL)
-    if not whole:
-        warnings.append(
-            f"no bound is used: the initial density integrates to {mass.value:.4g} over what a search found of it, but must "
-            "to 1."
+    if not abs(mass.value - 1.0) <= MASS_TOLERANCE + mass.half_width(MASS_LEVEL):
+        found.append(
+            f"the initial density integrates to {mass.value:.4g} over what a search found of it, but must to 1"
         )
     elif carried < LEAST_WORTH:
-        warnings.append(
-            "no bound is used: hardly any sampled state carries mass of the initial density, which is too narrow for its "
-            f"integral to be known (all states are worth as much as {100.0 * carried:.2g} % of them)."
+        found.append(
+            "hardly any sampled state carries mass of the initial density, which is too narrow for its integral to be known "
+            f"(all states are worth as much as {100.0 * carried:.2g} % of them)"
         )
-    sound = not shifted and positive and whole and carried >= LEAST_WORTH
-    return WellPosed(sound, nonnegative, not DIFFERENTIATED & seams.keys(), smallest, mass.value, warnings)
+    return found
 
 
 def _differences(problem: Problem, x: Tensor, y: Tensor, tolerance: float, sizes: dict[str, float]) -> dict[str, float]:
