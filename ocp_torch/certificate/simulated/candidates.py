@@ -1,6 +1,7 @@
 """Which of the controllers is simulated how long: all of them shortly, and the better ones at length."""
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 from ocp_torch.certificate.settings import CertificateSettings
@@ -50,28 +51,7 @@ def simulate_candidates(
     holds its control any that looks worse stays rough: acting at every instant it trembles where that one jumps, and would
     take minutes on fine steps."""
 
-    def simulate(candidate: Candidate, roughly: bool = False) -> Simulated:
-        policy, value, initial, rounded = candidate
-        effort, tolerance, doublings = settings.trajectories, settings.tolerance, MAX_DOUBLINGS
-        if isinstance(policy, HeldPolicy) and not problem.noisy:
-            effort *= MORE_HELD
-        if roughly:
-            effort, tolerance, doublings = max(2, effort // BASELINE_PART), ROUGH_FACTOR * tolerance, ROUGH_DOUBLINGS
-        return Simulation(
-            problem,
-            policy,
-            trajectories=effort,
-            replicates=settings.replicates,
-            seed=seed,
-            value=value,
-            initial=initial,
-            horizon=settings.horizon,
-            tolerance=tolerance,
-            rounded=rounded,
-            doublings=doublings,
-            audited=settings.audited,
-        ).run()
-
+    simulate = partial(_simulated, problem, settings, seed)
     held = [name for name, candidate in candidates.items() if isinstance(candidate.policy, HeldPolicy)]
     many = problem.noisy or held or settings.trajectories * settings.replicates > CHEAP
     roughly_first = [name for name in candidates if name not in held and name != chosen]
@@ -87,3 +67,28 @@ def simulate_candidates(
             lowest = min(lowest, found[name].perf.value)
     nothing = zero_policy(problem)  # the same in any precision
     return found, simulate(Candidate(nothing, None, None, (nothing, None)), roughly=True).perf
+
+
+def _simulated(
+    problem: Problem, settings: CertificateSettings, seed: int, candidate: Candidate, roughly: bool = False
+) -> Simulated:
+    """The performance of ``candidate``; ``roughly`` on a part of the trajectories, with large steps."""
+    effort, tolerance, doublings = settings.trajectories, settings.tolerance, MAX_DOUBLINGS
+    if isinstance(candidate.policy, HeldPolicy) and not problem.noisy:
+        effort *= MORE_HELD
+    if roughly:
+        effort, tolerance, doublings = max(2, effort // BASELINE_PART), ROUGH_FACTOR * tolerance, ROUGH_DOUBLINGS
+    return Simulation(
+        problem,
+        candidate.policy,
+        trajectories=effort,
+        replicates=settings.replicates,
+        seed=seed,
+        value=candidate.value,
+        initial=candidate.initial,
+        horizon=settings.horizon,
+        tolerance=tolerance,
+        rounded=candidate.rounded,
+        doublings=doublings,
+        audited=settings.audited,
+    ).run()
