@@ -43,7 +43,8 @@ class Context:
     """The base of the three kinds: trained fields, a given controller, recorded samples.
 
     ``kind`` names the controller that is handed out, ``candidates`` are all that can be simulated. ``fitted`` are the bounds
-    of the density that was fitted to the closed loop. ``notes`` are warnings before those of the bounds, ``remarks`` after.
+    of the density that was fitted to the closed loop. ``first_warnings`` stand before those of the bounds, ``last_warnings``
+    after.
     """
 
     problem: Problem

@@ -31,8 +31,9 @@ GIVEN = "given"
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ControllerContext(Context):
-    """``policy`` is the controller; ``value`` (float64), any `V`, says how far from optimal it is at most, for which ``kept``
-    was trained before; ``network`` makes the networks for `V^u` and `mu^u`. Raises `InputError` where the policy fails."""
+    """``policy`` is the controller; ``value`` (float64), any `V`, says how far from optimal it is at most, for which the
+    ``saved_subsolution`` was trained before; ``network`` makes the networks for `V^u` and `mu^u`. Raises `InputError` where
+    the policy fails."""
 
     policy: Policy
     value: Field | None
