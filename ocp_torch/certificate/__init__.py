@@ -7,8 +7,7 @@ from ocp_torch.certificate.certify import certify_fields, certify_policy
 from ocp_torch.certificate.contexts.fields import Trained, in_float64
 from ocp_torch.certificate.contexts.trained import TrainedContext
 from ocp_torch.certificate.report import table
-from ocp_torch.certificate.settings import CertificateSettings, Run
-from ocp_torch.certificate.upper.policy_evaluation import StageSettings
+from ocp_torch.certificate.settings import CertificateSettings, Run, StageSettings
 
 __all__ = [
     "BOUNDS",

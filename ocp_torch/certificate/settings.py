@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from ocp_torch.certificate.statistics.estimate import CONFIDENCE
-from ocp_torch.certificate.upper.policy_evaluation import StageSettings
 from ocp_torch.errors import InputError, require_choice, require_flag, require_integer, require_number, visible
 from ocp_torch.files.limits import require_memory
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
+from ocp_torch.steppers.fitting import LARGEST_RATE
 
 # Longest name of a problem or a method, in characters: a longer one would break tables.
 LONGEST_NAME = 120
@@ -50,6 +50,24 @@ class Run:
         if "train_seconds" in said:
             require_number("train_seconds of the certificate", said["train_seconds"], at_least=0.0)
         return cls(**said)
+
+
+@dataclass(frozen=True)
+class StageSettings:
+    """Budget of policy evaluation, `certificate.stage` of a configuration. Raises `InputError` on a wrong value."""
+
+    steps: int = 300  # least-squares steps in the first round; 0 for none at all
+    rounds: int = 3  # at most, each twice as long as the one before; where the slack is steep the last one alone
+    good_excess: float = 1e-4  # part of the Lagrangian bound that comes from the residual, below which rounds end
+    batch: int = 256  # states per step; twice as many where the slack is steep
+    lr: float = 1.0e-2  # learning rate, with cosine decay in each round
+
+    def __post_init__(self) -> None:
+        require_integer("certificate.stage.steps", self.steps, 0)
+        require_integer("certificate.stage.rounds", self.rounds, 1, maximum=16)
+        require_number("certificate.stage.good_excess", self.good_excess, above=0.0)
+        require_integer("certificate.stage.batch", self.batch, 1)
+        require_number("certificate.stage.lr", self.lr, above=0.0, at_most=LARGEST_RATE)
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 
+from ocp_torch.certificate.settings import StageSettings
 from ocp_torch.certificate.upper.lowered import UNCHANGED, LoweredSlack
 from ocp_torch.certificate.upper.multiples import terms_on
 from ocp_torch.control.policies import Policy
-from ocp_torch.errors import require_integer, require_number
 from ocp_torch.fields.embedding import FourierEmbedding
 from ocp_torch.fields.fields import LOG_OCCUPATION, VALUE, Fields
 from ocp_torch.maths.jets import CHUNK, Field
@@ -23,7 +23,6 @@ from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers import advance, short_fit
-from ocp_torch.steppers.fitting import LARGEST_RATE
 
 POOL = 2**15  # samples of a closed loop at most, then drawn again: their divergences cost more than a step
 # A largest slack above this part of `|E[V mu0]|` is steep, as beside kinks: only the last, longest round is then made.
@@ -45,24 +44,6 @@ EXCESS_EVERY = 25  # steps between two evaluations of the excess from then on
 EARLY_PART = 0.05  # of `good_excess`, at which a first round ends early: any `mu` will do where `V` solves its equation
 # That part where the slack is steep: at 1 the circle's certified gap was .002 % wider than after a round of 300 steps.
 STEEP_EARLY_PART = 0.5
-
-
-@dataclass(frozen=True)
-class StageSettings:
-    """Budget of policy evaluation, `certificate.stage` of a configuration. Raises `InputError` on a wrong value."""
-
-    steps: int = 300  # least-squares steps in the first round; 0 for none at all
-    rounds: int = 3  # at most, each twice as long as the one before; where the slack is steep the last one alone
-    good_excess: float = 1e-4  # part of the Lagrangian bound that comes from the residual, below which rounds end
-    batch: int = 256  # states per step; `STEEP_FACTOR` times as many where the slack is steep
-    lr: float = 1.0e-2  # learning rate, with cosine decay in each round
-
-    def __post_init__(self) -> None:
-        require_integer("certificate.stage.steps", self.steps, 0)
-        require_integer("certificate.stage.rounds", self.rounds, 1, maximum=16)
-        require_number("certificate.stage.good_excess", self.good_excess, above=0.0)
-        require_integer("certificate.stage.batch", self.batch, 1)
-        require_number("certificate.stage.lr", self.lr, above=0.0, at_most=LARGEST_RATE)
 
 
 def fit_closed_loop(
