@@ -146,6 +146,21 @@ def test_a_round_ends_at_the_first_look_that_finds_a_good_excess(good_from, monk
     assert len(made) == looks[-1]
 
 
+@pytest.mark.parametrize(
+    ("excess", "steps", "made"), [(1.0, 600, 300), (1.0, 300, 250), (0.2, 300, 300), (1.0, 40, 40)]
+)
+def test_a_fit_ends_half_way_where_its_bound_will_be_of_no_use(excess, steps, made, monkeypatch):
+    problem, taken = zoo.build("manufactured 2-d q=2"), []
+    network = partial(PeriodicMLP, modes=1, width=8, depth=1)
+    counted = policy_evaluation.advance
+    monkeypatch.setattr(policy_evaluation, "advance", lambda *a: taken.append(0) or counted(*a))
+    monkeypatch.setattr(policy_evaluation.LoweredSlack, "excess", lambda self, terms: excess)
+    fields, policy = Fields({"value": network(problem.dim)}), ValuePolicy(problem, problem.exact_value)
+    settings = StageSettings(steps=steps, rounds=1, batch=16)
+    fit_closed_loop(problem, policy, fields, network, resolve_constants(problem), settings, seed=0)
+    assert len(taken) == made
+
+
 def test_a_pool_makes_what_is_drawn_and_gives_the_same_states_again_only_after_all(monkeypatch):
     monkeypatch.setattr(policy_evaluation, "EXCESS_STATES", 8)
     problem = zoo.build("manufactured 2-d q=2")

@@ -44,6 +44,12 @@ EXCESS_EVERY = 25  # steps between two evaluations of the excess from then on
 EARLY_PART = 0.05  # of `good_excess`, at which a first round ends early: any `mu` will do where `V` solves its equation
 # That part where the slack is steep: at 1 the circle's certified gap was .002 % wider than after a round of 300 steps.
 STEEP_EARLY_PART = 0.5
+# Excess half way through the last round at which a fit ends, as what it would come to is of no use either: of dubins, an arm,
+# a unicycle, a pendulum and six oscillators the second half took off 3 to 28 % of it.
+HOPELESS = 0.3
+HOPELESS_AFTER = (
+    250  # steps of that round at least: a unicycle's excess was 1.7 after 100, .2 after 250, .06 after 1,200
+)
 
 
 def fit_closed_loop(
@@ -125,12 +131,18 @@ class ClosedLoopFit:
                     return True
                 if k == self.first and step == COLLAPSE_STEP and self._has_collapsed():
                     return False
+                late = k == self.settings.rounds - 1 and step + 1 == max(steps // 2, HOPELESS_AFTER)
+                if late and self._is_hopeless():
+                    return True
             if self._excess() <= self.settings.good_excess:
                 break
         return True
 
     def _is_good_after(self, steps: int) -> bool:
         return steps >= EXCESS_FIRST and steps % EXCESS_EVERY == 0 and self._excess() <= self.enough
+
+    def _is_hopeless(self) -> bool:
+        return self.slack is not None and self._excess() > HOPELESS  # a `V^u` that is fitted too may have far to go
 
     def _has_collapsed(self) -> bool:
         return self.settings.lr > LEAST_CHECKED_RATE and vanished(self.fitted.log_occupation, self.judged)
