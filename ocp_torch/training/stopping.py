@@ -34,8 +34,8 @@ def reason_to_stop(settings: TrainerSettings, state: TrainState, over: bool) -> 
     return MAX_SECONDS if over else None
 
 
-def in_words(reason: str, settings: TrainerSettings, state: TrainState) -> str:
-    """``reason`` as a sentence for the user."""
+def in_words(reason: str, settings: TrainerSettings, state: TrainState, good: bool) -> str:
+    """``reason`` as a sentence for the user; ``good`` says whether a measured gap made another round needless."""
     at = f"step {state.step:,}"
     if reason == MAX_SECONDS:
         return f"trainer.max_seconds = {settings.max_seconds:g} are over, at {at} of {settings.end(state.round):,}"
@@ -47,7 +47,7 @@ def in_words(reason: str, settings: TrainerSettings, state: TrainState) -> str:
         )
     if reason == TARGET_GAP:
         return f"a quick evaluation at {at} finds trainer.target_gap = {settings.target_gap:g} reached"
-    met = f", and trainer.good_gap = {settings.good_gap:g} is met" if state.round + 1 < settings.rounds else ""
+    met = f", and trainer.good_gap = {settings.good_gap:g} is met" if good else ""
     return f"all {state.step:,} steps are done{met}"
 
 

@@ -142,7 +142,7 @@ class Trainer:
     @property
     def why_stopped(self) -> str:
         """The reason for which `fit` stopped, in words."""
-        return in_words(self.stopped, self.settings, self.state)
+        return in_words(self.stopped, self.settings, self.state, good=self._another_may_follow)
 
     def _reason(self) -> str | None:
         return ASKED if self.asked else reason_to_stop(self.settings, self.state, late(self.settings, self.state))
@@ -202,12 +202,15 @@ class Trainer:
             save_checkpoint(checkpoint.with_name(BEST), self.state_dict())
         return self.state.pending
 
+    @property
+    def _another_may_follow(self) -> bool:
+        """Whether rounds are left; never without both bounds to measure the gap by."""
+        measured = self.fields.value is not None and self.problem.has_simulator
+        return measured and self.state.round + 1 < self.settings.rounds
+
     def _wants_another_round(self) -> bool:
-        """Whether rounds are left and the gap is not good yet; never without both bounds to measure it by."""
-        more = self.state.round + 1 < self.settings.rounds
-        if not more or self.fields.value is None or not self.problem.has_simulator:
-            return False
-        return not self.evaluator.reaches(self.settings.good_gap, self.run)
+        """Whether rounds are left and the gap is not good yet."""
+        return self._another_may_follow and not self.evaluator.reaches(self.settings.good_gap, self.run)
 
     def certify(self, settings: CertificateSettings, fields: Fields | None = None) -> Certificate:
         """The full certificate of ``fields``, or of the averaged ones as they stand."""

@@ -320,3 +320,12 @@ def test_bounds_that_contradict_each_other_stop_nothing_and_choose_nothing(tmp_p
     assert not said["lower"]["F_M"]["counts"]
     assert not said["assumptions"]["hold"]
     assert load_controller(tmp_path / "controller.safetensors").certificate["contradiction"] == said["contradiction"]
+
+
+@pytest.mark.parametrize(("method", "said"), [("dual", True), ("primal", False)])
+def test_a_gap_that_was_not_measured_is_not_said_to_be_met(method, said, monkeypatch):
+    monkeypatch.setattr(Evaluator, "evaluate", quick(lambda trainer: 0.01))
+    trainer = small(f"method={method}", "trainer.steps=8", "trainer.rounds=2", "trainer.good_gap=0.02")
+    assert trainer.fit(Observer()) == "steps"
+    assert trainer.step == 8
+    assert ("good_gap" in trainer.why_stopped) is said
