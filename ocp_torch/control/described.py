@@ -1,6 +1,8 @@
 """The problem of a controller as its file names it, and whether another is the same."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from ocp_torch.errors import InputError
 from ocp_torch.files.storage import finite
@@ -17,8 +19,23 @@ def problem_name(problem: Problem) -> str:
 
 def plain_parameters(parameters: dict) -> dict:
     """The ``parameters`` of a problem that JSON can hold. Only a user's own problem, given on loading, may have others."""
-    listed = {k: list(v) if isinstance(v, tuple) else v for k, v in parameters.items()}
-    return {k: v for k, v in listed.items() if isinstance(v, bool | int | float | str | list | type(None))}
+    return {name: _listed(value) for name, value in parameters.items() if _is_plain(value)}
+
+
+def _is_plain(value: object) -> bool:
+    """Whether JSON can hold ``value``, with all that is in it."""
+    if isinstance(value, Mapping):
+        return all(isinstance(key, str) and _is_plain(own) for key, own in value.items())
+    if isinstance(value, list | tuple):
+        return all(map(_is_plain, value))
+    return isinstance(value, bool | int | float | str | type(None))
+
+
+def _listed(value: Any) -> Any:
+    """``value`` as JSON gives it back: lists for tuples."""
+    if isinstance(value, Mapping):
+        return {key: _listed(own) for key, own in value.items()}
+    return [_listed(own) for own in value] if isinstance(value, list | tuple) else value
 
 
 def described(problem: Problem) -> dict:

@@ -12,7 +12,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from ocp_torch import Circle, InputError, Problem, load_controller
+from ocp_torch import Angle, Circle, InputError, Problem, load_controller
 from ocp_torch.control.policies import trained_policies
 from ocp_torch.files.storage import DIGEST_KEY, METADATA_KEY, digest
 from support.controllers import CERTIFICATE, METHODS, SMALL, controller_of, controllers
@@ -162,6 +162,34 @@ def test_a_problem_with_an_infinite_argument_does_not_lose_its_controller(tmp_pa
     controller.config = config | {"problem": {"_target_": "my_module.Capped", "cap": float("inf")}}
     controller.save(path)
     assert torch.equal(load_controller(path, problem=Capped())(states(2)), controller(states(2)))
+
+
+class Movable(Problem):
+    """Lists and mappings are arguments as natural as numbers, and may hold what no file does."""
+
+    def __init__(self, coordinates=None, gains=None, ranges=((0.0, 1.0),)) -> None:
+        super().__init__(dim=2)
+        self.coordinates, self.ranges = coordinates or [Angle("angle")], ranges
+        self.gains = gains or {"low": 1.0, 2: 3.0}
+
+    def state_cost(self, x):
+        return self.gains["low"] * (1.0 + (2.0 * torch.pi * x).cos().mean(dim=-1))
+
+
+def test_an_argument_that_no_file_can_hold_does_not_lose_a_controller(tmp_path):
+    path = tmp_path / "controller.safetensors"
+    controller_of(configured(*SMALL, "method=dual", "problem=torus"), Movable())[0].save(path)
+    assert load_controller(path, problem=Movable()).problem.ranges == ((0.0, 1.0),)
+    with pytest.raises(InputError, match=r"problem.ranges is \[\[0.0, 2.0\]\], but the run of .* has \[\[0.0, 1.0\]\]"):
+        load_controller(path, problem=Movable(ranges=((0.0, 2.0),)))
+
+
+def test_a_controller_is_not_loaded_with_other_numbers_in_a_mapping(tmp_path):
+    path, mine = tmp_path / "controller.safetensors", Movable(gains={"low": 1.0, "limits": (0.0, 1.0)})
+    controller_of(configured(*SMALL, "method=dual", "problem=torus"), mine)[0].save(path)
+    load_controller(path, problem=Movable(gains={"low": 1.0, "limits": [0.0, 1.0]}))
+    with pytest.raises(InputError, match="problem.gains"):
+        load_controller(path, problem=Movable(gains={"low": 2.0, "limits": (0.0, 1.0)}))
 
 
 def test_a_controller_is_not_loaded_for_another_problem(saved):
