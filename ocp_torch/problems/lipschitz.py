@@ -7,7 +7,8 @@ from dataclasses import dataclass
 class Lipschitz:
     """`|g(x) - g(y)| <= L |x - y|`, Euclidean in torus units, for each entry `g` of the data; `None` where `L` is unknown.
 
-    A method that is not overridden needs no constant.
+    A method that is not overridden needs no constant. Of a `System` all are, and constants are those of its data on the
+    torus, with their margins: 0 where something is the same everywhere.
     """
 
     state_cost: float | None = None

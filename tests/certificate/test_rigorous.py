@@ -306,6 +306,13 @@ def test_a_small_budget_gives_a_looser_bound_that_still_holds():
     assert all(b.slack >= top for b in bounds)
 
 
+def test_a_proof_that_its_budget_cut_short_says_so():
+    problem, V = Circle(), network(1, 6)
+    short, whole = (rigorous_lower_bound(problem, V, sampled_slack=1.0, cells=cells) for cells in (1, 20_000))
+    assert "ended before the tolerance" in short.sentence
+    assert "ended before the tolerance" not in whole.sentence
+
+
 def test_a_supremum_that_sampling_missed_is_found():
     problem, V = Circle(), network(1, 6)
     top = float(slack_function(problem, V)(grid(1, 40_001)).max())

@@ -62,7 +62,10 @@ class RigorousBound:
         """What was proved, for the terminal."""
         (low, high), W = self.integral, f"{self.theta:.4g} V"
         within = f"sup Q of {W} <= {self.slack:.3e}, E[{W} mu0] in [{low:.8f}, {high:.8f}]"
-        return f"proved: {within}, over {self.cells:,} cells"
+        short = (
+            "" if self.complete else ", which ended before the tolerance was met: the bound holds, and could be tighter"
+        )
+        return f"proved: {within}, over {self.cells:,} cells{short}"
 
 
 def obstacle(problem: Problem, value: Field, odd: Tensor | None = None) -> str | None:
