@@ -12,8 +12,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ocp_torch.cli.explain import CHECKOUT, CONFIGS, INSTALLED, explain
-from ocp_torch.errors import InputError, nearest
+from ocp_torch.cli.explain import CHECKOUT, CONFIGS, INSTALLED, explain, is_choice
+from ocp_torch.errors import InputError, nearest, shown
 from ocp_torch.runs.configuration import next_subfolder
 from ocp_torch.runs.resume import find_run, resumed_configuration
 
@@ -91,6 +91,11 @@ def configuration(config_name: str, overrides: list[str], whole: bool = True) ->
         needed = not name.startswith(("hydra", "problem.", "experiment")) and not (own and name == "problem")
         if override.is_delete() and needed:
             raise InputError(f"~{name} leaves out {name}, which is needed; set it to another value instead.")
+        # Of a list Hydra mixes the files, and the last one wins: that is of use for experiments alone.
+        value = override.value()
+        if isinstance(value, list) and len(value) > 1 and is_choice(name) and name != "experiment":
+            several = ",".join(map(str, value))
+            raise InputError(f"{name} is {shown(value)}, but must be one name; -m {name}={several} takes each in turn.")
     try:
         with initialize_config_dir(str(CONFIGS), job_name=config_name, version_base="1.3"):
             config = compose(config_name, overrides, return_hydra_config=True)

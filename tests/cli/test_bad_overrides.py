@@ -162,6 +162,7 @@ REFUSED = {
     ("+traner.steps=10",): "traner is not a field of the configuration (did you mean 'trainer'?)",
     ("--problem=circle",): "write problem=circle, without the dashes",
     ("problem._target_=ocp_torch.problems.Circl",): "has no class Circl (did you mean 'Circle'?)",
+    ("problem=[circle,torus]",): "-m problem=circle,torus takes each in turn",
     ("x=1",): "x is not a field of the configuration.",
     ("-m", "seed=1,x"): "seed is 'x'",
     ("-m", "trainer.steps=1,true"): "trainer.steps is True",
