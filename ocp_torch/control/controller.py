@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import asdict, dataclass
+from dataclasses import fields as dataclass_fields
 from pathlib import Path
 from typing import TypeVar
 
@@ -54,6 +55,10 @@ class Controller:
         self._exact = copy.deepcopy(self.fields).double()
         how = self.occupation, self.problem, self._exact, self.constants
         self._policy = trained_policies(*how, every=True)[self.kind]
+
+    def __reduce__(self) -> tuple:
+        """Copies and pickles are made anew of the fields: policies are functions, which cannot be pickled."""
+        return Controller, tuple(getattr(self, f.name) for f in dataclass_fields(self))
 
     def __repr__(self) -> str:
         said = self.certificate.get("gap")  # as the file has it, which may be anything
@@ -112,7 +117,9 @@ class Controller:
 
     def _states(self, name: str, given: States) -> Tensor:
         """``given`` as floats, if it is of shape ``(N, d)``."""
-        states = torch.as_tensor(given)
+        # PyTorch takes no arrays that run backwards or have another byte order, and warns of those that are read-only.
+        own = np.array(given, dtype=given.dtype.newbyteorder("=")) if isinstance(given, np.ndarray) else given
+        states = torch.as_tensor(own)
         if states.ndim != 2 or states.shape[1] != self.problem.dim:
             raise InputError(f"{name} has shape {tuple(states.shape)}, but must have shape (N, {self.problem.dim}).")
         return states if states.is_floating_point() else states.double()

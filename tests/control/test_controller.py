@@ -5,6 +5,7 @@ import json
 import os
 import pickle
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -98,6 +99,28 @@ def test_numpy_in_gives_numpy_out(saved):
         assert isinstance(u(given.numpy()), np.ndarray)
         np.testing.assert_array_equal(u(given.numpy()), u(given).numpy())
     assert u(np.zeros((0, 2))).shape == (0, 2)
+
+
+def test_any_array_of_states_is_taken_as_it_is(saved):
+    """Backwards, of another byte order, read-only: PyTorch takes none of them, or warns."""
+    u, x = load_controller(saved), states(2).numpy()
+    locked = x.copy()
+    locked.flags.writeable = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for given in (x[::-1][::-1], x.astype(">f4"), locked, np.asfortranarray(x)):
+            np.testing.assert_array_equal(u(given), u(x))
+        np.testing.assert_array_equal(u(x[::-1]), u(x)[::-1])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_controller_is_copied_and_pickled(method):
+    """As a pool of processes does with it."""
+    for controller in controllers(method):
+        x = states(controller.problem.dim)
+        for other in (pickle.loads(pickle.dumps(controller)), copy.deepcopy(controller)):
+            assert torch.equal(other(x), controller(x))
+            assert (other.kind, other.certificate) == (controller.kind, controller.certificate)
 
 
 @pytest.mark.parametrize("shape", [(), (2,), (4, 1), (4, 3), (4, 2, 2), (0,)])
