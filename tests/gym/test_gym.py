@@ -120,6 +120,36 @@ def test_each_action_is_in_units_of_its_actuators_limit(gymnasium):
     torch.testing.assert_close(env.x, (x + env.time_step * env.problem.velocity(middle, u)).remainder(1.0))
 
 
+@pytest.mark.parametrize("name", ["pendulum", "acrobot", "mountain_car"])
+def test_a_step_ends_where_the_system_does_under_a_held_control(gymnasium, name):
+    """Whatever the default time step: that of the mountain car is 20 steps of Gymnasium's. And with the same cost."""
+    env, off, costs = gymnasium.make(f"ocp_torch/{PROBLEMS[name].__name__}-v0").unwrapped, [], []
+    env.action_space.seed(0)
+    parts = 300
+    for k in range(10):
+        x = torch.as_tensor(env.reset(seed=k)[1]["state"])[None]
+        action = env.action_space.sample()
+        *_, info = env.step(action)
+        u = torch.as_tensor(env.control_bound * action.astype(np.float64))[None]
+        cost, h = 0.0, env.time_step / parts
+        for _ in range(parts):
+            velocity, now = env.problem.motion(x + 0.5 * h * env.problem.velocity(x, u), u)
+            x, cost = x + h * velocity, cost + float(now) / parts
+        off.append(float(((torch.as_tensor(info["state"]) - x + 0.5).remainder(1.0) - 0.5).norm()))
+        costs.append((info["cost"], cost))
+    assert np.mean(off) < 5e-3
+    assert np.allclose(*np.mean(costs, axis=0), rtol=0.02)
+
+
+@pytest.mark.parametrize("action", [[0.5], [0.5, 0.5, 0.5], [0.5, np.nan], 0.5, ["a", "b"], None])
+def test_an_action_that_is_not_a_finite_number_for_each_control_is_refused(gymnasium, action):
+    env = gymnasium.make("ocp_torch/Torus-v0").unwrapped
+    before = env.reset(seed=0)[1]["state"].copy()
+    with pytest.raises(InputError, match=r"action is .*, but must be 2 finite numbers\."):
+        env.step(action)
+    assert np.array_equal(before, env.x[0].numpy())
+
+
 def test_a_data_set_is_no_environment(tmp_path):
     path = tmp_path / "a.npz"
     record(zoo.build("circle rho=2"), 300, path, 0, True, 0.0)
