@@ -24,12 +24,14 @@ settings.load_profile("repeatable")
 # Files that take longest: begun first, so that of several processes none waits for another at the end.
 LONGEST = ("test_readme.py", "test_killed.py", "test_adversarial.py", "test_warm_start.py", "test_export.py")
 BEGUN = time.monotonic()
+FIFTHS, STRIDE = 5, 2  # a slow machine runs two fifths of the nightly tests in its time: three turns in a row run all
 
 
 def pytest_addoption(parser):
     parser.addoption(
         "--minutes", type=float, help="skip the tests that would begin later than so many minutes from now"
     )
+    parser.addoption("--turn", type=int, help="begin with another part of the tests, so that --minutes skips others")
 
 
 @pytest.hookimpl(tryfirst=True)  # before what a test needs is made
@@ -39,13 +41,17 @@ def pytest_runtest_setup(item):
         pytest.skip(f"it would begin after the {minutes:g} minutes that --minutes allows")
 
 
-def pytest_collection_modifyitems(items):
-    """The longest files, with those of most tests in between: what is begun last is short."""
+def pytest_collection_modifyitems(config, items):
+    """The longest files, with those of most tests in between: what is begun last is short. Each ``--turn`` begins with the
+    file at another fifth of the tests."""
     many = Counter(item.path for item in items)
     others = sorted((path for path in many if path.name not in LONGEST), key=lambda path: (-many[path], path))
     place = {path: 2 * k + 1 for k, path in enumerate(others)}
     place |= {path: 2 * LONGEST.index(path.name) for path in many if path.name in LONGEST}
     items.sort(key=lambda item: place[item.path])
+    begin = len(items) * (STRIDE * (config.getoption("turn") or 0) % FIFTHS) // FIFTHS
+    begin = next((k for k in range(begin, len(items)) if k == 0 or items[k].path != items[k - 1].path), 0)
+    items[:] = items[begin:] + items[:begin]
 
 
 @pytest.fixture(autouse=True, scope="session")
