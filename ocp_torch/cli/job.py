@@ -121,12 +121,12 @@ class Job:
 
 @contextlib.contextmanager
 def isolated():
-    """Restore threads, precision, random numbers and paths after the body, so that jobs of a sweep are independent."""
+    """Restore threads, precision, random numbers and paths after the body, so that jobs of a sweep are independent. Gradients
+    are had in it, whatever the caller has switched off."""
     dtype, threads = torch.get_default_dtype(), torch.get_num_threads()
     path, folder = list(sys.path), os.getcwd()
-    gradients = torch.set_grad_enabled(torch.is_grad_enabled())
     try:
-        with generators_kept(), gradients:
+        with generators_kept(), torch.inference_mode(False), torch.enable_grad():
             yield
     finally:
         torch.set_default_dtype(dtype)

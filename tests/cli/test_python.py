@@ -108,6 +108,14 @@ def test_the_process_is_left_as_it_was_within_an_application_of_hydra_too():
         assert GlobalHydra.instance().hydra is mine
 
 
+@pytest.mark.parametrize("without", [torch.no_grad, torch.inference_mode])
+def test_a_caller_may_have_switched_gradients_off(without):
+    with without():
+        run = train("circle", settings=SHORT)
+        assert not torch.is_grad_enabled()
+    assert run.certificate["step"] == 10
+
+
 @pytest.mark.nightly
 def test_a_callback_hears_of_steps_and_looks_as_the_history_keeps_them():
     heard = []
