@@ -81,7 +81,7 @@ class CertificateSettings:
     mollify: bool | None = None  # train on and average V for the bound without M; None: where there is no M
     bound_steps: int | None = None  # by which V is trained on for that bound; None: 2,000, with noise 700; 0: none
     occupation_states: int = 144  # where the supremum of the occupation density is looked for; 0 skips it
-    rigorous: bool = False  # a lower bound proved over cells, in one and two dimensions: a second, or up to two minutes
+    rigorous: bool = False  # a lower bound proved over cells, in one and two dimensions: a second, or some minutes
     confidence: float = CONFIDENCE  # how often an interval covers the truth, by Student's t over the replicates
     tolerance: float = 5e-5  # relative; a trajectory's steps are halved until its cost changes by less
     horizon: str = TRUNCATED  # truncated: bounded tail in `bias`; random: an exponential time, no tail and more noise

@@ -55,7 +55,8 @@ def train(
     progress: bool | None = None,
     **parameters: Any,
 ) -> TrainedRun:
-    """Train a controller for ``problem`` and certify it: `python scripts/train.py`, to the same bits.
+    """Train a controller for ``problem`` and certify it: `python scripts/train.py`, to the same bits where PyTorch's default
+    dtype is float32, which it is unless somebody changes it.
 
     ``problem`` is a `Problem`, or the name of one, with its ``parameters``: `train("pendulum", torque_noise=0.3)`.
     ``settings`` sets any field by its name on the command line: `{"trainer.batch": 256, "optimizer": "adam"}`; ``method``,
