@@ -41,6 +41,7 @@ def pytest_runtest_setup(item):
         pytest.skip(f"it would begin after the {minutes:g} minutes that --minutes allows")
 
 
+@pytest.hookimpl(trylast=True)  # of the tests that -m leaves
 def pytest_collection_modifyitems(config, items):
     """The longest files, with those of most tests in between: what is begun last is short. Each ``--turn`` begins with the
     file at another fifth of the tests."""
