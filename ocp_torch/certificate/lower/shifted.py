@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from ocp_torch.certificate.lower.slack import MAX_THETA, Scaled, SlackParts, slack_function
-from ocp_torch.certificate.statistics.estimate import Estimate, integral, integrals
+from ocp_torch.certificate.statistics.estimate import Estimate, integrals
 from ocp_torch.fields.rounded import rounded
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.peaks import NEGLIGIBLE, STEEP_ASCENTS, Peaks, climbed_from, steep_peaks
@@ -67,14 +67,13 @@ class Shift:
     @cached_property
     def initial(self) -> list[float]:
         """`E[W mu0]`, per set; by the mean of its difference from a ``variate``, where there is one."""
-        if self.variate is not None:
-            known = zip(self.variate.initial, self.variate.parts, strict=True)
-            own = zip(self.sets, self.parts, strict=True)
-            return [
-                mean + integral(samples, parts.initial - others.initial[: len(parts.initial)])
-                for (samples, parts), (mean, others) in zip(own, known, strict=True)
-            ]
-        return integrals([s.x for s in self.sets], [p.initial for p in self.parts], [s.weight for s in self.sets])
+        states, values = [samples.x for samples in self.sets], [parts.initial for parts in self.parts]
+        weights = [samples.weight for samples in self.sets]
+        if self.variate is None:
+            return integrals(states, values, weights)
+        known = [parts.initial[: len(own)] for parts, own in zip(self.variate.parts, values, strict=True)]
+        changes = integrals(states, [own - v for own, v in zip(values, known, strict=True)], weights)
+        return [mean + change for mean, change in zip(self.variate.initial, changes, strict=True)]
 
     @cached_property
     def _sampled(self) -> SlackParts:

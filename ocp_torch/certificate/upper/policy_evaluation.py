@@ -142,7 +142,9 @@ class ClosedLoopFit:
         return steps >= EXCESS_FIRST and steps % EXCESS_EVERY == 0 and self._excess() <= self.enough
 
     def _is_hopeless(self) -> bool:
-        return self.slack is not None and self._excess() > HOPELESS  # a `V^u` that is fitted too may have far to go
+        # A `V^u` that is fitted too may have far to go, and `J`, all that recordings have, takes no supremum of the slack.
+        known = self.slack is not None and self.loop.problem.has_simulator
+        return known and self._excess() > HOPELESS
 
     def _has_collapsed(self) -> bool:
         return self.settings.lr > LEAST_CHECKED_RATE and vanished(self.fitted.log_occupation, self.judged)
