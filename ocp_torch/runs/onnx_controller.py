@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ocp_torch.control.exported import PHYSICAL
-from ocp_torch.errors import InputError, shown
+from ocp_torch.errors import InputError, first_line, shown
 from ocp_torch.export import CONTROL
 from ocp_torch.files.plain import NotPlain, json_object
 from ocp_torch.problems import Problem
@@ -29,7 +29,7 @@ def onnx_controller(path: Path, problem: Problem) -> Callable[[Tensor], Tensor]:
     try:
         session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     except Exception as error:  # the runtime has no one type for a bad file
-        raise InputError(f"{path} is not a model that onnxruntime can run: {error}.") from None
+        raise InputError(f"{path} is not a model that onnxruntime can run: {first_line(error)}.") from None
     given, precision, output = *_input(session, path, problem.dim), _output(session, path)
 
     def model(x: Tensor) -> Tensor:

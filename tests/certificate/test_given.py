@@ -196,6 +196,23 @@ def u(x):
 """
 
 
+@pytest.mark.parametrize("script", [False, True])
+def test_a_network_of_another_size_is_refused_by_its_size_not_by_its_precision(script, tmp_path):
+    network = torch.nn.Linear(2, 1)
+    if script:
+        torch.jit.script(network).save(str(tmp_path / "law.pt"))
+        network = load_policy(str(tmp_path / "law.pt"), Circle())
+    with pytest.raises(InputError, match=r"for states in float32 RuntimeError: .*\(7x1 and 2x1\)\.$"):
+        BlackBox(network, Circle())
+
+
+def test_tensors_may_be_answered_with_arrays():
+    mixed = BlackBox(lambda x: 0.5 - x.numpy(), Circle())
+    torch.testing.assert_close(mixed(torch.tensor([[0.2]])), torch.tensor([[0.3]]))
+    with pytest.raises(InputError, match=r"gave shape \(7, 2\) for states \(7, 1\)"):
+        BlackBox(lambda x: np.zeros((len(x.numpy()), 2)), Circle())
+
+
 def test_files_are_loaded_or_refused(tmp_path):
     (tmp_path / "law.py").write_text(FILE)
     torch.jit.script(Sine()).save(str(tmp_path / "law.pt"))

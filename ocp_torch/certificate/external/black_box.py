@@ -17,6 +17,7 @@ BATCHES = (16, 64, 1024)  # sizes of batches that begin with these states, whose
 SAME = 1e-4  # difference of two answers, relative to the control, that rounding explains
 # Relative excess of a control over its limit that clipping in single precision explains: such a control is cut back.
 BEYOND = 1e-5
+TORCHSCRIPT = "TorchScript interpreter"  # in the first line of its errors, whose last line alone says what was wrong
 
 
 class BlackBox:
@@ -32,6 +33,7 @@ class BlackBox:
             raise InputError(f"controller is {function!r}, but must be a function of states (N, {problem.dim}).")
         self.function, self.control_dim = function, problem.control_dim
         self.cost = problem.control_cost
+        self._mixed = False  # whether it takes tensors and answers with arrays
         self._states = scrambled_sobol(max(BATCHES), problem.dim, 0, torch.float64)
         self._convert, self.precision, self._first = self._understood(self._states[:PROBES])
         self.require_still()
@@ -61,7 +63,7 @@ class BlackBox:
     def _ask(self, convert: Callable[[Tensor], object], x: Tensor) -> Tensor:
         with torch.no_grad():
             out = self.function(convert(x.clone()))  # it may write into its argument
-        if isinstance(out, np.ndarray) and isinstance(convert(x[:1]), Tensor):
+        if isinstance(out, np.ndarray) and isinstance(convert(x[:1]), Tensor) and not self._mixed:
             raise _WantsArrays
         out = torch.as_tensor(out if isinstance(out, Tensor) else np.asarray(out)).detach().cpu()
         if out.shape == (len(x),) and self.control_dim == 1:
@@ -88,7 +90,8 @@ class BlackBox:
         """The form of states the controller takes, tensors or arrays, the precision it answers in, and its answers."""
         forms = (lambda x: x, lambda x: x.float(), lambda x: x.numpy())
         complaints = []
-        for convert in forms:
+        # What answers tensors with arrays is first asked with arrays, as NumPy's functions should be.
+        for convert, self._mixed in [*((form, False) for form in forms), *((form, True) for form in forms[:2])]:
             try:
                 out, again, alone = (self._ask(convert, states) for states in (x, x, x[2:3]))
             except Exception as error:  # whatever the user's code may raise
@@ -104,7 +107,12 @@ class BlackBox:
             coarse = out.dtype in (torch.float32, torch.float16, torch.bfloat16) or convert is forms[1]
             return convert, torch.float32 if coarse else torch.float64, out
         own = [e for e in complaints if not isinstance(e, _WantsArrays)]
-        raise _refusal(next((e for e in own if isinstance(e, InputError)), own[0])) from None
+        refusal = _refusal(next((e for e in own if isinstance(e, InputError)), own[0]))
+        if own[:2] == complaints[:2] and not any(isinstance(e, InputError) for e in own):
+            double, single = map(_raised, own[:2])  # a network in float32 says of float64 only that it is not float32
+            if single != double:
+                refusal = InputError(f"the controller raised {double}; and for states in float32 {single}.")
+        raise refusal from None
 
 
 class _WantsArrays(Exception):
@@ -120,7 +128,15 @@ def _refusal(error: Exception) -> InputError:
     """The `InputError` for an ``error`` that the controller raised."""
     if isinstance(error, InputError):
         return error
-    return InputError(f"the controller raised {type(error).__name__}: {first_line(error)}.")
+    return InputError(f"the controller raised {_raised(error)}.")
+
+
+def _raised(error: Exception) -> str:
+    """The type of ``error`` and what it says, without a full stop."""
+    lines = str(error).rstrip().splitlines()
+    if len(lines) > 1 and TORCHSCRIPT in lines[0]:
+        return lines[-1].rstrip(".")
+    return f"{type(error).__name__}: {first_line(error)}"
 
 
 def require_limit(u: Tensor, x: Tensor, cost: PowerCost) -> None:
