@@ -164,6 +164,14 @@ def test_the_occupation_of_the_circle_is_bounded_exactly_above_discount_one(rho,
     assert (Circle(rho).occupation_bound < math.inf) == bounded
 
 
+@pytest.mark.parametrize("dim", [1, 3])
+@pytest.mark.parametrize("rho", [0.05, 2.0, 1e2, 1e4, 1e6])
+def test_the_exact_optimum_of_a_torus_has_all_digits_at_every_discount(rho, dim):
+    """`alpha + 2 alpha^2 / rho^2 = 1 / d` is the Hamilton-Jacobi-Bellman equation of `V* = alpha |y - 1/2|^2`."""
+    alpha = 12.0 * Torus(dim, discount=rho).exact_optimum / dim
+    assert alpha + 2.0 * (alpha / rho) ** 2 == pytest.approx(1.0 / dim, rel=1e-14)
+
+
 @pytest.mark.nightly
 @zoo.on(zoo.EXACT)
 def test_the_parameters_make_the_same_problem_again(problem):

@@ -59,7 +59,8 @@ class Torus(Problem):
         self.A = shear_matrix(self.dim, self.shear, self.seed)
         self.A_inverse = torch.linalg.inv(self.A).round()
         rho, d = self.discount, self.dim
-        self._alpha = (math.sqrt(1.0 + 8.0 / (d * rho**2)) - 1.0) * rho**2 / 4.0
+        # As a quotient: the difference of the docstring has no digits left where rho is large.
+        self._alpha = 2.0 / d / (math.sqrt(1.0 + 8.0 / (d * rho**2)) + 1.0)
         self._rate = 2.0 * self._alpha / rho
         excess = rho - d * self._rate
         self.state_cost_bound = 0.25
