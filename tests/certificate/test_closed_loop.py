@@ -147,14 +147,23 @@ def test_a_round_ends_at_the_first_look_that_finds_a_good_excess(good_from, monk
 
 
 @pytest.mark.parametrize(
-    ("excess", "steps", "made"), [(1.0, 600, 300), (1.0, 300, 250), (0.2, 300, 300), (1.0, 40, 40)]
+    ("excess", "steps", "made", "recorded"),
+    [
+        (1.0, 600, 300, False),
+        (1.0, 300, 250, False),
+        (0.2, 300, 300, False),
+        (1.0, 40, 40, False),
+        (1.0, 300, 300, True),
+    ],
 )
-def test_a_fit_ends_half_way_where_its_bound_will_be_of_no_use(excess, steps, made, monkeypatch):
+def test_a_fit_ends_half_way_where_its_bound_will_be_of_no_use(excess, steps, made, recorded, monkeypatch):
+    """Of a recording `J` is all there is, which takes no supremum of the slack."""
     problem, taken = zoo.build("manufactured 2-d q=2"), []
     network = partial(PeriodicMLP, modes=1, width=8, depth=1)
     counted = policy_evaluation.advance
     monkeypatch.setattr(policy_evaluation, "advance", lambda *a: taken.append(0) or counted(*a))
     monkeypatch.setattr(policy_evaluation.LoweredSlack, "excess", lambda self, terms: excess)
+    monkeypatch.setattr(type(problem), "has_simulator", not recorded)
     fields, policy = Fields({"value": network(problem.dim)}), ValuePolicy(problem, problem.exact_value)
     settings = StageSettings(steps=steps, rounds=1, batch=16)
     fit_closed_loop(problem, policy, fields, network, resolve_constants(problem), settings, seed=0)
