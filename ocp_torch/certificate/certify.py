@@ -17,7 +17,7 @@ from ocp_torch.certificate.contexts.fields import FieldsContext, Trained
 from ocp_torch.certificate.contexts.recorded import RecordedContext
 from ocp_torch.certificate.contexts.trained import TrainedContext
 from ocp_torch.certificate.external.black_box import BlackBox
-from ocp_torch.certificate.report import CONTROLLERS
+from ocp_torch.certificate.report import the_controller
 from ocp_torch.certificate.settings import CERTIFIED, CertificateSettings, Progress, Run, silent
 from ocp_torch.certificate.simulated.outside import outside_note
 from ocp_torch.certificate.simulated.performance import Simulated
@@ -98,7 +98,7 @@ def certify(context: Context) -> Certificate:
 
 def unseen(name: str, found: Simulated) -> list[str]:
     """What the simulation ``found`` of the controller ``name`` cannot have seen, in sentences."""
-    of = f"the {CONTROLLERS.get(name, name)}"
+    of = the_controller(name)
     wall = f"nothing certain is known of what {of} costs: {found.jumped_over}."
     rare = f"no path of {of} came near the dearest states; if one does, it costs up to {found.unmet:.2g} more."
     return ([wall] if found.jumped_over else []) + ([rare] if found.unmet else [])

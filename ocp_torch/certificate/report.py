@@ -39,6 +39,11 @@ ROWS = {
 }
 
 
+def the_controller(name: str) -> str:
+    """What sentences call the controller ``name``."""
+    return CONTROLLERS[name] if name == "given" else f"the {CONTROLLERS.get(name, name)}"
+
+
 def to_dict(certificate: Certificate) -> dict:
     """The schema of ``certificate``, ready for JSON: what does not apply is null."""
     one = lambda e: e.to_dict(certificate.confidence) if known(e) else None
@@ -149,7 +154,7 @@ def _gaps(certificate: dict) -> list[str]:
             lines.append(f"gap, {kind}: {gap_in_words(gap[kind])}{part}")
     for other, found in gap.get("certified_of", {}).items():
         if found is not None and other != certificate["controller"]:
-            lines.append(f"gap, certified, of the {CONTROLLERS.get(other, other)}: {gap_in_words(found)}")
+            lines.append(f"gap, certified, of {the_controller(other)}: {gap_in_words(found)}")
     if gap.get("conditional") is not None:
         guesses = dict.fromkeys(visible(b["if"]) for b in certificate["lower"].values() if b and "if" in b)
         lines.append(f"gap, if {' and '.join(guesses)}: {gap_in_words(gap['conditional'])}, which rests on a guess")

@@ -71,7 +71,7 @@ def test_a_wall_of_a_controller_is_noticed_and_told():
     certificate = certify(River(), barrier, settings=settings, train_steps=0)
     low, high = certificate.perf["given"].interval(0.95)
     assert low <= cost_of_staying(paid=1.0) <= high
-    said = "nothing certain is known of what the controller from given costs: at x = [0.37"
+    said = "nothing certain is known of what this controller costs: at x = [0.37"
     assert any(w.startswith(said) for w in certificate.warnings)
 
 

@@ -9,7 +9,7 @@ import torch
 from ocp_torch.certificate.checks.observed import Observed, observe
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.contexts.fields import FieldsContext, in_float64
-from ocp_torch.certificate.report import CONTROLLERS
+from ocp_torch.certificate.report import the_controller
 from ocp_torch.certificate.simulated.candidates import Candidate
 from ocp_torch.certificate.simulated.performance import Simulated
 from ocp_torch.certificate.statistics.estimate import Estimate
@@ -191,7 +191,7 @@ class TrainedContext(FieldsContext):
         """Warnings about the controllers themselves."""
         found, zero = self.simulated
         notes = [
-            f"the performance of the {CONTROLLERS.get(name, name)} is not finite; it is left out."
+            f"the performance of {the_controller(name)} is not finite; it is left out."
             for name, simulated in found.items()
             if not simulated.perf.finite
         ]
