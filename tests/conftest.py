@@ -24,10 +24,8 @@ settings.load_profile("repeatable")
 # Files that take longest: begun first, so that of several processes none waits for another at the end.
 LONGEST = ("test_readme.py", "test_killed.py", "test_adversarial.py", "test_warm_start.py", "test_export.py")
 BEGUN = time.monotonic()
-FIFTHS, STRIDE = (
-    5,
-    2,
-)  # a slow machine runs two fifths of the nightly tests in its time: three turns one after the other run all
+# With nothing beside, a slow machine has time for some two fifths of the nightly tests: three turns in a row then run all.
+FIFTHS, STRIDE = 5, 2
 
 
 def pytest_addoption(parser):

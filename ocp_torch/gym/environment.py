@@ -24,9 +24,11 @@ CANDIDATES = 4096
 HELD = 0.1
 # Default length of an episode, in units of 1 / rho.
 LENGTH = 5.0
-# A time step is divided until half as long parts end so near, in turns, on average over so many random states and controls,
-# in so many parts at most. One part is off by less for a pendulum, but by 0.2 for an acrobot and by 0.1 for the mountain car.
-CLOSE, TRIED, MOST_PARTS = 2e-3, 64, 64
+# A time step is divided into parts until half as long ones end this near, in turns on average: one part is off by less for a
+# pendulum, but by 0.2 for an acrobot and by 0.1 for the mountain car.
+CLOSE = 2e-3
+TRIED = 64  # random states and controls of that average
+MOST_PARTS = 64
 # Coordinates that are drawn as hands of clocks, at most.
 MOST_CLOCKS = 12
 

@@ -73,7 +73,7 @@ OCCUPATION_STATES = 144  # at which a certificate computes the occupation densit
 OCCUPATION_DIFFERENCES = 144 * 9
 WARM_ROUNDS = 120  # of value iteration before training, at most
 # Simulated starts per replicate, and the fewest with a trainer.effort below 1; powers of 2, over which Sobol points are
-# balanced. With 128 of them Perf of a unicycle is known to .07 %, with 256 to .05 %.
+# balanced. With 128 of them Perf of unicycles was known to .07 to .14 %, with 256 to .05 to .08 %.
 TRAJECTORIES = 256
 FEWEST_TRAJECTORIES = 32
 # Range of trainer.effort, which multiplies all numbers of steps that are null: a file may ask for 40 times as many.

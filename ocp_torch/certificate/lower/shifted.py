@@ -43,8 +43,8 @@ class Shift:
 
     The supremum of the slack is climbed from the ``ascents`` worst of all states, those ``beside`` included, and sought in
     steep places by `STEEP_ASCENTS` times as many ascents in each search. ``name`` is `W` in words; it is averaged over
-    neighbours at ``radius``, unless that is 0. ``variate`` is the bound of a function near `W`, on more states of the same
-    sets, from which `E[W mu0]` then starts. Properties are computed when they are first asked for.
+    neighbours at ``radius``, unless that is 0. ``variate`` is the bound of a function near `W`, on larger sets that begin
+    with these states, from which `E[W mu0]` then starts. Properties are computed when they are first asked for.
     """
 
     problem: Problem

@@ -12,8 +12,8 @@ from ocp_torch.problems.replaced import replaced
 STATES = 2**13  # at which the data are compared; smooth ones are then met within 1e-3 of where they are steepest
 DESIGN = 17
 STEP = 2.0**-14  # half of the length of a line: longer than rounding shows, shorter than features that are worth a name
-# Relative excess over a constant, and the rounding of data relative to 1 + their size, that are no contradiction.
-EXCESS, ROUNDING = 1e-6, 1e-10
+EXCESS = 1e-6  # over a constant, relative, that is no contradiction
+ROUNDING = 1e-10  # of data, relative to 1 + their size
 
 
 def missing(problem: Problem) -> list[str]:

@@ -45,11 +45,10 @@ EARLY_PART = 0.05  # of `good_excess`, at which a first round ends early: any `m
 # That part where the slack is steep: at 1 the circle's certified gap was .002 % wider than after a round of 300 steps.
 STEEP_EARLY_PART = 0.5
 # Excess half way through the last round at which a fit ends, as what it would come to is of no use either: of dubins, an arm,
-# a unicycle, a pendulum and six oscillators the second half took off 3 to 28 % of it.
+# a unicycle, a pendulum and six oscillators the second half took off at most 28 % of it.
 HOPELESS = 0.3
-HOPELESS_AFTER = (
-    250  # steps of that round at least: a unicycle's excess was 1.7 after 100, .2 after 250, .06 after 1,200
-)
+# Steps of that round at least: a unicycle's excess was 1.7 after 100, .31 after 200, .15 after 300 and .06 after 1,200.
+HOPELESS_AFTER = 250
 
 
 def fit_closed_loop(
