@@ -1,22 +1,21 @@
 """The certificate: bounds, performances, standard errors and what they rest on; and the gaps between its sides."""
 
 import json
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ocp_torch.certificate.bounds import BOUNDS
+from ocp_torch.certificate.bounds.bound import LOWER, PERFORMANCE, UPPER
 from ocp_torch.certificate.checks.assumptions import Assumptions
-from ocp_torch.certificate.report import to_dict
+from ocp_torch.certificate.gaps import Side, relative_gap, share
 from ocp_torch.certificate.settings import Run
 from ocp_torch.certificate.statistics.estimate import CONFIDENCE, Estimate, known, known_of
 from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.needs import GUESSED, Need
 
-# A side of a gap: the name of the bound, and the far end of its interval.
-Side = tuple[str, float]
+SCHEMA = 2  # of `certificate.json`
 
 
 @dataclass(frozen=True)
@@ -182,8 +181,39 @@ class Certificate:
         return self.assumptions.hold and all(need.holds for need in needs) and self.contradiction is None
 
     def to_dict(self) -> dict:
-        """What `certificate.json` holds."""
-        return to_dict(self)
+        """What `certificate.json` holds: a stable schema, in which what does not apply is null."""
+        one = lambda e: e.to_dict(self.confidence) if known(e) else None
+        return {
+            "schema": SCHEMA,
+            **vars(self.run),
+            "exact": self.exact,
+            "confidence": self.confidence,
+            "controller": self.controller,
+            **({} if self.held_for is None else {"held_for": self.held_for}),
+            **{side: {n: self._bound(n, e) for n, e in getattr(self, side).items()} for side in (LOWER, UPPER)},
+            **{group: {n: one(e) for n, e in getattr(self, group).items()} for group in ("perf", "baseline")},
+            "gap": self.gap,
+            "share": self.share,
+            "suboptimality": self.suboptimality,
+            **({PERFORMANCE: {name: one(e) for name, e in self.perf_lower.items()}} if self.perf_lower else {}),
+            **({} if self.outside is None else {"outside_box": one(self.outside)}),
+            "assumptions": {**self.assumptions.to_dict(), "hold": self.hold},
+            "contradiction": self.contradiction,
+            "warnings": list(self.warnings),
+        }
+
+    def _bound(self, name: str, estimate: Estimate | None) -> dict | None:
+        """An estimate with what the bound rests on, whether it counts, and what it supposes where a guess may be right."""
+        if not known(estimate):
+            return None
+        needs, is_subject = self.needs(name), self.about.get(name, self.subject) == self.subject
+        supposed = [need.condition for need in needs if need.basis == GUESSED] if self.conditional(name) else []
+        return {
+            **estimate.to_dict(self.confidence),
+            "rests_on": {need.name: need.basis for need in needs},
+            "counts": self.counts(name) and is_subject,
+            **({"if": " and ".join(supposed)} if supposed else {}),
+        }
 
     def save(self, path: Path) -> None:
         """Write `certificate.json`."""
@@ -202,18 +232,3 @@ class Certificate:
         """The one of ``estimates`` with the lowest upper end among those that are ``usable``, and that end."""
         ends = [(name, e.interval(self.confidence)[1]) for name, e in known_of(estimates).items() if usable(name)]
         return min(ends, key=lambda side: side[1], default=None)
-
-
-def relative_gap(lower: Side | None, upper: Side | None) -> float | None:
-    """The gap relative to the lower bound; `None` where that is not positive, or where errors make the two sides cross."""
-    if lower is None or upper is None or lower[1] <= 0.0 or upper[1] < lower[1]:
-        return None
-    return (upper[1] - lower[1]) / lower[1]
-
-
-def share(lower: Side | None, upper: Side | None, zero: float | None) -> float | None:
-    """`1 - (upper - lower) / (zero - lower)`, for ``zero`` the least that doing nothing may cost; `None` where unknown."""
-    if lower is None or upper is None or zero is None or upper[1] < lower[1]:
-        return None
-    gain = zero - lower[1]
-    return 1.0 - (upper[1] - lower[1]) / gain if gain > 0.0 and math.isfinite(gain) else None

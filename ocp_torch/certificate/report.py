@@ -1,22 +1,13 @@
-"""A certificate as `certificate.json` holds it, by a stable schema; as a table for the terminal; and in words."""
-
-from __future__ import annotations
+"""A certificate, as `certificate.json` holds it, as a table for the terminal and in words."""
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from ocp_torch.certificate import bounds
 from ocp_torch.certificate.bounds.bound import LOWER, PERFORMANCE, UPPER
 from ocp_torch.certificate.settings import LONGEST_NAME
-from ocp_torch.certificate.statistics.estimate import Estimate, known
 from ocp_torch.errors import visible
-from ocp_torch.problems.needs import GUESSED
 
-if TYPE_CHECKING:
-    from ocp_torch.certificate.certificate import Certificate
-
-SCHEMA = 2
 WIDE = 1.0  # gaps above this are written as a multiple, not in per cent
 # Where the largest number is outside this range eight decimals would show too few or too many digits.
 DECIMALS = (1e-3, 1e4)
@@ -42,45 +33,6 @@ ROWS = {
 def the_controller(name: str) -> str:
     """What sentences call the controller ``name``."""
     return CONTROLLERS[name] if name == "given" else f"the {CONTROLLERS.get(name, name)}"
-
-
-def to_dict(certificate: Certificate) -> dict:
-    """The schema of ``certificate``, ready for JSON: what does not apply is null."""
-    one = lambda e: e.to_dict(certificate.confidence) if known(e) else None
-    below = certificate.perf_lower
-
-    def bound(name: str, estimate: Estimate | None) -> dict | None:
-        """An estimate with what the bound rests on, whether it counts, and what it supposes where a guess may be right."""
-        if not known(estimate):
-            return None
-        needs = certificate.needs(name)
-        supposed = [need.condition for need in needs if need.basis == GUESSED] if certificate.conditional(name) else []
-        return {
-            **estimate.to_dict(certificate.confidence),
-            "rests_on": {need.name: need.basis for need in needs},
-            "counts": certificate.counts(name)
-            and certificate.about.get(name, certificate.subject) == certificate.subject,
-            **({"if": " and ".join(supposed)} if supposed else {}),
-        }
-
-    return {
-        "schema": SCHEMA,
-        **vars(certificate.run),
-        "exact": certificate.exact,
-        "confidence": certificate.confidence,
-        "controller": certificate.controller,
-        **({} if certificate.held_for is None else {"held_for": certificate.held_for}),
-        **{side: {n: bound(n, e) for n, e in getattr(certificate, side).items()} for side in (LOWER, UPPER)},
-        **{group: {n: one(e) for n, e in getattr(certificate, group).items()} for group in ("perf", "baseline")},
-        "gap": certificate.gap,
-        "share": certificate.share,
-        "suboptimality": certificate.suboptimality,
-        **({PERFORMANCE: {name: one(e) for name, e in below.items()}} if below else {}),
-        **({} if certificate.outside is None else {"outside_box": one(certificate.outside)}),
-        "assumptions": {**certificate.assumptions.to_dict(), "hold": certificate.hold},
-        "contradiction": certificate.contradiction,
-        "warnings": list(certificate.warnings),
-    }
 
 
 def _form(numbers: Sequence[float]) -> str:

@@ -100,6 +100,11 @@ def newest(folder: Path) -> tuple[dict, Path, list[str]]:
     raise InputError(f"{folder} holds no checkpoint, so there is nothing to go on from.")
 
 
+def misfit(path: Path, error: Exception) -> InputError:
+    """What to tell of an ``error`` that the state in ``path`` raised in a run that was to go on from it."""
+    return InputError(f"{path} does not fit this run ({type(error).__name__}: {first_line(error)}).")
+
+
 def _age(path: Path) -> int:
     suffix = path.stem.removeprefix("last-")
     return int(suffix) if suffix.isdecimal() else 0

@@ -4,14 +4,15 @@ import copy
 import math
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ocp_torch.certificate.contexts.fields import in_float64
 from ocp_torch.certificate.lower.slack import slack_function
+from ocp_torch.certificate.settings import Run
+from ocp_torch.compute.processes import SingleProcess
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.maths.jets import Field
 from ocp_torch.maths.sampling import SobolSampler
@@ -21,10 +22,8 @@ from ocp_torch.problems import Problem
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
 from ocp_torch.steppers.gauss_newton import refined
-from ocp_torch.training.observer import Observer
-
-if TYPE_CHECKING:
-    from ocp_torch.training.trainer import Trainer
+from ocp_torch.training.evaluator import Evaluator
+from ocp_torch.training.settings import TrainerSettings
 
 COMPARISON_STATES = 8192  # the same ones for `F_M` before and after the steps
 # States among which ascents to the largest slacks begin: in eight coordinates 4,096 missed a spike of 1e-3 (certified gap
@@ -44,13 +43,15 @@ class RefinedValue(NamedTuple):
     solved: bool
 
 
-def refine(trainer: "Trainer", monitor: Observer, checkpoint: Path | None, stop: Callable[[], bool]) -> None:
-    """Refine the averaged `V` of ``trainer``, from which training goes on, if that helps.
+def refine(
+    evaluator: Evaluator, settings: TrainerSettings, run: Run, ranks: SingleProcess, stop: Callable[[], bool]
+) -> bool:
+    """Refine the averaged `V` that ``evaluator`` judges, from which training goes on, if that helps; and say whether it did.
 
     It has to be called again where it was told to ``stop``. Before the end of a round it is all or nothing: either the
     equation is solved, and a quick evaluation finds a good gap, so that training is over, or all stays as it was.
     """
-    state, settings, started, told = trainer.state, trainer.settings, time.perf_counter(), []
+    problem, state, started, told = evaluator.problem, evaluator.state, time.perf_counter(), []
     spent = lambda: time.perf_counter() - started
 
     def stopping() -> bool:
@@ -58,40 +59,37 @@ def refine(trainer: "Trainer", monitor: Observer, checkpoint: Path | None, stop:
             told.append(True)  # not where a request comes after the last step: the steps are then done
         return bool(told)
 
-    seed, early = derive_seed(trainer.seed, Branch.REFINEMENT, state.round, trainer.step), trainer.step < trainer.end
-    how = trainer.constants.M, settings.newton_steps, seed, stopping
-    monitor.refined(trainer, None)
-    found, drawn = trainer.ranks.from_first(lambda: refined_value(trainer.problem, trainer.averaged_fields, *how))
+    early = state.step < settings.end(state.round)
+    seed = derive_seed(run.seed, Branch.REFINEMENT, state.round, state.step)
+    how = state.constants.M, settings.newton_steps, seed, stopping
+    found, drawn = ranks.from_first(lambda: refined_value(problem, evaluator.trained.fields, *how))
     if found is not None and early and not found.solved:
         found = None
-    kept = _values(trainer)
+    kept = _values(evaluator)
     if found is not None:
-        _put(trainer, [found.weights for _ in kept])
-    state.refined = trainer.ranks.from_first(lambda: not told)
+        _put(evaluator, [found.weights for _ in kept])
+    state.refined = ranks.from_first(lambda: not told)
     state.samples += drawn if state.refined else 0
     state.elapsed += spent()
-    every, another = settings.evaluate_every, state.round + 1 < settings.rounds
-    if state.refined and not early and another and every and trainer.step % every == 0:
-        state.pending = trainer.ranks.from_first(lambda: trainer.evaluate(monitor, checkpoint))
     if found is not None and early:  # not to be shown: the certificate comes next
         goal = min(settings.good_gap, settings.target_gap or math.inf)
-        state.solved = trainer.ranks.from_first(lambda: trainer.evaluator.reaches(goal, trainer.run))
+        state.solved = ranks.from_first(lambda: evaluator.reaches(goal, run))
         if not state.solved:
-            _put(trainer, kept)
-    monitor.refined(trainer, found is not None and (state.solved or not early))
+            _put(evaluator, kept)
+    return found is not None and (state.solved or not early)
 
 
-def _values(trainer: "Trainer") -> list[dict]:
+def _values(evaluator: Evaluator) -> list[dict]:
     """The weights of both `V`, of the iterate and of the average; none where there is no `V`."""
-    fields = trainer.fields, trainer.averaged_fields
+    fields = evaluator.state.fields, evaluator.trained.fields
     return [copy.deepcopy(f.value.state_dict()) for f in fields if f.value is not None]
 
 
-def _put(trainer: "Trainer", weights: list[dict]) -> None:
+def _put(evaluator: Evaluator, weights: list[dict]) -> None:
     """Give both `V` their ``weights``."""
-    for fields, own in zip((trainer.fields, trainer.averaged_fields), weights, strict=True):
+    for fields, own in zip((evaluator.state.fields, evaluator.trained.fields), weights, strict=True):
         fields.value.load_state_dict(own)
-    trainer.evaluator.latest = None  # that certificate is of the `V` before
+    evaluator.latest = None  # that certificate is of the `V` before
 
 
 def refined_value(

@@ -4,11 +4,10 @@ Where `V` is close to `V*`, the slack `Q` is about linear in what is missing: a 
 does not have, and that was too small to be seen in the problem's data, is then the largest that `Q` is made of.
 """
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
+from ocp_torch.compute.processes import SingleProcess
 from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.fields.coupled_waves import coupled_waves, may_be_coupled
 from ocp_torch.fields.embedding import FourierEmbedding
@@ -16,9 +15,7 @@ from ocp_torch.fields.waves import WAVE_STATES, standardised, waves_of
 from ocp_torch.problems import Problem
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
-
-if TYPE_CHECKING:
-    from ocp_torch.training.trainer import Trainer
+from ocp_torch.training.state import TrainState
 
 # Steps of a round after which missed waves are sought; the last time waves of many coordinates too, which takes seconds. In
 # 32 coordinates F_M ended .026 % below OPT with searches, .174 % without.
@@ -62,11 +59,11 @@ def add_waves(fields: Fields, waves: Tensor) -> None:
             network.add_waves(waves)
 
 
-def seek_waves(trainer: "Trainer") -> None:
-    """Give all networks the waves that the slack shows to be missing, before the steps `WAVE_SEARCH_STEPS` of a round."""
-    done = trainer.step - trainer.settings.start(trainer.state.round)
+def seek_waves(problem: Problem, state: TrainState, done: int, ranks: SingleProcess) -> None:
+    """Give all networks of ``state`` the waves that the slack shows to be missing, after those steps ``done`` of a round that
+    `WAVE_SEARCH_STEPS` lists."""
     if done in WAVE_SEARCH_STEPS:
-        last = done == WAVE_SEARCH_STEPS[-1]
-        waves = trainer.ranks.from_first(lambda: missed_waves(trainer.problem, trainer.averaged_fields, last))
-        for fields in (trainer.fields, trainer.averaged_fields):
+        averaged, last = state.average.module, done == WAVE_SEARCH_STEPS[-1]
+        waves = ranks.from_first(lambda: missed_waves(problem, averaged, last))
+        for fields in (state.fields, averaged):
             add_waves(fields, waves)

@@ -11,13 +11,13 @@ from ocp_torch.certificate import Certificate, CertificateSettings, Run, Trained
 from ocp_torch.certificate.settings import Progress, silent
 from ocp_torch.compute.cuda_graphs import replays_on
 from ocp_torch.compute.processes import LostError, SingleProcess
-from ocp_torch.errors import InputError, first_line
+from ocp_torch.errors import InputError
 from ocp_torch.fields import Fields
 from ocp_torch.objectives import Objective, Phase
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import blamed
 from ocp_torch.problems.constants import Constants
-from ocp_torch.training.checkpoint import BEST, load_checkpoint, save_checkpoint
+from ocp_torch.training.checkpoint import BEST, load_checkpoint, misfit, save_checkpoint
 from ocp_torch.training.evaluator import Evaluator
 from ocp_torch.training.health import sanity_warnings
 from ocp_torch.training.observer import Observer
@@ -72,8 +72,7 @@ class Trainer:
 
     @property
     def averaged_fields(self) -> Fields:
-        """The fields that are handed out."""
-        return self.trained.fields
+        return self.trained.fields  # those that are handed out
 
     @property
     def run(self) -> Run:
@@ -124,7 +123,7 @@ class Trainer:
         reason = self.ranks.from_first(self._reason)
         while reason is None:
             if not self.state.refined and self.step in (self.settings.newton_after or self.end, self.end):
-                refine(self, monitor, checkpoint, lambda: self.asked or signals.received is not None)
+                self._refine(monitor, checkpoint, signals)
             elif self.step < self.end:
                 self._advance(monitor, checkpoint)
             elif self.ranks.from_first(self._wants_another_round):
@@ -166,7 +165,7 @@ class Trainer:
     def _advance(self, monitor: Observer, checkpoint: Path | None) -> None:
         """Make a step, and what is due after it."""
         settings, state, started = self.settings, self.state, time.perf_counter()
-        seek_waves(self)
+        seek_waves(self.problem, state, self.step - settings.start(state.round), self.ranks)
         report = whole_step(self.state, self.phase, self.ranks)
         state.step, state.refined = state.step + 1, False
         state.samples += self.ranks.size * report.samples
@@ -181,6 +180,17 @@ class Trainer:
         state.elapsed += time.perf_counter() - started
         if self._due(settings.checkpoint_every) or state.pending:
             self.save(checkpoint)
+
+    def _refine(self, monitor: Observer, checkpoint: Path | None, signals: Signals) -> None:
+        """Try Gauss-Newton steps, and evaluate what they give where an evaluation is due before the next round."""
+        state, settings = self.state, self.settings
+        monitor.refined(self, None)
+        stop = lambda: self.asked or signals.received is not None
+        helped = refine(self.evaluator, settings, self.run, self.ranks, stop)
+        between = self.step == self.end and state.round + 1 < settings.rounds
+        if state.refined and between and self._due(settings.evaluate_every):
+            state.pending = self.ranks.from_first(lambda: self.evaluate(monitor, checkpoint))
+        monitor.refined(self, helped)
 
     def _due(self, every: int) -> bool:
         return every > 0 and self.step % every == 0
@@ -199,7 +209,7 @@ class Trainer:
         target, gap = self.settings.target_gap, certificate.plain_gap
         self.state.pending = target is not None and gap is not None and gap <= target and self.step >= self.state.retry
         if best and checkpoint is not None:
-            save_checkpoint(checkpoint.with_name(BEST), self.state_dict())
+            save_checkpoint(checkpoint.with_name(BEST), self.state.state_dict())
         return self.state.pending
 
     @property
@@ -221,11 +231,7 @@ class Trainer:
         """Write the state to ``checkpoint``, never one that is not finite. Raises `NonFiniteError`, `StorageError`."""
         self.state.require_finite()
         if checkpoint is not None:
-            save_checkpoint(checkpoint, self.state_dict(), self.settings.keep)
-
-    def state_dict(self) -> dict:
-        """Everything needed to go on exactly."""
-        return self.state.state_dict()
+            save_checkpoint(checkpoint, self.state.state_dict(), self.settings.keep)
 
     def resume(self, checkpoint: Path, state: dict | None = None) -> None:
         """Go on from ``checkpoint`` exactly where it was saved; ``state`` is what it holds, where that has been read already.
@@ -238,10 +244,7 @@ class Trainer:
             self.state.try_step(replace(self.phase, progress=1.0))
             self.state.load_state_dict(state, self.settings)
             self.evaluator.latest = None  # what was seen of another state at the same step says nothing
+        except InputError:
+            raise
         except Exception as error:  # a crafted state raises whatever its odd part leads to
-            if isinstance(error, InputError):
-                raise
-            if (told := blamed(error, type(self.problem))) is not None:
-                raise told from None
-            reason = f"{type(error).__name__}: {first_line(error)}"
-            raise InputError(f"{checkpoint} does not fit this run ({reason}).") from None
+            raise blamed(error, type(self.problem)) or misfit(checkpoint, error) from None

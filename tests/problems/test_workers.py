@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from ocp_torch.problems.simulator.target import Workers
+from ocp_torch.problems.simulator.workers import Workers
 from support.processes import alive, descendants, linux, wait_until
 
 MODULE = """

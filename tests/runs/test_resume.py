@@ -135,7 +135,7 @@ def test_the_round_follows_the_new_length(tmp_path):
     made = maker("method=dual")
     trainer = made(rounds=2, steps=4)
     trainer.state.round, trainer.state.step = 1, 10
-    save_checkpoint(tmp_path / "a.pt", trainer.state_dict())
+    save_checkpoint(tmp_path / "a.pt", trainer.state.state_dict())
     for steps, rounds, wanted in ((4, 2, 1), (5, 2, 1), (20, 2, 0), (3, 3, 2), (2, 1, 0)):
         other = made(rounds=rounds, steps=steps)
         other.resume(tmp_path / "a.pt")

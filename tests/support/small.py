@@ -57,4 +57,4 @@ def session(trainer, folder):
 
 def state_of(trainer) -> dict:
     """All of its state that must repeat: everything but the clock, and how often it is looked at."""
-    return {k: v for k, v in trainer.state_dict().items() if k not in ("seconds", "elapsed", "config")}
+    return {k: v for k, v in trainer.state.state_dict().items() if k not in ("seconds", "elapsed", "config")}

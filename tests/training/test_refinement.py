@@ -141,14 +141,14 @@ def test_they_end_where_a_run_has_no_seconds_left():
     trainer = small(*LITTLE, "trainer.max_seconds=1000")
     trainer.state.step, trainer.state.elapsed = 20, 999.999
     before = weights(trainer.averaged_fields)
-    refinement.refine(trainer, Observer(), None, lambda: False)
+    refinement.refine(trainer.evaluator, trainer.settings, trainer.run, trainer.ranks, lambda: False)
     assert not trainer.state.refined
     assert torch.equal(weights(trainer.averaged_fields), before)
 
 
 def test_a_checkpoint_from_before_there_were_any_goes_on(tmp_path):
     trainer = small(*LITTLE)
-    state = trainer.state_dict()
+    state = trainer.state.state_dict()
     del state["refined"]
     trainer.state.load_state_dict(state, trainer.settings)
     assert trainer.state.refined

@@ -61,14 +61,14 @@ def test_a_run_of_replays_resumes_to_the_same_bits(variant, device):
     options = (*VARIANTS[variant], "trainer.steps=24", f"trainer.device={device.type}")
     whole, first, second = (replays(small(*options)) for _ in range(3))
     steps(whole, 24)
-    second.state.load_state_dict(steps(first, 13).state_dict(), second.settings)
+    second.state.load_state_dict(steps(first, 13).state.state_dict(), second.settings)
     assert torch.equal(weights(steps(second, 11)), weights(whole))
 
 
 def test_a_state_is_loaded_over_what_was_captured(device):
     options = ("method=dual", "trainer.steps=24", f"trainer.device={device.type}")
     trainer = steps(replays(small(*options)), 9)
-    state = copy.deepcopy(trainer.state_dict())
+    state = copy.deepcopy(trainer.state.state_dict())
     once = weights(steps(trainer, 8))
     trainer.state.load_state_dict(state, trainer.settings)
     assert torch.equal(weights(steps(trainer, 8)), once)

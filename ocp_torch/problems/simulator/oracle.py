@@ -8,7 +8,8 @@ from torch import Tensor
 
 from ocp_torch.errors import InputError, ProblemError, first_line, require_integer
 from ocp_torch.maths.sampling import scrambled_sobol
-from ocp_torch.problems.simulator.target import Workers, asked, resolved
+from ocp_torch.problems.simulator.target import asked, resolved
+from ocp_torch.problems.simulator.workers import Workers
 
 # Two answers at a state may differ by this, relative to the size of the answer: rounding.
 SAME = 1e-6
