@@ -16,6 +16,7 @@ from hydra.version import VersionBase
 from ocp_torch.cli.compose import configuration, run_data, with_own_defaults
 from ocp_torch.control.described import plain_parameters, problem_name
 from ocp_torch.errors import InputError, shown
+from ocp_torch.files.plain import DEEPEST
 from ocp_torch.problems import PROBLEMS, Problem
 from ocp_torch.problems.blame import named
 from ocp_torch.problems.commands import LONGEST, PACKAGE, as_typed
@@ -61,6 +62,8 @@ def data_of(config_name: str, problem: Asked, parameters: Mapping[str, Any], set
 def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """``settings`` on one level, by dotted names. Raises `InputError` for a name that no field can have."""
     found: dict[str, Any] = {}
+    if prefix.count(".") > DEEPEST:
+        raise InputError(f"settings nests deeper than {DEEPEST} levels; one that holds itself has no end.")
     for name, value in settings.items():
         if not isinstance(name, str) or not FIELD.fullmatch(name):
             raise InputError(f"settings has {shown(name)}, but must have names of fields, as in 'trainer.batch'.")
@@ -73,12 +76,15 @@ def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def plain(name: str, value: Any) -> Any:
-    """``value`` if it is made of numbers, words and lists of them, as plain data; `InputError` for anything else."""
+def plain(name: str, value: Any, depth: int = 0) -> Any:
+    """``value``, within ``depth`` lists, if it is made of numbers, words and lists of them, as plain data; `InputError` for
+    anything else."""
     if isinstance(value, np.generic | np.ndarray | torch.Tensor):
         value = value.tolist()
+    if depth > DEEPEST:
+        raise InputError(f"{name} nests deeper than {DEEPEST} levels; a list that holds itself has no end.")
     if isinstance(value, list | tuple):
-        return [plain(name, each) for each in value]
+        return [plain(name, each, depth + 1) for each in value]
     value = str(value) if isinstance(value, Path) else value
     if isinstance(value, str) and (len(value) > LONGEST or not value.isprintable()):
         raise InputError(f"{name} is {shown(value)}, but must be a word of at most {LONGEST} printable signs.")

@@ -17,7 +17,7 @@ from ocp_torch.cli.single import require_writable, told
 from ocp_torch.compute.processes import joined
 from ocp_torch.control.saved import load_controller
 from ocp_torch.errors import InputError, require_integer, shown
-from ocp_torch.files.reading import kind, read_json, require_unlinked
+from ocp_torch.files.reading import kind, read_json, require_path, require_unlinked
 from ocp_torch.files.storage import only_writer
 from ocp_torch.problems import Problem
 from ocp_torch.problems.blame import blamed
@@ -86,7 +86,7 @@ def train(
             with told():
                 config = data_of("train", problem, parameters, {**unseen, **fields, **changed})
                 run = training_run(config, problem if isinstance(problem, Problem) else None)
-                place = _place(config, None if folder is None else Path(folder))
+                place = _place(config, None if folder is None else require_path("folder", folder))
                 done = None if place is None else _finished(run, place)
             return done or _trained(run, place, history, partial(Watch, history=history, callback=callback))
     except CallbackFailed as failure:
@@ -179,8 +179,8 @@ def compare(runs: TrainedRun | str | Path | Iterable[TrainedRun | str | Path]) -
 
     The smallest gap comes first; runs that are in no folder are named by their place among ``runs``. Raises `InputError`.
     """
-    given = [runs] if isinstance(runs, TrainedRun | str | Path) else list(runs)
-    found = compared([Path(run) for run in given if isinstance(run, str | Path)])
+    given = list(runs) if isinstance(runs, Iterable) and not isinstance(runs, str) else [runs]
+    found = compared([require_path("a run", run) for run in given if not isinstance(run, TrainedRun)])
     names = {k: str(run.folder or f"run {k}") for k, run in enumerate(given) if isinstance(run, TrainedRun)}
     rows = [row_from(run.certificate, names[k]) for k, run in enumerate(given) if isinstance(run, TrainedRun)]
     folders = {names[k]: run.folder for k, run in enumerate(given) if isinstance(run, TrainedRun) and run.folder}

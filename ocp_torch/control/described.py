@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ocp_torch.errors import InputError
+from ocp_torch.files.plain import DEEPEST
 from ocp_torch.files.storage import finite
 from ocp_torch.problems import PROBLEMS, Problem
 from ocp_torch.problems.physical.system import System
@@ -22,12 +23,12 @@ def plain_parameters(parameters: dict) -> dict:
     return {name: _listed(value) for name, value in parameters.items() if _is_plain(value)}
 
 
-def _is_plain(value: object) -> bool:
-    """Whether JSON can hold ``value``, with all that is in it."""
+def _is_plain(value: object, depth: int = 0) -> bool:
+    """Whether JSON can hold ``value``, within ``depth`` others, with all that is in it; not where that has no end."""
     if isinstance(value, Mapping):
-        return all(isinstance(key, str) and _is_plain(own) for key, own in value.items())
+        return all(isinstance(key, str) for key in value) and _is_plain([*value.values()], depth)
     if isinstance(value, list | tuple):
-        return all(map(_is_plain, value))
+        return depth < DEEPEST and all(_is_plain(own, depth + 1) for own in value)
     return isinstance(value, bool | int | float | str | type(None))
 
 

@@ -11,7 +11,7 @@ from ocp_torch.control.policies import CLOSED, NETWORK, SADDLE
 from ocp_torch.errors import InputError, notes
 from ocp_torch.fields import CONTROL_DENSITY, LOG_OCCUPATION, MODELS, SUBSOLUTION, TRAJECTORY_VALUE, VALUE, Fields, made
 from ocp_torch.files.limits import require_held, require_modest_problem
-from ocp_torch.files.reading import FILE, FOLDER, kind
+from ocp_torch.files.reading import FILE, FOLDER, kind, require_path
 from ocp_torch.files.storage import load_tensors
 from ocp_torch.problems import PROBLEMS, Problem
 from ocp_torch.problems.checks.check import check_once
@@ -40,7 +40,7 @@ def load_controller(path: str | Path, problem: Problem | None = None, device: st
     ``problem``, made with the same arguments. Raises `InputError` when the file is missing, damaged, of a newer schema, or
     does not fit the problem.
     """
-    path = controller_file(Path(path))
+    path = controller_file(require_path("path", path))
     tensors, metadata = load_tensors(path)
     schema = metadata.get("schema")
     if not isinstance(schema, int) or schema > SCHEMA:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO, cast
 from zipfile import ZipFile
 
-from ocp_torch.errors import InputError
+from ocp_torch.errors import InputError, shown
 from ocp_torch.files.plain import NotPlain, json_object, looked_up, yaml_mapping
 
 # Kinds of paths.
@@ -28,6 +28,13 @@ LARGEST_PIECE = 2**20
 WRITTEN = (".hydra", "checkpoints", "figures", "*.log", "*.json", "*.html", "*.safetensors", "events.*")
 
 
+def require_path(name: str, value: object) -> Path:
+    """``value`` as a path; raises `InputError`, about what ``name`` is, where it is none."""
+    if not isinstance(value, str | os.PathLike):
+        raise InputError(f"{name} is {shown(value)}, but must be a path, as in 'outputs/circle_pd'.")
+    return Path(value)
+
+
 def kind(path: str | Path) -> str | None:
     """``FILE``, ``FOLDER`` or ``OTHER`` (a pipe, a device, a socket), links followed; `None` where there is nothing. Raises
     `InputError` where the path is too long, in a folder that may not be entered, or a circle of links."""
@@ -38,8 +45,8 @@ def kind(path: str | Path) -> str | None:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
-        shown = f"{str(path)[:80]!r}... ({len(str(path)):,} characters)" if long else repr(str(path))
-        raise InputError(f"{shown} is not a path that can be read: {reason}.") from None
+        named = f"{str(path)[:80]!r}... ({len(str(path)):,} characters)" if long else repr(str(path))
+        raise InputError(f"{named} is not a path that can be read: {reason}.") from None
     return FILE if stat.S_ISREG(mode) else FOLDER if stat.S_ISDIR(mode) else OTHER
 
 

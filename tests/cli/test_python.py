@@ -156,6 +156,11 @@ def test_what_a_callback_raises_is_raised():
         train("circle", settings=SHORT, callback=lambda moment: 1 / 0)
 
 
+ENDLESS, ENDLESS_GROUP = [1.0], {}
+ENDLESS.append(ENDLESS)
+ENDLESS_GROUP["trainer"] = ENDLESS_GROUP
+
+
 @pytest.mark.parametrize(
     ("asked", "override"),
     [
@@ -189,6 +194,12 @@ def test_a_mistake_is_told_as_on_the_command_line(asked, override):
         (lambda: train("circle", folder="/dev/null/x"), ("folder", "/dev/null/x")),
         (lambda: reference("circle", side=-3), ("side",)),
         (lambda: compare(["nowhere"]), ("nowhere",)),
+        (lambda: compare(None), ("a run is None", "path")),
+        (lambda: compare([3]), ("a run is 3", "path")),
+        (lambda: train("circle", folder=3), ("folder is 3", "path")),
+        (lambda: load_controller(None), ("path is None", "outputs/circle_pd")),
+        (lambda: train("circle", noise=ENDLESS), ("problem.noise", "holds itself")),
+        (lambda: train("circle", settings=ENDLESS_GROUP), ("settings", "holds itself")),
     ],
 )
 def test_a_mistake_that_only_python_can_make_is_told_in_a_sentence(asked, words):

@@ -14,6 +14,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from ocp_torch import Angle, Circle, InputError, Problem, load_controller
+from ocp_torch.control.described import plain_parameters
 from ocp_torch.control.policies import trained_policies
 from ocp_torch.files.storage import DIGEST_KEY, METADATA_KEY, digest
 from support.controllers import CERTIFICATE, METHODS, SMALL, controller_of, controllers
@@ -203,6 +204,9 @@ def test_an_argument_that_no_file_can_hold_does_not_lose_a_controller(tmp_path):
     path = tmp_path / "controller.safetensors"
     controller_of(configured(*SMALL, "method=dual", "problem=torus"), Movable())[0].save(path)
     assert load_controller(path, problem=Movable()).problem.ranges == ((0.0, 1.0),)
+    endless = [1.0]
+    endless.append(endless)
+    assert plain_parameters({"ranges": endless, "gains": {"low": endless}, "depth": 3.0}) == {"depth": 3.0}
     with pytest.raises(InputError, match=r"problem.ranges is \[\[0.0, 2.0\]\], but the run of .* has \[\[0.0, 1.0\]\]"):
         load_controller(path, problem=Movable(ranges=((0.0, 2.0),)))
 
