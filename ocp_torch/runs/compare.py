@@ -1,5 +1,6 @@
 """Runs side by side, the smallest gap first: their certificates as a table for the terminal, as CSV, and as a plot."""
 
+import contextlib
 import csv
 import io
 import math
@@ -11,12 +12,14 @@ from pathlib import Path
 from ocp_torch.certificate.report import WIDE
 from ocp_torch.certificate.settings import LONGEST_NAME
 from ocp_torch.errors import InputError, visible
-from ocp_torch.files.reading import FOLDER, kind, read_json
+from ocp_torch.files.reading import FOLDER, kind, read_json, read_text
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.runs.canvas import blank_figure, save_figure
 from ocp_torch.training.checkpoint import newest
 
 LARGEST_CERTIFICATE = 2**22
+LOG, LARGEST_LOG = "train.log", 2**24
+FAILED = "error: "  # how the last line of the log of a failed job of a sweep begins
 # Names come from untrusted files: control characters and overlong names must not reach the terminal.
 printable = partial(visible, most=LONGEST_NAME)
 # A number that would take more characters is shown with six digits.
@@ -205,13 +208,23 @@ def number_or_none(value) -> float | None:
     return None if value is None else number(value)
 
 
+def failure_in(folder: Path) -> str:
+    """What the log in ``folder`` says a job of a sweep failed by; empty where it says nothing of that."""
+    with contextlib.suppress(InputError):
+        last = read_text(folder / LOG, LARGEST_LOG).rstrip().rpartition("\n")[2]
+        return visible(f"failed: {last[len(FAILED) :]}") if last.startswith(FAILED) else ""
+    return ""
+
+
 def progress_of(folder: Path) -> str:
     """A sentence on how far a run without a certificate came."""
+    failed = failure_in(folder)
     try:
         state = newest(folder / "checkpoints")[0]
         total = state["config"]["trainer"]["steps"]
-        return f"not finished: saved at step {int(state['step'])} of {int(total)}; resume={printable(folder)} goes on."
+        saved = f"saved at step {int(state['step'])} of {int(total)}; resume={printable(folder)} goes on"
+        return f"not finished: {saved}{f'; {failed}' if failed else '.'}"
     except InputError as error:
-        return f"not finished: {printable(error)}"
+        return failed or f"not finished: {printable(error)}"
     except (KeyError, TypeError, ValueError):
         return "its checkpoint is not the state of a run."

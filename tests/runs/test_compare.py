@@ -55,6 +55,20 @@ def test_runs_are_sorted_by_gap_and_what_is_not_finished_is_named(outputs):
     assert [row["run"] for row in compare([outputs / "circle_dual" / "good"]).rows] == ["good"]
 
 
+def test_a_job_that_failed_is_named_with_its_reason(outputs):
+    """The last line of its log counts: one that went on, and was stopped, has not failed."""
+    runs, said = outputs / "circle_pd", "error: job 1 (problem.discount=-1): problem.discount is -1."
+    (runs / "empty" / "train.log").write_text(f"{said}\n")
+    (runs / "killed" / "train.log").write_text(f"going on\n{said}\n")
+    why = {name.rpartition("/")[2]: text for name, text in compare([outputs]).unfinished.items()}
+    assert why["empty"] == "failed: job 1 (problem.discount=-1): problem.discount is -1."
+    assert why["killed"].startswith("not finished: saved at step 30 of 90; resume=")
+    assert why["killed"].endswith("goes on; failed: job 1 (problem.discount=-1): problem.discount is -1.")
+    (runs / "killed" / "train.log").write_text(f"{said}\ngoing on\n")
+    why = {name.rpartition("/")[2]: text for name, text in compare([outputs]).unfinished.items()}
+    assert why["killed"].endswith("goes on.")
+
+
 @pytest.mark.parametrize(
     "change",
     [
