@@ -151,6 +151,12 @@ def test_what_is_no_controller_is_refused_in_one_sentence(name):
     assert "\n" not in str(caught.value)
 
 
+def test_sparse_controls_are_controls():
+    box = BlackBox(lambda x: x.to_sparse(), Manufactured(dim=2))
+    x = torch.rand(20, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert torch.equal(box(x), x)
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_derivatives_of_a_black_box_are_those_of_its_function(dtype):
     policy = lambda x: torch.stack([(TURN * x[:, 0]).sin(), x[:, 1].cos() * (TURN * x[:, 0]).cos()], dim=-1)

@@ -65,7 +65,7 @@ class BlackBox:
             out = self.function(convert(x.clone()))  # it may write into its argument
         if isinstance(out, np.ndarray) and isinstance(convert(x[:1]), Tensor) and not self._mixed:
             raise _WantsArrays
-        out = torch.as_tensor(out if isinstance(out, Tensor) else np.asarray(out)).detach().cpu()
+        out = torch.as_tensor(out if isinstance(out, Tensor) else np.asarray(out)).detach().cpu().to_dense()
         if out.shape == (len(x),) and self.control_dim == 1:
             out = out.unsqueeze(-1)
         wanted = (len(x), self.control_dim)
