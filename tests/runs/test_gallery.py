@@ -30,7 +30,8 @@ SYSTEMS = ["torus", "circle"]
 
 
 def asked(folder, systems=SYSTEMS, common=QUICK, overrides=OWN) -> dict:
-    return {"systems": list(systems), "common": dict(common), "overrides": dict(overrides), "folder": str(folder)}
+    own = {name: given for name, given in overrides.items() if name in systems}
+    return {"systems": list(systems), "common": dict(common), "overrides": own, "folder": str(folder)}
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +136,8 @@ def test_what_is_finished_is_not_trained_again(made, monkeypatch):
         ({"systems": ["circle", "dataset"]}, ("dataset: problem.path is missing",)),
         ({"overrides": {"circel": {}}}, ("overrides", "'circel'")),
         ({"overrides": {"circle": {"problem.nose": 1}}}, ("circle: problem.nose", "did you mean 'problem.noise'")),
+        ({"overrides": {"torus": {"problem.dim": 3}}}, ("overrides.torus is set", "not in systems, ['circle']")),
+        ({"overrides": {"arm": {"problem": {"joint_noise": 0.6}}}}, ("overrides.arm is set", "not in systems")),
         ({"overrides": {"circle": {"problem": "torus"}}}, ("overrides.circle.problem is set",)),
         ({"common": {"resume": "auto"}}, ("common.resume is set",)),
         ({"common": {"trainer": {"batch": 0}}}, ("circle: trainer.batch is 0",)),
@@ -160,6 +163,13 @@ def test_a_field_of_all_wins_and_one_that_is_null_is_left_as_it_is(tmp_path):
     common, own = {"method": "dual", "seed": None}, {"circle": {"method": "pd", "seed": 3}}
     (circle,) = gallery.planned(asked(tmp_path, ["circle"], common, own))
     assert circle.command == "python scripts/train.py problem=circle method=dual seed=3"
+
+
+def test_what_the_file_itself_sets_for_a_system_that_is_not_shown_is_no_mistake(tmp_path):
+    usual = composed("gallery", [])["overrides"]
+    asking = {**asked(tmp_path, ["circle"]), "overrides": usual}
+    assert "pendulum" in usual
+    assert [system.name for system in gallery.planned(asking)] == ["circle"]
 
 
 def test_from_the_command_line_a_mistake_leaves_nothing(tmp_path):

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from omegaconf import OmegaConf
+
 from ocp_torch.cli.asked import data_of, flat, plain
 from ocp_torch.cli.command import Command
-from ocp_torch.cli.explain import INSTALLED, choices
+from ocp_torch.cli.explain import CONFIGS, INSTALLED, choices
 from ocp_torch.cli.job import isolated
 from ocp_torch.cli.python import train
 from ocp_torch.cli.single import require_writable, told
@@ -51,6 +53,10 @@ def planned(data: dict) -> list[Planned]:
         require_choice("a name in systems", name, known)
     own = require_section("overrides", data["overrides"])
     given = {require_choice("a name in overrides", name, known): fields(f"overrides.{name}", own[name]) for name in own}
+    usual: Any = OmegaConf.to_container(OmegaConf.load(CONFIGS / "gallery.yaml"), resolve=False)
+    for name in given:
+        if name not in names and own[name] != usual["overrides"].get(name):
+            raise InputError(f"overrides.{name} is set, but {name} is not in systems, {shown(names)}; add it there.")
     common = {name: value for name, value in fields("common", data["common"]).items() if value is not None}
     require_writable(folder, "folder")
     seconds_in(folder)
