@@ -30,8 +30,12 @@ def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -
             return f"{group} is {choice!r}, which is not installed; pip install -e {brings}."
         group, _, choice = f"{group}/{choice}".partition("/")  # as in problem=./mine.py
         known = choices(group)
-        hint = nearest(choice, known)
-        if group == "problem" and not hint:
+        hint, file = nearest(choice, known), Path(choice)
+        if file.stem in known:  # the path of one of them
+            hint = f"; write {group}={file.stem}"
+        elif file.suffix in (".yaml", ".yml"):
+            hint = f"; a file of your own cannot be given, but its fields can, {group}.<field>=<value>"
+        elif group == "problem" and not hint:
             hint = f"; a class of your own in the folder you start from is problem._target_={own_class(choice)}"
         return f"{group} is {choice!r}, but must be one of {', '.join(known)}{hint}."
     override = re.search(r"Could not override '([\w.@/-]+)'", text)
