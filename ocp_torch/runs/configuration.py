@@ -12,7 +12,7 @@ from ocp_torch.errors import InputError
 from ocp_torch.files.reading import FOLDER, kind, read_yaml
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.problems.commands import current_name, current_section
-from ocp_torch.training.checkpoint import load_checkpoint, newest
+from ocp_torch.training.checkpoint import LAST, load_checkpoint, newest
 
 CONFIG, AUTO = "config.yaml", "auto"
 
@@ -24,6 +24,13 @@ def locate(path: Path) -> tuple[Path | None, Path | None]:
         raise InputError(f"resume is {str(path)!r}, which Hydra would take for an interpolation; rename the folder.")
     found = kind(path)
     if found == FOLDER:
+        # Which of several runs is written to is for the user to say.
+        inside = [] if kind(path / "checkpoints") == FOLDER else [*path.glob(f"*/checkpoints/{LAST}")]
+        if inside:
+            last = max(inside, key=lambda file: file.stat().st_mtime).parent.parent
+            raise InputError(
+                f"resume is {str(path)!r}, which is no run but holds {len(inside)} of them; the newest is resume={last}."
+            )
         return path, None
     if found is None:
         raise InputError(f"resume is {str(path)!r}, which does not exist; give a run's folder or a checkpoint.")

@@ -47,6 +47,16 @@ def agrees(config: dict, made: dict) -> bool:
     return config is None or config == made
 
 
+def test_a_folder_of_runs_is_refused_and_the_newest_is_named(tmp_path):
+    for age, name in enumerate(("later", "earlier")):
+        file = tmp_path / name / "checkpoints" / "last.pt"
+        file.parent.mkdir(parents=True)
+        file.touch()
+        os.utime(file, (100 - age, 100 - age))
+    with pytest.raises(InputError, match=f"holds 2 of them; the newest is resume={tmp_path / 'later'}\\.$"):
+        saved_configuration(tmp_path)
+
+
 @pytest.mark.nightly
 @pytest.mark.parametrize("lost", [".hydra", ".hydra/config.yaml"])
 def test_a_folder_without_configuration_goes_on_with_that_of_its_checkpoint(lost, run, tmp_path):
