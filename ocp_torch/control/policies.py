@@ -30,9 +30,10 @@ LARGEST_DENSITY = 1e30  # a density above it counts as infinite, in single preci
 # The multiples of this number are spread evenly, and no grid or symmetric state has them as coordinates.
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
-# A policy maps states (N, d) to controls (N, m); a density maps them to (N,).
+# A policy maps states (N, d) to controls (N, m); a density maps them to (N,); `w` and `mu` together are (N, m) and (N,).
 Policy = Callable[[Tensor], Tensor]
 Density = Callable[[Tensor], Tensor]
+Densities = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 class ValuePolicy:
@@ -79,15 +80,15 @@ def admissible_density(kind: str | None, problem: Problem, fields: Fields, const
     return problem.control_cost.admissible(fields.control_density, occupation_density(kind, problem, fields, constants))
 
 
-def density_policy(control_density: Field, occupation: Density, cost: PowerCost) -> Policy:
+def density_policy(densities: Densities, cost: PowerCost) -> Policy:
     """`u = w / mu`, within the limit of ``cost``; 0 where `mu` is 0 (no mass is there) or infinite (mass stands still), and
     NaN where a state is."""
 
     def policy(x: Tensor) -> Tensor:
-        mu = occupation(x)
+        w, mu = densities(x)
         idle = (mu <= 0) | (mu > LARGEST_DENSITY)
         mu = torch.where(idle, 1.0, mu)
-        return torch.where(idle.unsqueeze(-1), 0.0, cost.within(control_density(x), mu) / mu.unsqueeze(-1))
+        return torch.where(idle.unsqueeze(-1), 0.0, cost.within(w, mu) / mu.unsqueeze(-1))
 
     return policy
 
@@ -97,22 +98,32 @@ def zero_policy(problem: Problem) -> Policy:
     return lambda x: x.new_zeros(len(x), problem.control_dim)
 
 
-def occupation_density(kind: str | None, problem: Problem, fields: Fields, constants: Constants) -> Density:
-    """`mu(x)` of trained fields: ``closed`` (Lemma 2, no drift), ``saddle`` (Lemma 3) or ``network`` (`exp log mu`)."""
+def trained_densities(kind: str | None, problem: Problem, fields: Fields, constants: Constants) -> Densities:
+    """`w(x)` and `mu(x)` of trained fields: `mu` ``closed`` (Lemma 2, no drift), ``saddle`` (Lemma 3), both of which are made
+    of `w`, or ``network`` (`exp log mu`)."""
     cost = problem.control_cost
 
-    def closed(x: Tensor) -> Tensor:
+    def closed(x: Tensor) -> tuple[Tensor, Tensor]:
         samples = Samples.of(problem, x)
         w, inflow = Generator.of(problem, samples).control_inflow(fields.control_density)
-        return cost.primal_occupation(w, samples.f, constants.C_V, inflow)
+        return w, cost.primal_occupation(w, samples.f, constants.C_V, inflow)
 
-    def saddle(x: Tensor) -> Tensor:
+    def saddle(x: Tensor) -> tuple[Tensor, Tensor]:
         generator = Generator.of(problem, Samples.live(problem, x))
         beta = generator.reduced_cost(generator.jet(fields.value))
-        return cost.saddle_occupation(fields.control_density(x), beta, constants.M)
+        w = fields.control_density(x)
+        return w, cost.saddle_occupation(w, beta, constants.M)
 
-    network = lambda x: fields.log_occupation(x).exp()
+    network = lambda x: (fields.control_density(x), fields.log_occupation(x).exp())
     return {CLOSED: closed, SADDLE: saddle, NETWORK: network}[kind or NETWORK]
+
+
+def occupation_density(kind: str | None, problem: Problem, fields: Fields, constants: Constants) -> Density:
+    """`mu(x)` of `trained_densities`; that of a ``network`` is had without `w`."""
+    if kind in (None, NETWORK):
+        return lambda x: fields.log_occupation(x).exp()
+    densities = trained_densities(kind, problem, fields, constants)
+    return lambda x: densities(x)[1]
 
 
 def trained_policies(
@@ -126,11 +137,11 @@ def trained_policies(
         policies[VALUE] = ValuePolicy(problem, fields.value)
     # Lemmas 2 and 3 give mu from the cost at the state itself.
     if fields.control_density is not None and (kind == NETWORK or problem.has_simulator):
-        mu = occupation_density(kind, problem, fields, constants)
-        policies[DENSITY] = density_policy(fields.control_density, mu, problem.control_cost)
+        densities = trained_densities(kind, problem, fields, constants)
+        policies[DENSITY] = density_policy(densities, problem.control_cost)
         if every and kind != CLOSED and problem.has_simulator and problem.still:
-            mu = occupation_density(CLOSED, problem, fields, constants)
-            policies[MINIMISED] = density_policy(fields.control_density, mu, problem.control_cost)
+            densities = trained_densities(CLOSED, problem, fields, constants)
+            policies[MINIMISED] = density_policy(densities, problem.control_cost)
     if fields.trajectory_value is not None:
         policies[TRAJECTORIES] = HeldPolicy(problem, fields.trajectory_value, Pace.of(problem))
     if fields.subsolution is not None and not problem.noisy:

@@ -82,11 +82,20 @@ def test_the_density_of_the_exact_fields_is_the_exact_one_and_so_is_its_controll
     torch.testing.assert_close(found["density"](x)[moved], u[moved], rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("kind", [CLOSED, SADDLE, NETWORK])
+def test_a_controller_from_w_and_mu_asks_for_w_once(kind):
+    problem, asked = zoo.build("torus 2-d chain"), []
+    fields = exact_fields(problem)
+    fields.control_density.register_forward_hook(lambda *_: asked.append(kind))
+    trained_policies(kind, problem, fields, resolve_constants(problem))["density"](zoo.states(problem, 5))
+    assert asked == [kind]
+
+
 def test_where_there_is_no_mass_or_mass_without_end_nothing_is_controlled():
     problem = zoo.build("manufactured 2-d q=2")
     x = zoo.states(problem, 3)
     mu = torch.tensor([0.0, torch.inf, 2.0], dtype=torch.float64)
-    u = density_policy(lambda x: torch.ones_like(x), lambda x: mu, problem.control_cost)(x)
+    u = density_policy(lambda x: (torch.ones_like(x), mu), problem.control_cost)(x)
     assert u.tolist() == [[0.0, 0.0], [0.0, 0.0], [0.5, 0.5]]
     assert (zoo.build("manufactured 3-d m=2").control_dim, 0.0) == (
         zero_policy(zoo.build("manufactured 3-d m=2"))(torch.rand(2, 3)).shape[1],
