@@ -119,6 +119,10 @@ class Aperiodic(Circle):
 
 
 class Seam(Circle):
+    def __init__(self) -> None:
+        super().__init__()
+        self.exact_optimum = None  # that of another cost
+
     def state_cost(self, x):
         return x[:, 0].remainder(1.0)
 
