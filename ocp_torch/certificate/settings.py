@@ -7,6 +7,7 @@ from typing import ClassVar
 from ocp_torch.certificate.statistics.estimate import CONFIDENCE
 from ocp_torch.errors import InputError, require_choice, require_flag, require_integer, require_number, visible
 from ocp_torch.files.limits import require_memory
+from ocp_torch.maths.runge_kutta import MAX_DOUBLINGS
 from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.problem import Problem
 from ocp_torch.steppers.fitting import LARGEST_RATE
@@ -90,6 +91,7 @@ class CertificateSettings:
     # Whether a few trajectories are simulated once more, on far finer steps, for the bias: no claim may do without, so that
     # this is no field of a configuration.
     audited: ClassVar[bool] = True
+    doublings: ClassVar[int] = MAX_DOUBLINGS  # of the steps of a simulation without noise, at most
 
     def __post_init__(self) -> None:
         least = {"points": 1, "replicates": 2, "trajectories": 0, "ascents": 1, "occupation_states": 0}

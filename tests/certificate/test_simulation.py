@@ -327,6 +327,7 @@ def test_what_rounds_is_audited_however_fine_the_steps_of_all_trajectories_are()
 def test_only_looks_go_without_audits():
     assert CertificateSettings().audited
     assert not QUICK.audited
+    assert CertificateSettings().doublings > QUICK.doublings > 0
     with pytest.raises(InputError, match="audited"):
         call(CertificateSettings, "certificate", {"audited": False})
 

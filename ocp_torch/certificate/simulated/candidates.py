@@ -10,7 +10,6 @@ from ocp_torch.certificate.statistics.estimate import CONFIDENCE, Estimate
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.policies import Policy, zero_policy
 from ocp_torch.maths.jets import Field
-from ocp_torch.maths.runge_kutta import MAX_DOUBLINGS
 from ocp_torch.problems.problem import Problem
 
 # Divisor of the trajectories of rough simulations: of doing nothing, whose performance is a yardstick and no bound, and of a
@@ -73,7 +72,7 @@ def _simulated(
     problem: Problem, settings: CertificateSettings, seed: int, candidate: Candidate, roughly: bool = False
 ) -> Simulated:
     """The performance of ``candidate``; ``roughly`` on a part of the trajectories, with large steps."""
-    effort, tolerance, doublings = settings.trajectories, settings.tolerance, MAX_DOUBLINGS
+    effort, tolerance, doublings = settings.trajectories, settings.tolerance, settings.doublings
     if isinstance(candidate.policy, HeldPolicy) and not problem.noisy:
         effort *= MORE_HELD
     if roughly:
