@@ -112,7 +112,7 @@ class ControlEnvironment(Env):  # type: ignore[misc, valid-type]
 
     def _info(self, u: torch.Tensor | None = None) -> dict:
         """The state; for a `System` also in physical units, with the control ``u`` ``(1, m)`` that led to it."""
-        found = {"state": self.x[0].numpy()}
+        found = {"state": self.x[0].numpy().copy()}
         if isinstance(problem := self.problem, System):
             found["physical_state"] = problem.from_torus(self.x)[0].numpy()
             found |= {} if u is None else {"physical_control": problem.from_controls(u)[0].numpy()}

@@ -95,6 +95,13 @@ def test_episodes_repeat_by_seed_and_differ_without(gymnasium, name):
     assert not np.array_equal(third, fourth)
 
 
+def test_who_writes_into_a_state_that_was_told_does_not_move_the_environment(gymnasium):
+    env = ControlEnvironment(zoo.Swing())
+    told, before = env.reset(seed=0)[1], env.x.clone()
+    told["state"] += 0.25
+    assert torch.equal(env.x, before)
+
+
 def test_actions_beyond_the_limit_are_cut_to_the_ball(gymnasium):
     problem = Manufactured(control_limit=0.3)
     env = ControlEnvironment(problem)
