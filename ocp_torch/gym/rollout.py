@@ -5,6 +5,7 @@ import math
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from ocp_torch.control.policies import TRAJECTORIES
 from ocp_torch.errors import InputError, first_line, require_integer
 from ocp_torch.files.storage import write_atomically
 from ocp_torch.gym.agreement import Agreement
-from ocp_torch.gym.environment import require_gymnasium
+from ocp_torch.gym.environment import ControlEnvironment, require_gymnasium
 from ocp_torch.problems.blame import in_their_words
 from ocp_torch.problems.problem import Problem
 from ocp_torch.runs.evaluate import load_run
@@ -46,8 +47,11 @@ class Agent:
         self.controller, self.name, self.space = controller, name, env.action_space
         self.acted = self.cut = 0  # actions, and how many of them the environment does not allow
         own = env.unwrapped
-        self.step = step_of(own)
-        if hasattr(own, "from_observation"):
+        self.step, ours = step_of(own), isinstance(own, ControlEnvironment)
+        if self.space.shape is None:
+            kind = type(self.space).__name__
+            raise InputError(f"the actions of {name} are a {kind}, but a controller gives one array of numbers.")
+        if ours:
             if own.problem.dim != controller.problem.dim or own.problem.control_dim != controller.problem.control_dim:
                 raise InputError(
                     f"{name} has d = {own.problem.dim}, m = {own.problem.control_dim}, but the controller is for "
@@ -57,8 +61,7 @@ class Agent:
         else:
             self._state = partial(controller.problem.from_observation, name)
             self._action = partial(controller.problem.to_action, name)
-        theirs = not hasattr(own, "from_observation")
-        self.agreement = Agreement(controller.problem, self.step, self.space) if theirs and self.step else None
+        self.agreement = Agreement(controller.problem, self.step, self.space) if self.step and not ours else None
 
     def act(self, observation) -> np.ndarray:
         """The action for ``observation``."""
@@ -83,6 +86,8 @@ class Agent:
         action = within.astype(self.space.dtype)
         if np.issubdtype(action.dtype, np.integer) and (action != within).any():
             raise InputError(f"to_action gave {given} for {self.name}, but must give whole numbers.")
+        if not hasattr(self.space, "low") and not self.space.contains(action):
+            raise InputError(f"to_action gave {given} for {self.name}, but must give one of {self.space}.")
         if self.agreement is not None:
             self.agreement.acted(state, control, action)
         return action
@@ -98,7 +103,7 @@ class Agent:
 def step_of(env) -> float | None:
     """The time for which ``env`` holds an action, in its unit, from one of the attributes `STEP_NAMES`; `None` without."""
     told = (getattr(env, name, None) for name in STEP_NAMES)
-    return next((float(t) for t in told if isinstance(t, int | float) and 0.0 < t < math.inf), None)
+    return next((s for t in told if isinstance(t, Real) and 0.0 < (s := float(t)) < math.inf), None)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from ocp_torch.errors import InputError
 class GymnasiumAdapter:
     """Override both methods for the Gymnasium environments a problem is a model of; those of this package need neither."""
 
-    def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
+    def from_observation(self, env: str, observation: np.ndarray | dict) -> np.ndarray:
         """The state ``(d,)`` that an observation of the environment ``env`` shows. Raises `InputError` for an unknown one."""
         raise self._unknown(env)
 

@@ -7,7 +7,7 @@ import pytest
 
 import ocp_torch.gym.rollout
 from ocp_torch import InputError
-from ocp_torch.gym.rollout import play
+from ocp_torch.gym.rollout import play, step_of
 from ocp_torch.problems import Pendulum
 
 gymnasium = pytest.importorskip("gymnasium")
@@ -114,3 +114,45 @@ def test_actions_that_count_are_cut_before_they_become_whole_numbers():
     env.action_space = count
     with pytest.raises(InputError, match="to_action gave 0.9 for Pendulum-v1, but must give whole numbers"):
         play(player, env, NAME, 1, 0)
+
+
+SPACES = gymnasium.spaces
+
+
+@pytest.mark.parametrize(
+    ("space", "given"),
+    [
+        (SPACES.Discrete(3), -1),
+        (SPACES.Discrete(3), 3),
+        (SPACES.MultiDiscrete([3, 3]), [1, 5]),
+        (SPACES.MultiBinary(1), [7]),
+    ],
+)
+def test_a_number_that_counts_no_action_is_refused(space, given):
+    """A list of actions that is asked for its number -1 gives its last one."""
+    env = Theirs(action_space=space)
+    with pytest.raises(InputError, match=r"to_action gave .* for Pendulum-v1, but must give one of "):
+        play(Player(action=lambda self, u: np.array(given)), env, NAME, 1, 0)
+
+
+@pytest.mark.parametrize("space", [SPACES.Dict(push=SPACES.Discrete(3)), SPACES.Tuple([SPACES.Discrete(3)])])
+def test_actions_that_are_no_array_are_refused(space):
+    with pytest.raises(InputError, match="the actions of Pendulum-v1 are a (Dict|Tuple), but a controller gives one"):
+        play(Player(), Theirs(action_space=space), NAME, 1, 0)
+
+
+def test_an_observation_that_is_a_dict_reaches_the_map():
+    seen = {"observation": SHOWN, "goal": np.zeros(2)}
+    env = Theirs(reset=lambda seed=None: (seen, {}), step=lambda action: (seen, -1.0, False, True, {}))
+    shown = lambda self, observation: observation["observation"][1:]
+    assert play(Player(observed=shown), env, NAME, 1, 0).lengths.tolist() == [1]
+
+
+def test_an_environment_with_a_map_of_its_own_by_that_name_is_not_taken_for_ours():
+    assert play(Player(), Theirs(from_observation=lambda seen: seen), NAME, 1, 0).lengths.tolist() == [4]
+
+
+@pytest.mark.parametrize("number", [float, np.float32, np.float64])
+def test_the_time_of_a_step_may_be_any_kind_of_number(number):
+    assert step_of(Theirs(dt=number(0.25))) == 0.25
+    assert step_of(Theirs(dt=number(-0.25))) is None

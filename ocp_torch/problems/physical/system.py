@@ -2,6 +2,7 @@ r"""A problem in physical units: what a user writes in radians, metres and newto
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -83,19 +84,20 @@ class System(Disturbed):
             require_number("problem.failure_cost", failure_cost, at_least=0.0)
         self.failure_cost = failure_cost
 
-    def observed(self, observation: np.ndarray) -> np.ndarray:
-        """The physical state ``(d,)`` that an observation of the environment ``gymnasium`` shows."""
+    def observed(self, observation: Any) -> np.ndarray:
+        """The physical state ``(d,)`` that an observation of the environment ``gymnasium``, an array or a dict, shows."""
         raise InputError(f"{type(self).__name__} must define observed(observation), as it names an environment.")
 
     def action(self, control: np.ndarray) -> np.ndarray:
         """The action of the environment ``gymnasium`` that applies the physical ``control`` ``(m,)``."""
         raise InputError(f"{type(self).__name__} must define action(control), as it names an environment.")
 
-    def from_observation(self, env: str, observation: np.ndarray) -> np.ndarray:
+    def from_observation(self, env: str, observation: np.ndarray | dict) -> np.ndarray:
         """The torus state ``(d,)`` of an observation of `gymnasium`; coordinates beyond a seam are moved to it."""
         if env != self.gymnasium:
             return super().from_observation(env, observation)
-        s = np.asarray(self.observed(np.asarray(observation, dtype=np.float64)), dtype=np.float64)
+        seen = observation if isinstance(observation, dict) else np.asarray(observation, dtype=np.float64)
+        s = np.asarray(self.observed(seen), dtype=np.float64)
         if s.shape != (self.dim,):  # one number would be taken for all coordinates
             raise InputError(
                 f"observed of {type(self).__name__} gave shape {s.shape}, but must give ({self.dim},), a physical state."
