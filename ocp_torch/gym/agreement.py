@@ -11,7 +11,7 @@ from ocp_torch.problems.problem import Problem
 # differ by 2e-4 at most, a pendulum whose mass or length is 10 % wrong by 0.003 to 0.07, with cosine for sine by 2.
 LARGEST_DIFFERENCE = 2e-3
 AT_END = 1e-4  # distance from the end of an interval, as a part of half its length, below which a state is at the end
-FEWEST_STEPS = 10  # below which nothing is said (not tuned)
+FEWEST_STEPS = 10  # below which more episodes are waited for (not tuned)
 ROUNDING = 1e-6  # turns in a step, as observations are in single precision
 NOISE_DEVIATIONS = 3.0  # standard deviations of the model's noise that a step may differ by besides (not tuned)
 
@@ -38,15 +38,18 @@ class Agreement:
         self._last = (state, control) if bool(((action > low) & (action < high)).all()) else None
 
     @torch.no_grad()
-    def difference(self) -> str:
-        """Where environment and model differ, in words; empty where they agree."""
-        if len(self.steps) < FEWEST_STEPS:
-            return ""
+    def difference(self) -> str | None:
+        """Where environment and model differ after an episode, in words; empty where they agree, `None` while too few steps
+        are known."""
+        self._last = None
+        if not self.steps:
+            return None
         x, u, y = (torch.as_tensor(np.stack(part), dtype=torch.float64) for part in zip(*self.steps, strict=True))
         kept = self._inside(x) & self._inside(y)
-        if int(kept.sum()) < FEWEST_STEPS:
-            return ""
         x, u, y = x[kept], u[kept], y[kept]
+        if len(x) < FEWEST_STEPS:
+            self.steps = [step for step, inside in zip(self.steps, kept, strict=True) if inside]
+            return None
         moved = (y - x + 0.5).remainder(1.0) - 0.5
         model = self.step * torch.stack([self.problem.velocity(at, u) for at in (x, x + 0.5 * moved, y)])
         low, high = model.amin(dim=0), model.amax(dim=0)

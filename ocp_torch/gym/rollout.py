@@ -93,8 +93,10 @@ class Agent:
         return action
 
     def ended(self) -> None:
-        """Say, after the first episode, where the environment moved otherwise than the model."""
-        if self.agreement is not None and (difference := self.agreement.difference()):
+        """Say, after the first episodes with enough steps, where the environment moved otherwise than the model."""
+        if self.agreement is None or (difference := self.agreement.difference()) is None:
+            return
+        if difference:
             look = "compare parameters, the order of observations, actions and the unit of time"
             log.warning("warning: %s does not move as the model: %s; %s.", self.name, difference, look)
         self.agreement = None

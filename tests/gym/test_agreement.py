@@ -96,6 +96,30 @@ def test_a_step_that_is_not_as_long_as_the_environment_says_is_told(caplog):
     assert "in a step of 0.045" in warned(caplog, env)
 
 
+class Falling(Swinging):
+    """Over after ``most`` steps, as where a wrong model lets a pole fall at once."""
+
+    def __init__(self, most: int) -> None:
+        super().__init__(0.05, 100)
+        self.most = most
+
+    def step(self, action):
+        seen, reward, *_ = super().step(action)
+        return seen, reward, self.count == self.most, False, {}
+
+
+@pytest.mark.parametrize(("most", "episodes", "told"), [(2, 9, False), (2, 10, True), (5, 3, True), (1, 20, False)])
+def test_episodes_that_are_too_short_are_put_together(caplog, most, episodes, told):
+    """Each has a step less than actions; from its end to the next start nothing moves."""
+    for maps in ({"action": lambda self, u: np.clip(0.5 * u, -1.9, 1.9)}, {}):
+        caplog.clear()
+        player = Player(**maps)
+        player.policy = lambda x: 0.5 * torch.ones(len(x), 1)
+        with caplog.at_level(logging.WARNING):
+            play(player, Falling(most), NAME, episodes, 0)
+        assert ("does not move" in caplog.text) == (told and bool(maps))
+
+
 def test_an_environment_that_does_not_say_how_long_a_step_is_is_not_compared(caplog):
     env = Swinging(0.05, 10)
     env.dt = None
