@@ -15,7 +15,7 @@ from ocp_torch.control.exported import about, coordinates_of, example_states, ex
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.pace import Pace
 from ocp_torch.control.policies import BOUNDING, TRAJECTORIES, Policy, trained_policies
-from ocp_torch.errors import InputError, require_number
+from ocp_torch.errors import InputError, require_number, shown
 from ocp_torch.export import export
 from ocp_torch.fields import Fields
 from ocp_torch.files.storage import save_tensors
@@ -119,7 +119,12 @@ class Controller:
         """``given`` as floats, if it is of shape ``(N, d)``."""
         # PyTorch takes no arrays that run backwards or have another byte order, and warns of those that are read-only.
         own = np.array(given, dtype=given.dtype.newbyteorder("=")) if isinstance(given, np.ndarray) else given
-        states = torch.as_tensor(own)
+        try:
+            states = torch.as_tensor(own)
+        except (TypeError, ValueError, RuntimeError):  # a dict of observations, rows of unlike lengths
+            raise InputError(
+                f"{name} is {shown(given)}, but must be numbers of shape (N, {self.problem.dim})."
+            ) from None
         if states.ndim != 2 or states.shape[1] != self.problem.dim:
             raise InputError(f"{name} has shape {tuple(states.shape)}, but must have shape (N, {self.problem.dim}).")
         return states if states.is_floating_point() else states.double()

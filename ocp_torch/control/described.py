@@ -53,9 +53,9 @@ def require_same(path: Path, problem: Problem, saved: dict) -> None:
     own = {k: v for k, v in given["parameters"].items() if k not in problem.incidental}
     units = {k: v for k, v in given.items() if k not in ("name", "parameters")}
     for group, before in ((own, saved["parameters"]), (units, saved)):
-        for name in group.keys() & before.keys():
-            if group[name] != before[name]:
-                raise InputError(
-                    f"problem.{name} is {group[name]!r:.80}, but the run of {path} has {before[name]!r:.80}; a controller is "
-                    "loaded with the problem it was trained for."
-                )
+        if other := [name for name in group if name in before and group[name] != before[name]]:
+            mine = " and ".join(f"problem.{name} is {group[name]!r:.80}" for name in other)
+            theirs = " and ".join(f"{before[name]!r:.80}" for name in other)
+            raise InputError(
+                f"{mine}, but the run of {path} has {theirs}; a controller is loaded with the problem it was trained for."
+            )

@@ -132,6 +132,14 @@ def test_another_shape_is_refused_with_the_shape_that_is_right(saved, shape):
             u(x)
 
 
+@pytest.mark.parametrize(
+    "given", [{"observation": [0.0, 0.0]}, None, "state", [[0.0, 0.0], [0.0]], np.array([None, 1])]
+)
+def test_what_is_no_array_of_numbers_is_refused(saved, given):
+    with pytest.raises(InputError, match=r"^x is .*, but must be numbers of shape \(N, 2\)\.$"):
+        load_controller(saved)(given)
+
+
 class Valley(Problem):
     """A user's own problem, with an argument of its own."""
 
@@ -217,6 +225,9 @@ def test_a_controller_is_not_loaded_with_other_numbers_in_a_mapping(tmp_path):
     load_controller(path, problem=Movable(gains={"low": 1.0, "limits": [0.0, 1.0]}))
     with pytest.raises(InputError, match="problem.gains"):
         load_controller(path, problem=Movable(gains={"low": 2.0, "limits": (0.0, 1.0)}))
+    all_at_once = r"problem.gains is .* and problem.ranges is \[\], but the run of .* has {.*} and \[\[0.0, 1.0\]\]; a"
+    with pytest.raises(InputError, match=all_at_once):
+        load_controller(path, problem=Movable(gains={"low": 2.0}, ranges=()))
 
 
 def test_a_controller_is_not_loaded_for_another_problem(saved):
