@@ -614,5 +614,8 @@ def test_the_torque_is_that_of_the_model_and_never_beyond_what_gymnasium_allows(
 
 def test_the_pendulum_knows_no_other_environment():
     for call in (lambda p: p.from_observation("Acrobot-v1", np.zeros(6)), lambda p: p.to_action("Acrobot-v1", [0.0])):
-        with pytest.raises(InputError, match="Pendulum does not know the environment Acrobot-v1"):
+        words = (
+            "Pendulum does not know the environment Acrobot-v1: its gymnasium is 'Pendulum-v1'; set it, and define obs"
+        )
+        with pytest.raises(InputError, match=words):
             call(Pendulum())

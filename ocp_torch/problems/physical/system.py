@@ -110,6 +110,10 @@ class System(Disturbed):
         v = torch.as_tensor(np.asarray(control), dtype=torch.float64)
         return np.asarray(self.action(self.from_controls(v).numpy()))
 
+    def _unknown(self, env: str) -> InputError:
+        must = f"its gymnasium is {self.gymnasium!r}; set it, and define observed and action"
+        return InputError(f"{type(self).__name__} does not know the environment {env}: {must}.")
+
     def cost(self, s: Tensor) -> Tensor:
         """Running cost `>= 0`, ``(N,)``, per unit of time."""
         raise InputError(f"{type(self).__name__} must define cost(s), the running cost of shape (N,).")
