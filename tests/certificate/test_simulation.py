@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from ocp_torch.certificate import CertificateSettings
+from ocp_torch.certificate.simulated import candidates
 from ocp_torch.certificate.simulated.backward import backward_flow, settled_occupation
+from ocp_torch.certificate.simulated.candidates import Candidate, simulate_candidates
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, Simulation, starting_points
 from ocp_torch.compute import threads as cores
 from ocp_torch.compute.threads import in_pieces
@@ -327,9 +329,23 @@ def test_what_rounds_is_audited_however_fine_the_steps_of_all_trajectories_are()
 def test_only_looks_go_without_audits():
     assert CertificateSettings().audited
     assert not QUICK.audited
-    assert CertificateSettings().doublings > QUICK.doublings > 0
     with pytest.raises(InputError, match="audited"):
         call(CertificateSettings, "certificate", {"audited": False})
+
+
+def test_looks_halve_their_steps_less_often(monkeypatch):
+    problem, asked = Circle(), []
+
+    def simulated(*given, **how):
+        asked.append(how["doublings"])
+        return Simulation(*given, **how)
+
+    monkeypatch.setattr(candidates, "Simulation", simulated)
+    own = {"own": Candidate(problem.exact_control, None, None)}
+    for settings in (QUICK, CertificateSettings(trajectories=2, replicates=2)):
+        simulate_candidates(problem, own, settings, 0, best_only=True)
+    looks, _, claims, _ = asked  # each beside doing nothing, which is rough
+    assert 0 < looks < claims
 
 
 @pytest.mark.nightly
