@@ -56,7 +56,7 @@ EFFORTS = {"cheap": CHEAP, "thorough": THOROUGH}
 @pytest.fixture
 def hasty(monkeypatch):
     """Steps of trajectories are halved once at most: bounds must be true whatever is spent."""
-    monkeypatch.setattr("ocp_torch.certificate.simulated.candidates.MAX_DOUBLINGS", 1)
+    monkeypatch.setattr(CertificateSettings, "doublings", 1)
 
 
 @pytest.fixture
