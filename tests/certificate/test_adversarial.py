@@ -8,7 +8,7 @@ from itertools import product
 import pytest
 import torch
 
-from ocp_torch.certificate import StageSettings
+from ocp_torch.certificate import CertificateSettings, StageSettings
 from ocp_torch.certificate.report import table
 from ocp_torch.certificate.simulated.performance import Simulation
 from ocp_torch.control.policies import ValuePolicy
