@@ -31,9 +31,10 @@ def explain(error: Exception, config_name: str, overrides: Iterable[str] = ()) -
         group, _, choice = f"{group}/{choice}".partition("/")  # as in problem=./mine.py
         known = choices(group)
         hint, file = nearest(choice, known), Path(choice)
-        if file.stem in known:  # the path of one of them
+        is_yaml = file.suffix in (".yaml", ".yml")
+        if file.stem in known and (is_yaml or not file.suffix):  # the path of one of them
             hint = f"; write {group}={file.stem}"
-        elif file.suffix in (".yaml", ".yml"):
+        elif is_yaml:
             hint = f"; a file of your own cannot be given, but its fields can, {group}.<field>=<value>"
         elif group == "problem" and not hint:
             hint = f"; a class of your own in the folder you start from is problem._target_={own_class(choice)}"

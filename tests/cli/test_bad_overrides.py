@@ -159,6 +159,7 @@ REFUSED = {
     ("problem=./configs/problem/circle.yaml",): "unicycle; write problem=circle.",
     ("problem=/home/me/circle.yml",): "unicycle; write problem=circle.",
     ("method=configs/method/dual.yaml",): "write method=dual.",
+    ("problem=/home/me/circle.py:Mine",): "is problem._target_=circle.Mine.",
     ("problem=mine.yaml",): "a file of your own cannot be given, but its fields can, problem.<field>=<value>.",
     ("problem=own.Mine",): "is problem._target_=own.Mine.",
     ("problem=pendulm",): "(did you mean 'pendulum'?).",
