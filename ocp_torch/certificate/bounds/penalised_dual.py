@@ -9,7 +9,7 @@ from ocp_torch.problems.needs import Need
 
 
 class PenalisedDual(Bound):
-    """`F_M` of a `V` that is known everywhere."""
+    """`F_M` of a `V` that is known everywhere, or of a multiple of it less a constant."""
 
     name, side, label = "F_M", LOWER, "F_M"
 
