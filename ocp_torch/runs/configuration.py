@@ -25,7 +25,11 @@ def locate(path: Path) -> tuple[Path | None, Path | None]:
     found = kind(path)
     if found == FOLDER:
         # Which of several runs is written to is for the user to say.
-        inside = [] if kind(path / "checkpoints") == FOLDER else [*path.glob(f"*/checkpoints/{LAST}")]
+        inside = (
+            []
+            if kind(path / "checkpoints") == FOLDER
+            else [f for f in path.glob(f"*/checkpoints/{LAST}") if f.exists()]
+        )
         if inside:
             last = max(inside, key=lambda file: file.stat().st_mtime).parent.parent
             raise InputError(
