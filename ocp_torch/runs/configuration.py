@@ -24,13 +24,8 @@ def locate(path: Path) -> tuple[Path | None, Path | None]:
         raise InputError(f"resume is {str(path)!r}, which Hydra would take for an interpolation; rename the folder.")
     found = kind(path)
     if found == FOLDER:
-        # Which of several runs is written to is for the user to say.
-        inside = (
-            []
-            if kind(path / "checkpoints") == FOLDER
-            else [f for f in path.glob(f"*/checkpoints/{LAST}") if f.exists()]
-        )
-        if inside:
+        inside = [file for file in path.glob(f"*/checkpoints/{LAST}") if file.exists()]
+        if inside and kind(path / "checkpoints") != FOLDER:  # which of several runs goes on is for the user to say
             last = max(inside, key=lambda file: file.stat().st_mtime).parent.parent
             raise InputError(
                 f"resume is {str(path)!r}, which is no run but holds {len(inside)} of them; the newest is resume={last}."
