@@ -150,7 +150,7 @@ def test_a_run_that_is_killed_in_its_warm_start_goes_on_to_the_same_bits(way, tm
     assert differences(state_of(resumed), state_of(whole)) == []
     again = small(*way)
     again.resume(tmp_path / "last.pt")
-    assert differences(again.state_dict()["fields"], whole.state_dict()["fields"]) == []
+    assert differences(again.state.state_dict()["fields"], whole.state.state_dict()["fields"]) == []
 
 
 @pytest.mark.nightly
