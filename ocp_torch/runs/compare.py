@@ -18,7 +18,8 @@ from ocp_torch.runs.canvas import blank_figure, save_figure
 from ocp_torch.training.checkpoint import newest
 
 LARGEST_CERTIFICATE = 2**22
-LOG, LARGEST_LOG = "train.log", 2**24
+LOG = "train.log"
+LARGEST_LOG = 2**24  # bytes
 FAILED = "error: "  # how the last line of the log of a failed job of a sweep begins
 # Names come from untrusted files: control characters and overlong names must not reach the terminal.
 printable = partial(visible, most=LONGEST_NAME)

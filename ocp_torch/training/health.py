@@ -22,9 +22,8 @@ GROWN_WEIGHTS = 100.0
 GROWN_LOSS = 1e4
 CONSTANT_STATES = 2**13  # on which the bound of the best constant V is computed
 CONTRADICTED = "bounds contradicted each other at step"
-# A lower bound this little above that of the best constant, relatively, is no better: both are sampled, and whatever `V` is,
-# `F_M` with a given `M` is at least about that of the constant.
-NO_BETTER = 1e-3
+# A lower bound this little below that of the best constant, relatively, is as good: both are sampled.
+ROUNDING = 1e-4
 
 
 @dataclass(frozen=True)
@@ -147,9 +146,9 @@ def sanity_warnings(problem: Problem, constants: Constants, certificate: Certifi
     if certificate.counts("F_M") and any(e is not None for e in certificate.lower.values()):
         constant = best_constant(problem, constants, seed)
         estimate = certificate.lower[lower[0]] if lower else None
-        if estimate is None or not estimate.value > constant + NO_BETTER * abs(constant):
+        if estimate is None or estimate.above < constant - ROUNDING * abs(constant):
             value = f"{estimate.value:.6g}" if estimate else "not finite"
-            found.append(f"the lower bound, {value}, is no better than {constant:.6g}, that of the best constant V.")
+            found.append(f"the lower bound, {value}, is worse than {constant:.6g}, that of the best constant V.")
     if perf is not None and known(zero) and perf[1] > zero.above:
         found.append("the best controller is worse than doing nothing.")
     return found

@@ -1,7 +1,7 @@
 r"""Running estimates of the bracket while a run trains: cheap, for curves that show where it is going, and no claim.
 
-On states that training never draws, with the averaged fields: `F_M` of `V` itself, or for the best constant where no `M` is
-known; `J` of the density players; and `Perf` of the controller, by a few short paths with `V` as control variate.
+On states that training never draws, with the averaged fields: `F_M`, for the best constant where no `M` is known; `J` of the
+density players; and `Perf` of the controller, by a few short paths with `V` as control variate.
 """
 
 import math

@@ -72,7 +72,8 @@ class Trainer:
 
     @property
     def averaged_fields(self) -> Fields:
-        return self.trained.fields  # those that are handed out
+        """The fields that are handed out."""
+        return self.trained.fields
 
     @property
     def run(self) -> Run:

@@ -7,7 +7,7 @@ import torch
 
 from ocp_torch.certificate import Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.contexts.trained import TrainedContext
-from ocp_torch.certificate.lower.penalised import best_penalised, levelled, penalised
+from ocp_torch.certificate.lower.penalised import levelled
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.report import table
 from ocp_torch.certificate.settings import CertificateSettings
@@ -16,7 +16,6 @@ from ocp_torch.fields import Fields, PeriodicMLP
 from ocp_torch.problems import Circle
 from ocp_torch.problems.constants import FROM_DENSITY, OBSERVED_ROOM, resolve_constants
 from ocp_torch.problems.needs import GIVEN, GUESSED
-from ocp_torch.training.health import best_constant
 from support import zoo
 from support.formulas import ERRORS, Field
 
@@ -148,25 +147,6 @@ def test_the_best_multiple_and_constant_are_found_and_leave_a_bound(problem, M):
         assert highest - ERRORS * found.se - 1e-3 <= found.value <= 1.05 * highest + ERRORS * found.se
     if M >= problem.occupation_bound:
         assert found.value <= problem.exact_optimum + ERRORS * found.se
-
-
-@pytest.mark.parametrize(("size", "M"), [(0.01, 1.6), (1.0, 1.6), (1.0, 50.0)])
-def test_a_value_that_is_hardly_learnt_is_worth_no_less_than_the_best_constant(size, M):
-    """At a large discount the optimum is nearly `E[f mu0]`, and the rough `V` is far from it."""
-    problem = Circle(discount=100.0)
-    network = zoo.rough_network(1, seed=3, size=size)
-    V = SampledValue(problem, network, replicated_samples(problem, 2048, 8, 0, divergences=False))
-    constant = best_constant(problem, resolve_constants(problem, occupation_bound=M), seed=0)
-    found = best_penalised(V, M)
-    assert penalised(V, M).value < 0.5 * constant
-    assert found.value > constant - 1e-3 * abs(constant) - ERRORS * found.se
-    assert found.value < problem.exact_optimum
-
-
-def test_an_exact_value_is_left_as_it_is():
-    problem = Circle(discount=2.0)
-    V = SampledValue(problem, problem.exact_value, replicated_samples(problem, 512, 4, 0, divergences=False))
-    assert best_penalised(V, problem.occupation_bound) == penalised(V, problem.occupation_bound)
 
 
 def test_a_constant_in_the_value_changes_nothing_of_the_best(solved):

@@ -2,29 +2,24 @@
 
 import json
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 
 from ocp_torch import load_controller
-from ocp_torch.certificate import Run, Trained, certify_fields
 from ocp_torch.errors import InputError
-from ocp_torch.fields import VALUE, Fields, PeriodicMLP
 from ocp_torch.objectives import Objective
-from ocp_torch.problems import Circle, Torus
-from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.problems import Circle
 from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.run import run_to_end
 from ocp_torch.steppers import NonFiniteError
 from ocp_torch.steppers.nonfinite import first_nonfinite
-from ocp_torch.training.evaluator import QUICK, Evaluator
-from ocp_torch.training.health import Evaluation, Health, best_constant, sanity_warnings
+from ocp_torch.training.evaluator import Evaluator
+from ocp_torch.training.health import Evaluation, Health, best_constant
 from ocp_torch.training.monitor import Observer
 from ocp_torch.training.stopping import postpone
 from ocp_torch.training.trainer import Trainer
-from support import zoo
 from support.looks import LOWER, certificate, quick
 from support.small import small
 
@@ -197,15 +192,6 @@ def test_a_hopeless_run_is_told_plainly(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr("support.looks.LOWER", LOWER)
     _, made = run(small(*WAY), tmp_path / "good", monkeypatch, lambda t: 0.1)
     assert made.warnings == []
-
-
-def test_a_value_that_learnt_nothing_is_told_though_its_bound_is_that_of_a_constant():
-    problem, settings = Torus(), replace(QUICK, trajectories=0)
-    constants = resolve_constants(problem)
-    trained = Trained(Fields({VALUE: zoo.rough_network(2, seed=3, size=1.0)}), None, PeriodicMLP)
-    made = certify_fields(problem, trained, constants, settings, Run("torus", "dual"))
-    (told,) = sanity_warnings(problem, constants, made, seed=0)
-    assert "no better than" in told
 
 
 def test_the_best_constant_is_the_best_of_all_constants():

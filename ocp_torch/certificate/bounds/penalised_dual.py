@@ -3,13 +3,13 @@
 from ocp_torch.certificate.bounds.bound import LOWER, Bound, recorded
 from ocp_torch.certificate.checks.assumptions import Assumptions
 from ocp_torch.certificate.contexts.context import Context
-from ocp_torch.certificate.lower.penalised import best_penalised, levelled, penalised_on_records
+from ocp_torch.certificate.lower.penalised import levelled, penalised, penalised_on_records
 from ocp_torch.certificate.statistics.estimate import Estimate
 from ocp_torch.problems.needs import Need
 
 
 class PenalisedDual(Bound):
-    """`F_M` of a `V` that is known everywhere, or of a multiple of it less a constant."""
+    """`F_M` of a `V` that is known everywhere."""
 
     name, side, label = "F_M", LOWER, "F_M"
 
@@ -24,7 +24,7 @@ class PenalisedDual(Bound):
         if V is None:
             return None
         # Training aimed at the bound without M, to which the constant in V means nothing.
-        return levelled(V.best, constants.M) if constants.needs_no_M else best_penalised(V, constants.M)
+        return levelled(V.best, constants.M) if constants.needs_no_M else penalised(V, constants.M)
 
 
 class RecordedDual(PenalisedDual):

@@ -14,7 +14,7 @@ from ocp_torch.certificate.lower.levels import best_level
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.lower.shifted import Shift
 from ocp_torch.certificate.lower.slack import SlackParts
-from ocp_torch.certificate.statistics.estimate import CONFIDENCE, Estimate, starting_level, starting_mean
+from ocp_torch.certificate.statistics.estimate import Estimate, starting_level, starting_mean
 from ocp_torch.certificate.statistics.tails import rarity, unmet
 from ocp_torch.maths.jets import Field
 from ocp_torch.problems.generator import Generator
@@ -31,25 +31,12 @@ def penalised(V: SampledValue, M: float) -> Estimate:
     return _penalised(V.initial, V.sets, slacks, [0.0] * len(slacks), M)
 
 
-def best_penalised(V: SampledValue, M: float) -> Estimate:
-    """`F_M` of the best multiple of `V` and the best constant where that is higher, beyond its interval, than that of `V`
-    itself: a `V` that is hardly learnt is worth less than a constant, which multiple 0 leaves."""
-    plain, best = penalised(V, M), _levelled(V.own, M)
-    return best if best is not None and best.interval(CONFIDENCE)[0] > plain.above else plain
-
-
 def levelled(shift: Shift, M: float) -> Estimate:
     """`F_M(theta W - c)` for the value `W` of ``shift``, its best multiple and the best constant; the shifted bound where
-    hardly any state would lie above the constant."""
-    found = _levelled(shift, M)
-    return shift.estimate if found is None else found
-
-
-def _levelled(shift: Shift, M: float) -> Estimate | None:
-    """The bound of `levelled`, `None` where hardly any state would lie above the constant. Each half of the sets takes
-    multiple and constant from the other half, so that the search does not flatter the bound."""
+    hardly any state would lie above the constant. Each half of the sets takes multiple and constant from the other half, so
+    that the search does not flatter the bound."""
     if FEWEST_ABOVE * M > sum(map(len, shift.sets[1::2])):
-        return None
+        return shift.estimate
     weights = [samples.weight for samples in shift.sets]
     mean = sum(shift.initial) / len(shift.initial)
     found = [best_level(SlackParts.join(shift.parts[k::2]), torch.cat(weights[k::2]), mean, M) for k in (0, 1)]

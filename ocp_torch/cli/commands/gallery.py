@@ -53,6 +53,7 @@ def planned(data: dict) -> list[Planned]:
         require_choice("a name in systems", name, known)
     own = require_section("overrides", data["overrides"])
     given = {require_choice("a name in overrides", name, known): fields(f"overrides.{name}", own[name]) for name in own}
+    # Those of `gallery.yaml` itself stand there for whoever lists their system.
     usual: Any = OmegaConf.to_container(OmegaConf.load(CONFIGS / "gallery.yaml"), resolve=False)
     for name in given:
         if name not in names and own[name] != usual["overrides"].get(name):

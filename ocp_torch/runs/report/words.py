@@ -11,8 +11,7 @@ NARROW = 0.01
 NARROW_TIMES = 2.0
 # Names of bounds, of their assumptions and of the basis of these -> their meaning.
 BOUNDS = {
-    "F_M": "the dual value of `V`, or of a multiple of it less a constant where that is clearly higher, each violation of "
-    "its inequality charged `M` times; needs no controller",
+    "F_M": "the dual value of `V`, each violation of its inequality charged `M` times; needs no controller",
     "shifted": "`E[V mu0]` less the largest violation of the inequality of `V`; needs neither a controller nor an `M`",
     "rigorous": "the shifted bound with its supremum proved by interval arithmetic",
     "J": "the cost of `(w, mu)`, each violation of the equation of `mu` charged `C_V` times",

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from ocp_torch.certificate import BOUNDS, LOWER, UPPER, CertificateSettings, Run, StageSettings, Trained, bounds
 from ocp_torch.certificate.bounds.penalised_dual import PenalisedDual
 from ocp_torch.certificate.contexts.trained import TrainedContext
-from ocp_torch.certificate.lower.penalised import penalised
 from ocp_torch.certificate.simulated.performance import Simulation
 from ocp_torch.certificate.statistics.estimate import replicated_samples
 from ocp_torch.certificate.upper.penalised import DensityBounds
@@ -136,18 +135,16 @@ class Judge:
     @torch.no_grad()
     def __call__(self, fields: Fields, occupation: str | None, perf: bool = True) -> dict[str, float]:
         """The values of the bounds on `OPT` that ``fields`` give, `F_M`, `shifted`, `J` and `G` among them, and with ``perf``
-        the controllers' performances, `value` and `density`, by their keys in `certificate.json`. `F_M` is that of `V`
-        itself, as in the paper; it is left out where its `M` is guessed or none is large enough: it would be no bound."""
+        the controllers' performances, `value` and `density`, by their keys in `certificate.json`. `F_M` is left out where its
+        `M` is guessed or none is large enough: it would be no bound."""
         trained = Trained(fields, occupation, nn.Identity)  # nothing is fitted, so that no network is made
         context = Measured(problem=self.problem, constants=self.constants, trained=trained, sets=self.sets)
-        V, M = context.sampled_value, self.constants.M
-        plain = None if V is None or self.constants.needs_no_M else penalised(V, M)
         listed = [bound for bound in BOUNDS if bound.side in (LOWER, UPPER) and bound.applies(context)]
-        found = {bound.name: bound.evaluate(context) for bound in listed if bound.name != PenalisedDual.name}
-        found[PenalisedDual.name] = plain
+        unproved = (PenalisedDual.name,) if self.constants.needs_no_M else ()
+        found = {bound.name: bound.evaluate(context) for bound in listed if bound.name not in unproved}
         numbers = {name: estimate.value for name, estimate in found.items() if estimate is not None}
         if perf:
-            initial = None if V is None else V.initial
+            initial = None if context.sampled_value is None else context.sampled_value.initial
             for name, policy in context.policies.items():
                 numbers[name] = self.performance(policy, context.value, initial)
         return numbers
