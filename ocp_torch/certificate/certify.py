@@ -56,7 +56,7 @@ def certify(context: Context) -> Certificate:
     bounds = [bound for bound in BOUNDS if bound.applies(context)]
     evaluated = lambda side: {bound.name: shown(bound, context) for bound in bounds if bound.side == side}
     _ = context.well_posed  # first of all, to refuse functions that are not finite
-    with context.ahead:
+    with context.ahead():
         simulated, zero = context.simulated  # before the upper side, which is of the best of them
         upper, perf_lower = evaluated(UPPER), evaluated(PERFORMANCE)
         assumptions = context.assumptions  # before the lower side, whose `M` may follow from what is met here

@@ -5,40 +5,45 @@ import pickle
 from typing import Any
 
 import cloudpickle
-
-# The name that stands for the problem, which every process has, and which may hold what cannot be sent.
-PROBLEM = "problem"
+from torch import Tensor
 
 
 class Packer(cloudpickle.Pickler):
-    """Packs all but ``problem``, of which it leaves the name."""
+    """Packs all but what is ``shared``, of which it leaves the numbers; of tensors only what they show."""
 
-    def __init__(self, file: io.BytesIO, problem: object) -> None:
+    def __init__(self, file: io.BytesIO, shared: tuple[object, ...]) -> None:
         super().__init__(file)
-        self.problem = problem
+        self.shared = {id(thing): number for number, thing in enumerate(shared)}
 
-    def persistent_id(self, thing: object) -> str | None:
-        return PROBLEM if thing is self.problem and thing is not None else None
+    def persistent_id(self, thing: object) -> int | None:
+        return self.shared.get(id(thing))
+
+    def reducer_override(self, thing: Any) -> Any:
+        # PyTorch packs the whole block of memory that a tensor is a view of.
+        if type(thing) is Tensor and thing.untyped_storage().nbytes() > thing.nbytes:
+            return thing.clone().__reduce_ex__(pickle.DEFAULT_PROTOCOL)
+        return super().reducer_override(thing)
 
 
 class Unpacker(pickle.Unpickler):
-    """Puts this process's ``problem`` in the place of the name."""
+    """Puts what this process has of the ``shared`` things in the place of their numbers."""
 
-    def __init__(self, file: io.BytesIO, problem: object) -> None:
+    def __init__(self, file: io.BytesIO, shared: tuple[object, ...]) -> None:
         super().__init__(file)
-        self.problem = problem
+        self.shared = shared
 
-    def persistent_load(self, name: str) -> object:
-        return self.problem
+    def persistent_load(self, number: int) -> object:
+        return self.shared[number]
 
 
-def packed(what: object, problem: object) -> bytes:
-    """``what``, with lambdas and closures; of ``problem`` the name alone."""
+def packed(what: object, *shared: object) -> bytes:
+    """``what``, with lambdas and closures; of what is ``shared``, such as a problem that may hold what cannot be sent, the
+    numbers alone."""
     file = io.BytesIO()
-    Packer(file, problem).dump(what)
+    Packer(file, shared).dump(what)
     return file.getvalue()
 
 
-def unpacked(these: bytes, problem: object) -> Any:
-    """What was `packed` by a process of this run, which is trusted, with this one's ``problem``."""
-    return Unpacker(io.BytesIO(these), problem).load()
+def unpacked(these: bytes, *shared: object) -> Any:
+    """What was `packed` by a process of this run, which is trusted, with what this one has of ``shared``."""
+    return Unpacker(io.BytesIO(these), shared).load()

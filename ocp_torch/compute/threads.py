@@ -24,10 +24,20 @@ S = TypeVar("S")
 CHUNK = 1024
 
 
+taken = 0  # cores that copies of this process use now
+
+
 def cores() -> int:
-    """The number of cores that this process may use, beside others of its run on this machine."""
+    """The number of cores that this process may use, beside copies of it and others of its run on this machine."""
     there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, there // here().busy)
+    return max(1, there // here().busy - taken)
+
+
+def alone(own: int) -> None:
+    """Begin anew in a copy of a process, which has none of its threads, on so many cores of its ``own``."""
+    global taken
+    taken += cores() - own
+    _helpers.cache_clear()
 
 
 @cache

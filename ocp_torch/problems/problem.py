@@ -162,6 +162,12 @@ class Problem(Reproducible, DeviceConstants, GymnasiumAdapter):
         return shipped(type(self))
 
     @property
+    def copyable(self) -> bool:
+        """Whether a copy of the process may call the functions meanwhile: not if they use something outside of it, such as
+        another process."""
+        return True
+
+    @property
     def driftless(self) -> bool:
         """Whether `a = 0`: true exactly when `drift` is not replaced, unless a subclass knows better."""
         return not replaced(self, "drift", Problem)

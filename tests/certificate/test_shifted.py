@@ -3,15 +3,12 @@
 import copy
 import math
 from dataclasses import replace
-from functools import partial
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ocp_torch.certificate import Run, StageSettings, Trained, certify_fields
 from ocp_torch.certificate.lower.mollified import DIRECTIONS, EVALUATIONS, Mollified, mollified_shift
 from ocp_torch.certificate.lower.sampled import SampledValue, attainable
 from ocp_torch.certificate.lower.shifted import Shift, climbed, highest, scaled_by
@@ -19,14 +16,14 @@ from ocp_torch.certificate.lower.slack import MAX_THETA, SlackParts, slack_funct
 from ocp_torch.certificate.lower.tightened import tightened
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.statistics.estimate import replicated_samples
-from ocp_torch.compute.background import BackgroundResult
-from ocp_torch.fields import Fields, PeriodicMLP, Subsolution
+from ocp_torch.fields import PeriodicMLP, Subsolution
 from ocp_torch.maths.jets import jet
 from ocp_torch.maths.peaks import Peaks
-from ocp_torch.problems import Circle, Simulator
+from ocp_torch.problems import Circle
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.problems.generator import Generator
 from ocp_torch.problems.samples import Samples
+from ocp_torch.steppers import fitting
 from support import zoo
 from support.hidden_peak import PLACE, Still, hidden_peak
 
@@ -303,7 +300,7 @@ def test_a_value_trained_on_for_the_bound_comes_closer_to_the_optimum_from_below
 
 
 def test_what_cannot_be_trained_on_stays_as_it_is():
-    trained = lambda value, **how: BackgroundResult(tightened(Circle(), value, seed=0, **how)).answer()
+    trained = lambda value, **how: tightened(Circle(), value, seed=0, **how)
     assert trained(Circle().exact_value) is None
     assert trained(perturbed(Circle()), steps=0) is None
     broken = perturbed(Circle())
@@ -314,7 +311,15 @@ def test_what_cannot_be_trained_on_stays_as_it_is():
 def test_a_quick_certificate_trains_for_as_many_times_fewer_steps_as_it_has_fewer_states(monkeypatch):
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.PLAN", (1000.0, 24, 1e-3))
     monkeypatch.setattr("ocp_torch.certificate.lower.tightened.BATCH", 64)
-    count = lambda *how: sum(1 for _ in tightened(Circle(), perturbed(Circle()), 0, *how))
+    steps = []
+    advance = "ocp_torch.certificate.lower.tightened.advance"
+    monkeypatch.setattr(advance, lambda *how: (steps.append(how), fitting.advance(*how)))
+
+    def count(*how) -> int:
+        steps.clear()
+        tightened(Circle(), perturbed(Circle()), 0, *how)
+        return len(steps)
+
     assert [count(batch) for batch in (1000, 64, 16, 1)] == [24, 24, 6, 1]
     assert [count(batch, 48) for batch in (64, 16)] == [48, 12]
 
@@ -357,7 +362,6 @@ def test_v_is_trained_on_where_there_is_enough_to_gain(problem, heights, trained
 
     def training(*_):
         asked.append(W)
-        yield
         return Subsolution(W, sets[0].x[:4])
 
     monkeypatch.setattr("ocp_torch.certificate.lower.sampled.tightened", training)
@@ -372,37 +376,3 @@ def test_v_is_trained_on_where_there_is_enough_to_gain(problem, heights, trained
     assert len(found.best.beside) == (found.best.value is not V)
     # And it is kept, where the bound is of it.
     assert (found.subsolution is None) == (found.best.value is V)
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", ["kuramoto n=3", "noisy 1-d"])
-def test_a_second_core_gives_the_same_certificate(name, monkeypatch):
-    for plan in ("PLAN", "NOISY_PLAN"):
-        monkeypatch.setattr(f"ocp_torch.certificate.lower.tightened.{plan}", (1000.0, 30, 1e-3))
-    for least in ("LEAST_PROMISE", "NOISY_LEAST_PROMISE"):
-        monkeypatch.setattr(f"ocp_torch.certificate.lower.sampled.{least}", 0.0)
-    problem, threads = zoo.build(name), []
-    torch.manual_seed(0)
-    fields = Fields({"value": PeriodicMLP(problem.dim, width=8, depth=2, modes=1)})
-    trained = Trained(fields, None, partial(PeriodicMLP, width=8, depth=2, modes=1))
-    small = dict(points=256, replicates=2, trajectories=4, ascents=2, occupation_states=0, mollify=True, tolerance=0.1)
-    settings_ = CertificateSettings(**small, stage=StageSettings(steps=20, rounds=1))
-
-    def said(cores: int) -> dict:
-        monkeypatch.setattr("ocp_torch.compute.background.cores", lambda: cores)
-        constants = resolve_constants(problem)
-        return certify_fields(problem, trained, constants, settings_, Run("any", "dual")).to_dict()
-
-    begun = BackgroundResult.begin
-    monkeypatch.setattr(BackgroundResult, "begin", lambda work: (begun(work), threads.append(work._thread))[0])
-    assert said(1) == said(2)
-    assert [thread is None for thread in threads] == [True, False]
-
-
-def test_a_strangers_functions_are_not_called_from_two_threads():
-    class Own(Circle):
-        pass
-
-    assert Circle().concurrent
-    assert not Own().concurrent
-    assert not Simulator(lambda x: (0.0, None, np.eye(1)), dim=1).concurrent

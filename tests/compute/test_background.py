@@ -1,82 +1,220 @@
-"""Work begun in a thread: the same answer, errors for whoever asks, and an end when nobody wants it any more."""
+"""Work begun in a copy of the process: the same answer, errors for whoever asks, and an end when nobody wants it any more."""
 
+import os
+import signal
+import subprocess
+import sys
 import threading
 import time
+import warnings
+from typing import NoReturn
 
 import pytest
 import torch
 
-from ocp_torch.compute import background as ahead
+from ocp_torch.compute import background, threads
 from ocp_torch.compute.background import BackgroundResult
+from ocp_torch.compute.packing import packed, unpacked
 
 DEADLINE = 60.0
 
-
-def counting(count: int, done: list, gate: threading.Event | None = None):
-    for k in range(count):
-        if gate is not None:
-            gate.wait(DEADLINE)
-        done.append((k, threading.current_thread()))
-        yield
-    return sum(k for k, _ in done)
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are copied on Linux alone")
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_the_answer_is_that_of_the_work_wherever_it_is_done(monkeypatch, count):
-    monkeypatch.setattr(ahead, "cores", lambda: count)
-    done: list = []
-    work = BackgroundResult(counting(5, done))
-    work.begin()
-    assert work.answer() == work.answer() == 10
-    threads = {thread for _, thread in done}
-    assert (threading.current_thread() in threads) == (count == 1)
-    assert len(threads) == 1
+@pytest.fixture
+def two_cores(monkeypatch):
+    monkeypatch.setattr(threads, "cores", lambda: 2 - threads.taken)
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+    assert threads.taken == 0
 
 
-def test_a_sum_begun_before_is_bitwise_that_of_whoever_asked(monkeypatch):
-    left, right = torch.randn(2, 2048, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+def begun(work, *shared) -> BackgroundResult:
+    job = BackgroundResult(work, *shared)
+    job.begin()
+    return job
 
-    def product():
-        yield
-        return left.T @ right
 
-    monkeypatch.setattr(ahead, "cores", lambda: 2)
-    work = BackgroundResult(product())
-    work.begin()
-    assert torch.equal(work.answer(), left.T @ right)
+def refused() -> NoReturn:
+    raise BlockingIOError("there are too many")
+
+
+def ended(pid: int) -> bool:
+    """Whether there is no process ``pid`` any more, not even one that nobody has waited for."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+def copy_of(job: BackgroundResult) -> int:
+    assert job._copy is not None
+    return job._copy.pid
+
+
+def test_the_answer_is_that_of_a_copy_where_there_is_a_core_for_it(two_cores):
+    job = begun(os.getpid)
+    pid = copy_of(job)
+    assert threads.cores() == 1
+    assert job.answer() == job.answer() == pid != os.getpid()
+    assert ended(pid)
+    assert threads.cores() == 2
+
+
+@pytest.mark.parametrize(
+    "obstacle",
+    [
+        lambda patch: patch.setattr(threads, "cores", lambda: 1),
+        lambda patch: patch.setattr(torch, "get_num_threads", lambda: 2),
+        lambda patch: patch.setattr(torch.cuda, "is_available", lambda: True),
+        lambda patch: patch.setattr(sys, "platform", "darwin"),
+        lambda patch: patch.setattr(background, "_seconds", lambda pid: None),
+        lambda patch: patch.setattr(os, "fork", refused),
+        lambda patch: patch.setattr(os, "pipe", refused),
+    ],
+    ids=["one core", "more threads", "a GPU", "another system", "no /proc", "no more processes", "no more files"],
+)
+def test_elsewhere_whoever_asks_does_the_work(obstacle, two_cores, monkeypatch):
+    obstacle(monkeypatch)
+    assert begun(os.getpid).answer() == os.getpid()
 
 
 def test_without_a_beginning_whoever_asks_does_the_work():
-    done: list = []
-    assert BackgroundResult(counting(3, done)).answer() == 3
-    assert {thread for _, thread in done} == {threading.current_thread()}
+    assert BackgroundResult(os.getpid).answer() == os.getpid()
 
 
-def test_an_error_reaches_whoever_asks(monkeypatch):
-    monkeypatch.setattr(ahead, "cores", lambda: 2)
+def test_a_copy_takes_only_the_cores_that_are_left(two_cores):
+    first, second = begun(os.getpid), begun(os.getpid)
+    assert second.answer() == os.getpid() != first.answer()
 
+
+def test_tensors_come_back_bitwise_and_what_is_shared_is_the_same_object(two_cores):
+    generator = torch.Generator().manual_seed(0)
+    wide = torch.randn(2, 2048, 64, dtype=torch.float64, generator=generator)
+    part = wide[0]
+    product, same = begun(lambda: (part.T @ wide[1], part), part).answer()
+    assert torch.equal(product, part.T @ wide[1])
+    assert same is part
+
+
+def test_of_a_view_only_what_it_shows_is_packed():
+    whole = torch.arange(100_000.0)
+    said = packed(whole[5:8])
+    assert len(said) < 5_000
+    assert torch.equal(unpacked(said), whole[5:8])
+    twice = packed([whole, whole])
+    assert len(twice) < 1.5 * whole.nbytes
+
+
+def test_an_error_reaches_whoever_asks(two_cores):
     def failing():
-        yield
         raise ArithmeticError("no number")
 
-    work = BackgroundResult(failing())
-    work.begin()
+    job = begun(failing)
     for _ in range(2):
         with pytest.raises(ArithmeticError, match="no number"):
-            work.answer()
+            job.answer()
 
 
-def test_what_is_stopped_ends_after_its_piece_and_may_be_asked_for_later(monkeypatch):
-    monkeypatch.setattr(ahead, "cores", lambda: 2)
-    done: list = []
-    gate = threading.Event()
-    work = BackgroundResult(counting(1000, done, gate))
-    work.begin()
-    opener = threading.Timer(0.05, gate.set)
-    opener.start()
+def test_where_an_answer_cannot_be_sent_whoever_asks_does_the_work(two_cores):
+    lock = threading.Lock()
+    assert begun(lambda: (lock, os.getpid())).answer() == (lock, os.getpid())
+
+
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
+def test_where_a_copy_is_killed_whoever_asks_does_the_work(end, two_cores):
+    here = os.getpid()
+    job = begun(lambda: time.sleep(0.0 if os.getpid() == here else DEADLINE))
+    pid = copy_of(job)
+    os.kill(pid, end)
+    assert job.answer() is None
+    assert ended(pid)
+
+
+def test_a_copy_that_waits_for_what_never_comes_is_given_up(two_cores, monkeypatch):
+    monkeypatch.setattr(background, "PATIENCE", 0.3)
+    here = os.getpid()
+
+    def work() -> int:
+        if os.getpid() != here:
+            time.sleep(DEADLINE)
+        return os.getpid()
+
     start = time.monotonic()
-    work.stop()
-    assert time.monotonic() - start < DEADLINE
-    assert len(done) < 1000
-    assert not any(thread.name == "ocp_torch ahead" for thread in threading.enumerate())
-    assert work.answer() == sum(range(1000))
+    assert begun(work).answer() == here
+    assert time.monotonic() - start < DEADLINE / 2.0
+
+
+def test_a_copy_that_computes_is_waited_for_however_long_it_takes(two_cores, monkeypatch):
+    monkeypatch.setattr(background, "PATIENCE", 0.3)
+
+    def work() -> int:
+        end = time.process_time() + 1.5
+        while time.process_time() < end:
+            pass
+        return os.getpid()
+
+    assert begun(work).answer() != os.getpid()
+
+
+def test_what_is_stopped_ends_at_once_and_may_be_asked_for_later(two_cores):
+    here = os.getpid()
+    job = begun(lambda: time.sleep(0.0 if os.getpid() == here else DEADLINE) or os.getpid())
+    pid = copy_of(job)
+    start = time.monotonic()
+    job.stop()
+    assert time.monotonic() - start < DEADLINE / 2.0
+    assert ended(pid)
+    assert job.answer() == here
+
+
+def test_ctrl_c_is_for_the_first_process_alone(two_cores):
+    def work() -> int:
+        os.kill(os.getpid(), signal.SIGINT)
+        return os.getpid()
+
+    assert begun(work).answer() != os.getpid()
+
+
+def test_a_copy_has_pieces_done_by_threads_of_its_own(two_cores):
+    squares = lambda: threads.side_by_side(lambda k: k * k, range(8))
+    assert squares() == begun(squares).answer()
+
+
+def test_a_copy_prints_nothing_and_its_warnings_are_not_seen(two_cores, capfd):
+    def work() -> int:
+        print("printed")
+        warnings.warn("warned", stacklevel=1)
+        os.write(2, b"written")
+        return os.getpid()
+
+    assert begun(work).answer() != os.getpid()
+    assert capfd.readouterr() == ("", "")
+
+
+SCRIPT = """
+import os, time, torch
+from ocp_torch.compute import threads
+from ocp_torch.compute.background import BackgroundResult
+torch.set_num_threads(1)
+threads.cores = lambda: 2
+job = BackgroundResult(lambda: time.sleep(60.0))
+job.begin()
+print(job._copy.pid, flush=True)
+time.sleep(60.0)
+"""
+
+
+def test_a_copy_dies_with_the_process_that_began_it():
+    with subprocess.Popen([sys.executable, "-c", SCRIPT], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        pid = int(process.stdout.readline())
+        assert not ended(pid)
+        process.kill()
+    end = time.monotonic() + DEADLINE / 2.0
+    while not ended(pid) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert ended(pid)

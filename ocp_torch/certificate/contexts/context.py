@@ -13,7 +13,7 @@ from ocp_torch.certificate.checks.observed import Observed
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.lower.sampled import SampledValue
 from ocp_torch.certificate.settings import CERTIFIED, CertificateSettings, Progress, Run, silent
-from ocp_torch.certificate.simulated.candidates import Candidate, simulate_candidates
+from ocp_torch.certificate.simulated.candidates import Candidate, first_look, simulate_candidates
 from ocp_torch.certificate.simulated.outside import time_outside
 from ocp_torch.certificate.simulated.performance import Simulated
 from ocp_torch.certificate.statistics.estimate import Estimate, replicated_samples
@@ -151,7 +151,6 @@ class Context:
             self.problem, self.value, self.value_samples, s.ascents, search, self.seed, odd, kept, s.bound_steps
         )
 
-    @property
     def ahead(self) -> contextlib.AbstractContextManager[None]:
         """A context in which a second core works on the lower side, beside simulation and the upper side."""
         return contextlib.nullcontext() if self.sampled_value is None else self.sampled_value.ahead()
@@ -162,16 +161,27 @@ class Context:
         return {}
 
     @cached_property
+    def looked(self) -> dict[str, Simulated]:
+        """What a first look shows of the controllers, by name: some are simulated roughly at first."""
+        if not self.settings.trajectories or not self.candidates:
+            return {}
+        self.progress("simulation")
+        return first_look(*self._asked, self.remembered, self._chosen)
+
+    @cached_property
     def simulated(self) -> tuple[dict[str, Simulated], Estimate | None]:
         """What simulation shows of the controllers, by name, and what doing nothing costs."""
-        candidates = self.candidates if self.settings.trajectories else {}
-        if not candidates:
-            return {}, None
-        self.progress("simulation")
+        return simulate_candidates(*self._asked, self.looked, self._chosen) if self.looked else ({}, None)
+
+    @property
+    def _asked(self) -> tuple[Problem, dict[str, Candidate], CertificateSettings, int, bool]:
         # Where the controller with the best certified bound is handed out, none can be left out.
-        how = self.settings, self.seed, not self.external and self.settings.prefer != CERTIFIED
-        chosen = self.kind if self.controller_fixed else None
-        return simulate_candidates(self.problem, candidates, *how, self.remembered, chosen)
+        best_only = not self.external and self.settings.prefer != CERTIFIED
+        return self.problem, self.candidates, self.settings, self.seed, best_only
+
+    @property
+    def _chosen(self) -> str | None:
+        return self.kind if self.controller_fixed else None
 
     def outside(self, name: str | None) -> Estimate | None:
         """The part of the discounted time that the controller ``name`` spends outside the box of a system."""
@@ -179,17 +189,17 @@ class Context:
         return handed_out and time_outside(self.problem, handed_out.policy, self.settings, self.seed)
 
     def bounds_of(
-        self, policy: Policy, value: Field, log_occupation: Field, initial: list[float] | None
+        self, name: str | None, policy: Policy, value: Field, log_occupation: Field, initial: list[float] | None
     ) -> ClosedLoopBounds:
-        """The bounds of the closed loop of ``policy`` by any ``value`` and ``log_occupation``, all in float64; ``initial`` is
-        `E[V mu0]` per set, if that is known from more states."""
+        """The bounds of the closed loop of ``policy``, the controller ``name``, by any ``value`` and ``log_occupation``, all
+        in float64; ``initial`` is `E[V mu0]` per set, if that is known from more states."""
         loop, ascents, sought = ClosedLoop(self.problem, policy), self.settings.ascents, list[Peaks]()
 
         def judge(sets: list[Samples]) -> ClosedLoopBounds:
             before = sought[-1] if sought else None
             at = loop.samples_of(sets)
             found = closed_loop_bounds(
-                loop, value, log_occupation, at, ascents, self.followed, initial, self.narrow_states, before
+                loop, value, log_occupation, at, ascents, name, initial, self.narrow_states, before
             )
             sought.append(found.sought)
             return found

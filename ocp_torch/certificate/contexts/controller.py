@@ -78,7 +78,7 @@ class ControllerContext(Context):
     def fitted(self) -> ClosedLoopBounds | None:
         if self._fit is None:
             return None
-        return self.bounds_of(self.policy, self._fit.value, self._fit.log_occupation, self._initial)
+        return self.bounds_of(self.followed, self.policy, self._fit.value, self._fit.log_occupation, self._initial)
 
     @property
     def candidates(self) -> dict[str, Candidate]:

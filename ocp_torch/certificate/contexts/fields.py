@@ -28,7 +28,7 @@ class Trained:
     """What training hands over: the fields, how they give `mu` (see `trained_policies`), the network they are made of, and
     which ``kind`` of controller was handed out, where that is settled already.
 
-    ``memory`` keeps the simulation of the controller of a warm start, whose `V` stays as it is while others are trained.
+    ``memory`` keeps the simulations of controllers, for later certificates in which some are the same.
     """
 
     fields: Fields

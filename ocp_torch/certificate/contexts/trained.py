@@ -1,7 +1,9 @@
 """What the bounds of trained fields share, where the problem can be simulated."""
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from hashlib import sha256
 
 import torch
@@ -17,8 +19,10 @@ from ocp_torch.certificate.statistics.tails import sharpened
 from ocp_torch.certificate.upper.lagrangian import ClosedLoopBounds
 from ocp_torch.certificate.upper.penalised import DensityBounds, density_bounds
 from ocp_torch.certificate.upper.policy_evaluation import fit_closed_loop
+from ocp_torch.compute.background import BackgroundResult
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.policies import (
+    BOUNDING,
     CLOSED,
     DENSITY,
     MINIMISED,
@@ -27,6 +31,7 @@ from ocp_torch.control.policies import (
     admissible_density,
     occupation_density,
 )
+from ocp_torch.fields.fields import SUBSOLUTION, TRAJECTORY_VALUE
 from ocp_torch.fields.subsolution import Subsolution
 from ocp_torch.problems.samples import Samples
 
@@ -60,31 +65,48 @@ class TrainedContext(FieldsContext):
     @property
     def tightened(self) -> Subsolution | None:
         """`V` trained on for its bound, as the certificate would train it, where that promises enough and there is no noise:
-        its controller may be the best one."""
+        its controller may be the best one. Beside that the others are simulated, which the certificate remembers."""
         sampled = self.sampled_value
         if sampled is None or not sampled.search or self.problem.noisy:
             return None
-        self.progress("lower bound")
-        return sampled.tightened
+        with sampled.ahead(sampled.tightened):
+            _ = self.simulated
+            self.progress("lower bound")
+            return sampled.tightened.answer()
 
     @property
     def remembered(self) -> dict[str, Simulated]:
-        found = self.trained.memory.get(self._remembered_as)
-        return {} if found is None else {TRAJECTORIES: found}
+        kept = {name: self.trained.memory.get(self._remembered_as(name)) for name in self.policies}
+        return {name: found[1] for name, found in kept.items() if found and found[0] == self._weights_of(name)}
 
     @cached_property
     def simulated(self) -> tuple[dict[str, Simulated], Estimate | None]:
         found, zero = super().simulated
-        if TRAJECTORIES in found:
-            self.trained.memory[self._remembered_as] = found[TRAJECTORIES]
+        for name, simulated in found.items():
+            self.trained.memory[self._remembered_as(name)] = self._weights_of(name), simulated
         return found, zero
 
-    @cached_property
-    def _remembered_as(self) -> tuple:
-        """All that the simulation of the warm start's controller depends on, within a run."""
-        own, s = self.fields.trajectory_value, self.settings
-        weights = b"" if own is None else b"".join(p.numpy().tobytes() for p in own.parameters())
-        return sha256(weights).digest(), self.seed, s.trajectories, s.replicates, s.points, s.tolerance, s.horizon
+    def _remembered_as(self, name: str) -> tuple:
+        """All that the simulation of the controller ``name`` depends on, within a run, but weights."""
+        s, constants = self.settings, self.constants
+        return (
+            name,
+            self.seed,
+            s.trajectories,
+            s.replicates,
+            s.points,
+            s.tolerance,
+            s.horizon,
+            constants.M,
+            constants.C_V,
+        )
+
+    def _weights_of(self, name: str) -> bytes:
+        """What stands for the weights of the controller ``name`` and of its control variate."""
+        own = {TRAJECTORIES: (TRAJECTORY_VALUE,), BOUNDING: tuple(self.fields.networks)}
+        used = own.get(name, tuple(n for n in self.fields.networks if n not in (TRAJECTORY_VALUE, SUBSOLUTION)))
+        weights = (p.numpy().tobytes() for n in used for p in self.fields.networks[n].parameters())
+        return sha256(b"".join(weights)).digest()
 
     @cached_property
     def kind(self) -> str:
@@ -97,11 +119,17 @@ class TrainedContext(FieldsContext):
 
     @cached_property
     def followed(self) -> str:
-        return self._best_of([n for n, p in self.policies.items() if not isinstance(p, HeldPolicy)] or [self.kind])
+        return self._best_of(self._acting or [self.kind])
 
-    def _best_of(self, names: list[str]) -> str:
-        """The one of the controllers ``names`` with the lowest performance, or the first where none is known."""
-        found = self.simulated[0]
+    @property
+    def _acting(self) -> list[str]:
+        """The controllers that act at every instant."""
+        return [name for name, policy in self.policies.items() if not isinstance(policy, HeldPolicy)]
+
+    def _best_of(self, names: list[str], at_first: bool = False) -> str:
+        """The one of the controllers ``names`` with the lowest performance, by a first look or by all simulations; the first
+        where none is known."""
+        found = {} if len(names) == 1 else self.looked if at_first else self.simulated[0]
         known = {name: found[name].perf.above for name in names if name in found and found[name].perf.finite}
         return min(known, key=known.__getitem__, default=names[0])
 
@@ -129,6 +157,17 @@ class TrainedContext(FieldsContext):
     def _mu(self) -> Density:
         return occupation_density(self.occupation, self.problem, self.fields, self.constants)
 
+    @contextlib.contextmanager
+    def ahead(self) -> Iterator[None]:
+        """A context in which other cores work on the upper side, of the controller that leads after a first look, and on the
+        lower one: as many of the two as there are cores for."""
+        upper: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
+        if self._acting and self.settings.stage.steps and self.problem.copyable:
+            _ = self.divergence_samples, self.sampled_value and self.sampled_value.initial  # needed here as well
+            upper = self._fitting(self._best_of(self._acting, at_first=True)).ahead()
+        with upper, super().ahead():
+            yield
+
     @cached_property
     def _fit(self) -> tuple[ClosedLoopBounds | None, list[str]]:
         """The bounds of `mu` fitted to the closed loop of the controller that is followed, or a warning that says why not."""
@@ -136,17 +175,28 @@ class TrainedContext(FieldsContext):
             return None, []
         kind = self.followed  # before this part is announced: it may have to be simulated
         self.progress("closed-loop fit")
+        _ = self.sampled_value and self.sampled_value.best  # meanwhile, where another core is at the fit
+        return self._fitting(kind).answer()
+
+    def _fitting(self, kind: str) -> BackgroundResult[tuple[ClosedLoopBounds | None, list[str]]]:
+        """That fit to the closed loop of the controller ``kind``."""
+        if kind not in self.results:
+            self.results[kind] = BackgroundResult(partial(self._fitted, kind), self.problem)
+        return self.results[kind]
+
+    def _fitted(self, kind: str) -> tuple[ClosedLoopBounds | None, list[str]]:
         if unknown := self.problem.unknown_divergences:
             return None, [f"no upper bound without simulation: this problem gives no divergences of {unknown}."]
-        problem, trained, policy = self.problem, self.trained, self.policies_of(self.trained.fields)[kind]
+        problem, trained = self.problem, self.trained
         how = self.constants, self.settings.stage, self.seed
         try:
+            policy = self.policies_of(trained.fields)[kind]
             fitted = in_float64(fit_closed_loop(problem, policy, trained.fields, trained.network, *how))
         except ArithmeticError as error:
             return None, [f"the certification stage failed: {error}"]
         V = self.sampled_value
         value, initial = (fitted.value, None) if V is None else (V.value, V.initial)
-        return self.bounds_of(self.policies[kind], value, fitted.log_occupation, initial), []
+        return self.bounds_of(kind, self.policies[kind], value, fitted.log_occupation, initial), []
 
     @property
     def fitted(self) -> ClosedLoopBounds | None:

@@ -1,7 +1,6 @@
 """`V` at sampled states, which the lower bounds of one `V` share."""
 
 import contextlib
-from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -77,38 +76,35 @@ class SampledValue:
         """`V` trained on for its bound, where the `best` is of it or of an average of it; else `None`."""
         return self._best.answer().subsolution
 
-    @contextlib.contextmanager
-    def ahead(self) -> Iterator[None]:
-        """A context in which a second core seeks the `best`, if there is one and two threads may evaluate the problem."""
-        _ = self.initial  # needed at once, beside that search
-        if self.search and self.problem.concurrent:
-            self._best.begin()
-        try:
-            yield
-        finally:
-            self._best.stop()
+    def ahead(self, job: BackgroundResult | None = None) -> contextlib.AbstractContextManager[None]:
+        """A context in which another core does ``job``, by default the search for the `best`, if there is one."""
+        job = job or (self._best if self.search else None)
+        if job is None:
+            return contextlib.nullcontext()
+        _ = self.initial  # needed at once, beside that job
+        return job.ahead(self.problem.copyable)
 
     @cached_property
     def _best(self) -> BackgroundResult[BestShift]:
-        return BackgroundResult(self._found())
+        return BackgroundResult(self._found, self.problem, self.value, *self.sets)
 
-    @property
-    def tightened(self) -> Subsolution | None:
+    @cached_property
+    def tightened(self) -> BackgroundResult[Subsolution | None]:
         """`V` trained on for its bound; `None` where that promises too little."""
-        return BackgroundResult(self._trained_on()).answer()
+        return BackgroundResult(self._trained_on, self.problem)
 
-    def _trained_on(self) -> Generator[None, None, Subsolution | None]:
+    def _trained_on(self) -> Subsolution | None:
         if not worth(self.own, NOISY_LEAST_PROMISE if self.problem.noisy else LEAST_PROMISE):
             return None
         batch = len(self.sets[0])  # states a step: a small certificate trains on few
-        return (yield from tightened(self.problem, self.value, self.seed, batch, self.steps))
+        return tightened(self.problem, self.value, self.seed, batch, self.steps)
 
-    def _found(self) -> Generator[None, None, BestShift]:
+    def _found(self) -> BestShift:
         if not self.search:
             return BestShift(self.own)
         best, W = self.own, self.kept
         if W is None:
-            W = yield from self._trained_on()
+            W = self._trained_on()
         if W is not None:
             beside = [*self.own.beside, *([self.problem.samples(W.worst, divergences=False)] if len(W.worst) else [])]
             best = highest([self.own, replace(self.own, value=W.network, name="V tightened", beside=beside)])

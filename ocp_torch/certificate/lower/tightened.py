@@ -10,7 +10,6 @@ off the bounds of six `W` in two and three coordinates, but 0.6 % off one of two
 """
 
 import copy
-from collections.abc import Generator
 
 import torch
 from torch import Tensor, nn
@@ -60,8 +59,8 @@ def new_states(problem: Problem, batch: int, steps: int | None) -> int:
 
 def tightened(
     problem: Problem, value: Field, seed: int, batch: int = BATCH, steps: int | None = None
-) -> Generator[None, None, Subsolution | None]:
-    """Train `W` from ``value`` `V` in float32 by ``steps`` on up to ``batch`` new states each, with a yield after each step.
+) -> Subsolution | None:
+    """Train `W` from ``value`` `V` in float32 by ``steps`` on up to ``batch`` new states each.
 
     Returns `W` in float64; `None` where `V` has no weights, there are no steps, or weights do not stay finite. Fewer states
     than `BATCH` are for a quick evaluation, and take as many times fewer steps."""
@@ -85,7 +84,6 @@ def tightened(
                 draw.remember(hidden_peaks(problem, average.module.value, draw.worst.x, starts, generator))
             with torch.enable_grad():
                 advance(stepper, average, draw, phase)
-            yield
     except NonFiniteError:
         return None
     return Subsolution(average.module.value, draw.worst.x).requires_grad_(False).double()

@@ -1,6 +1,7 @@
 """Which of the controllers is simulated how long: all of them shortly, and the better ones at length."""
 
 import math
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -34,6 +35,24 @@ class Candidate(NamedTuple):
     rounded: tuple[Policy, Field | None] | None = None
 
 
+def first_look(
+    problem: Problem,
+    candidates: dict[str, Candidate],
+    settings: CertificateSettings,
+    seed: int,
+    best_only: bool,
+    remembered: dict[str, Simulated] | None = None,
+    chosen: str | None = None,
+) -> dict[str, Simulated]:
+    """Each of ``candidates`` simulated, or ``remembered``; with ``best_only``, where that saves time, roughly, on a quarter
+    of the trajectories, but the one that is ``chosen`` already and those that hold their control."""
+    many = problem.noisy or _held(candidates) or settings.trajectories * settings.replicates > CHEAP
+    exact = {chosen, *_held(candidates)} if best_only and len(candidates) > 1 and many else candidates.keys()
+    known = {name: found for name, found in (remembered or {}).items() if not (found.rough and name in exact)}
+    simulate = partial(_simulated, problem, settings, seed)
+    return known | {name: simulate(c, name not in exact) for name, c in candidates.items() if name not in known}
+
+
 def simulate_candidates(
     problem: Problem,
     candidates: dict[str, Candidate],
@@ -43,29 +62,26 @@ def simulate_candidates(
     remembered: dict[str, Simulated] | None = None,
     chosen: str | None = None,
 ) -> tuple[dict[str, Simulated], Estimate]:
-    """Performance of each of ``candidates``, and of doing nothing; what is ``remembered`` is not simulated again.
-
-    With ``best_only``, where that saves time, candidates are simulated roughly first, on a quarter of the trajectories: the
-    one that is ``chosen`` already, the best of the others and any that may still be better get all of them. Beside one that
-    holds its control any that looks worse stays rough: acting at every instant it trembles where that one jumps, and would
-    take minutes on fine steps."""
-
-    simulate = partial(_simulated, problem, settings, seed)
-    held = [name for name, candidate in candidates.items() if isinstance(candidate.policy, HeldPolicy)]
-    many = problem.noisy or held or settings.trajectories * settings.replicates > CHEAP
-    roughly_first = [name for name in candidates if name not in held and name != chosen]
-    quickly = roughly_first if best_only and len(candidates) > 1 and many else []
-    found = dict(remembered or {})
-    found |= {name: simulate(c, name in quickly) for name, c in candidates.items() if name not in found}
+    """Performance of each of ``candidates``, and of doing nothing, by a `first_look`: of those that were simulated roughly
+    the best, and any that may still be better, get all trajectories. Beside one that holds its control any that looks worse
+    stays rough: acting at every instant it trembles where that one jumps, and would take minutes on fine steps."""
+    simulate, held = partial(_simulated, problem, settings, seed), _held(candidates)
+    found = first_look(problem, candidates, settings, seed, best_only, remembered, chosen)
+    rough = [name for name in found if found[name].rough]
     best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
     lowest = math.inf  # performance of those simulated on all trajectories
-    for name in sorted(quickly, key=lambda name: found[name].perf.value if found[name].perf.finite else math.inf):
+    for name in sorted(rough, key=lambda name: found[name].perf.value if found[name].perf.finite else math.inf):
         perf = found[name].perf
         if not (perf.above if held else perf.interval(CONFIDENCE)[0]) > best and not perf.value >= lowest:
             found[name] = simulate(candidates[name])
             lowest = min(lowest, found[name].perf.value)
     nothing = zero_policy(problem)  # the same in any precision
     return found, simulate(Candidate(nothing, None, None, (nothing, None)), roughly=True).perf
+
+
+def _held(candidates: dict[str, Candidate]) -> list[str]:
+    """Those of ``candidates`` that hold their control."""
+    return [name for name, candidate in candidates.items() if isinstance(candidate.policy, HeldPolicy)]
 
 
 def _simulated(
@@ -77,7 +93,7 @@ def _simulated(
         effort *= MORE_HELD
     if roughly:
         effort, tolerance, doublings = max(2, effort // BASELINE_PART), ROUGH_FACTOR * tolerance, ROUGH_DOUBLINGS
-    return Simulation(
+    simulation = Simulation(
         problem,
         candidate.policy,
         trajectories=effort,
@@ -90,4 +106,5 @@ def _simulated(
         rounded=candidate.rounded,
         doublings=doublings,
         audited=settings.audited,
-    ).run()
+    )
+    return replace(simulation.run(), rough=roughly)

@@ -62,6 +62,7 @@ class Simulated:
     end_states: Tensor
     jumped_over: str = ""  # the wall that steps jump over, in words; empty where none was seen
     unmet: float = 0.0  # what states far costlier than any that was met add, if one path comes to them
+    rough: bool = False  # whether a simulation on more trajectories may follow
 
 
 class Start(NamedTuple):

@@ -62,6 +62,11 @@ class Simulator(Problem):
         return False
 
     @property
+    def copyable(self) -> bool:
+        """False: the function may use other processes, as its ``workers`` are."""
+        return False
+
+    @property
     def driftless(self) -> bool:
         return self._oracle.driftless
 

@@ -3,11 +3,13 @@
 import json
 import logging
 import math
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from ocp_torch.compute.background import BackgroundResult
 from ocp_torch.control.greedy import HeldPolicy
 from ocp_torch.control.policies import Policy, zero_policy
 from ocp_torch.files.storage import write_atomically
@@ -59,15 +61,22 @@ def metrics(problem: Problem, policy: Policy, seed: int = 0, starts: int = START
     x0 = random_starts(problem, starts, seed)
     duration = TRIAL / problem.discount
     steps = max(STEPS, math.ceil(duration * _pace(problem) / LONGEST_STEP))
-    policies = {"controller": policy, "zero": zero_policy(problem), "classical": classical_policy(problem)}
-    found = {}
+    classical = classical_policy(problem)
+    policies = {"controller": policy, "zero": zero_policy(problem)} | ({"classical": classical} if classical else {})
     # Classical policies ignore limits of the control, and others round; a held policy is within them.
     cut = lambda each: lambda x: problem.control_cost.within(each(x), torch.ones_like(x[:, 0]))
     within = lambda each: each if isinstance(each, HeldPolicy) else cut(each)
-    for name, each in policies.items():
-        if each is not None:
-            path = simulate(problem, within(each), x0, duration, steps)
+
+    def measured(names: Iterable[str]) -> dict:
+        found = {}
+        for name in names:
+            path = simulate(problem, within(policies[name]), x0, duration, steps)
             found[name] = {**(measure(problem, path) or {}), "cost": float(path.cost.mean())}
+        return found
+
+    others = BackgroundResult(lambda: measured(name for name in policies if name != "controller"), problem)
+    with others.ahead(problem.copyable):
+        found = measured(["controller"]) | others.answer()
     return {"starts": starts, "seed": seed, "duration": duration, **found}
 
 
