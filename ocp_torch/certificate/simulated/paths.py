@@ -1,6 +1,6 @@
 """The paths of one simulation, followed to their ends: along smooth trajectories, with noise, and where a control is held."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, cast
 
@@ -74,6 +74,13 @@ class Paths:
         if isinstance(self.loop, HeldLoop) and isinstance(self.quick, HeldLoop):
             return self._held(self.loop, self.quick)
         return self._smooth()
+
+    def from_states(self, x: Tensor) -> Tensor:
+        """The results ``(N,)`` of trajectories from an even number of other states ``x`` ``(N, d)``, without an audit."""
+        state = self.loop.start(x)
+        steps = Steps.of(self.loop, self.steps.horizon, self.loop(state)[0][:, : x.shape[1]])
+        alike = replace(self, steps=steps, state=state, mass=torch.ones_like(x[:, 0]), replicates=2, audited=False)
+        return alike.followed().results
 
     @cached_property
     def sliding(self) -> Sliding | None:

@@ -1,14 +1,16 @@
 """What the starts and paths of a simulation may have missed: costly states, and jumps of the cost between starts."""
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from ocp_torch.certificate.simulated.loops import Loop
+from ocp_torch.certificate.simulated.loops import FeedbackLoop, Loop
 from ocp_torch.certificate.simulated.paths import Paths
 from ocp_torch.certificate.statistics.tails import beyond_largest, unmet
 from ocp_torch.maths.sampling import scrambled_sobol
+from ocp_torch.maths.seeds import fixed_generator
 from ocp_torch.maths.supremum import batched, supremum
 from ocp_torch.problems.problem import Problem
 from ocp_torch.problems.starts import initial_points
@@ -25,6 +27,11 @@ MET_PART = 0.01
 MATERIAL = 0.1
 # Ascents to the largest rate: if it has no supremum, as `r^-1.6`, they find more than all that could matter.
 ASCENTS = 32
+# Paths from states around those of the largest results, and as many around the highest peak of the rate: so many neighbours
+# of each, at random distances in turns.
+TOP, NEIGHBOURS = 16, 16
+NEAREST, FARTHEST = 1e-4, 3e-2
+RESULT_ROOM = 2.0  # head-room on the largest result found
 
 
 @torch.no_grad()
@@ -40,12 +47,15 @@ def unseen_cost(problem: Problem, x0: Tensor, mass: Tensor, seed: int) -> float:
     return off if off > UNLIKELY * noise + 1e-9 * float(there.abs().mean()) else 0.0
 
 
-@torch.no_grad()
-def largest_rate_of(loop: Loop, ascents: int = 0) -> float:
-    """The largest absolute rate of ``loop`` at evenly spread states, and on ``ascents`` from the highest of these."""
+def largest_rate_of(loop: Loop) -> float:
+    """The largest absolute rate of ``loop`` at evenly spread states."""
+    return float(batched(*_rate(loop)).max())
+
+
+def _rate(loop: Loop) -> tuple[Callable[[Tensor], Tensor], Tensor]:
+    """The absolute rate of ``loop`` as a function of the state, and evenly spread states."""
     x = scrambled_sobol(COMPARED, loop.problem.dim, 0, torch.float64)
-    rate = lambda at: loop(loop.start(at))[1].reshape(len(at), -1)[:, 0].abs()
-    return supremum(rate, x, ascents, differentiable=False).value if ascents else float(batched(rate, x).max())
+    return lambda at: loop(loop.start(at))[1].reshape(len(at), -1)[:, 0].abs(), x
 
 
 def unmet_cost(loop: Loop, met: float, draws: int, size: float) -> float:
@@ -62,15 +72,31 @@ def unmet_tail(paths: Paths, results: Tensor, size: float) -> float:
     """What results larger than any of ``results`` ``(N,)`` of ``paths`` add to their mean, whose size is ``size``.
 
     The estimate is `beyond_largest`, but at most what `3 / N` of all paths add if their results are as large as the largest
-    rate found: beside kinks of `V` errors fall off slowly up to the largest slack alone (on a torus .1 % instead of .6 %)."""
+    found: beside kinks of `V` errors fall off slowly, but only up to that one."""
     beyond = beyond_largest(results, paths.mass, size)
     if not beyond > 0.0:
         return 0.0
-    largest = max(largest_rate_of(paths.quick, ASCENTS), float(results.abs().max()))
-    largest += abs(float(paths.means(results).mean()))
-    if paths.value is not None:
-        largest += float(paths.value(paths.state[:, : paths.loop.problem.dim]).abs().max())
+    largest = largest_result_of(paths, results) + abs(float(paths.means(results).mean()))
     return min(beyond, unmet(float(paths.mass.max()) * largest, len(results)))
+
+
+@torch.no_grad()
+def largest_result_of(paths: Paths, results: Tensor) -> float:
+    """The largest absolute result of paths, of which those of ``paths`` are ``results`` ``(N,)``: of these, and of others
+    that start near the largest and near the highest peak of the rate. Where paths are random, or a control is held, no result
+    is larger than that peak, with the variate."""
+    loop, met, dim = paths.loop, float(results.abs().max()), paths.loop.problem.dim
+    peak = supremum(*_rate(paths.quick), ASCENTS, differentiable=False)
+    if loop.problem.noisy or paths.times is not None or not isinstance(loop, FeedbackLoop):
+        along = 0.0 if paths.value is None else float(paths.value(paths.state[:, :dim]).abs().max())
+        return max(peak.value, met) + along
+    top = paths.state[results.abs().topk(min(TOP, len(results))).indices, :dim]
+    starts = torch.cat([top, peak.x.expand(TOP, -1)]).repeat(NEIGHBOURS, 1)
+    generator = fixed_generator()
+    radius = NEAREST * (FARTHEST / NEAREST) ** torch.rand(len(starts), 1, generator=generator, dtype=starts.dtype)
+    around = starts + radius * torch.randn(starts.shape, generator=generator, dtype=starts.dtype)
+    found = paths.from_states(torch.cat([peak.x.expand(2, -1), around]).remainder(1.0))
+    return RESULT_ROOM * max(float(found.abs().max()), met)
 
 
 def stratum_error(results: Tensor, replicates: int) -> float:
