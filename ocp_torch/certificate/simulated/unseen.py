@@ -28,7 +28,8 @@ MATERIAL = 0.1
 # Ascents to the largest rate: if it has no supremum, as `r^-1.6`, they find more than all that could matter.
 ASCENTS = 32
 # Paths from states around those of the largest results, and as many around the highest peak of the rate: so many neighbours
-# of each, at random distances in turns.
+# of each, at random distances in turns. On a torus the largest of these results was 7.0e-3, of 16,384 random ones 6.4e-3, of
+# the 2,048 of a simulation 2.4e-3.
 TOP, NEIGHBOURS = 16, 16
 NEAREST, FARTHEST = 1e-4, 3e-2
 RESULT_ROOM = 2.0  # head-room on the largest result found
