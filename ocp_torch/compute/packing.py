@@ -5,11 +5,12 @@ import pickle
 from typing import Any
 
 import cloudpickle
+import torch
 from torch import Tensor
 
 
 class Packer(cloudpickle.Pickler):
-    """Packs all but what is ``shared``, of which it leaves the numbers; of tensors only what they show."""
+    """Packs all but what is ``shared``, of which it leaves the numbers; of dense tensors only what they show."""
 
     def __init__(self, file: io.BytesIO, shared: tuple[object, ...]) -> None:
         super().__init__(file)
@@ -19,9 +20,11 @@ class Packer(cloudpickle.Pickler):
         return self.shared.get(id(thing))
 
     def reducer_override(self, thing: Any) -> Any:
-        # PyTorch packs the whole block of memory that a tensor is a view of.
-        if type(thing) is Tensor and thing.untyped_storage().nbytes() > thing.nbytes:
-            return thing.clone().__reduce_ex__(pickle.DEFAULT_PROTOCOL)
+        # PyTorch packs the whole block of memory that a tensor is a view of. A column stays a view: sums over numbers that
+        # lie apart are made in another order.
+        if type(thing) is Tensor and thing.layout is torch.strided:
+            if thing.untyped_storage().nbytes() > thing.nbytes and (alone := thing.clone()).stride() == thing.stride():
+                return alone.__reduce_ex__(pickle.DEFAULT_PROTOCOL)
         return super().reducer_override(thing)
 
 

@@ -109,6 +109,20 @@ def test_of_a_view_only_what_it_shows_is_packed():
     assert len(twice) < 1.5 * whole.nbytes
 
 
+def test_a_column_stays_one_so_that_its_sum_does():
+    x = torch.randn(4000, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    for view in (x[:, 2], x[:, :5], x[3:900].T, x[0].expand(4, 7)):
+        again = unpacked(packed(view))
+        assert again.stride() == view.stride()
+        assert torch.equal(again, view)
+        assert torch.equal(again.sum(), view.sum())
+
+
+def test_sparse_tensors_are_packed_too():
+    sparse = torch.eye(5).to_sparse()
+    assert torch.equal(unpacked(packed(sparse)).to_dense(), torch.eye(5))
+
+
 def test_an_error_reaches_whoever_asks(two_cores):
     def failing():
         raise ArithmeticError("no number")
