@@ -6,6 +6,7 @@ two threads made 33, and two processes 23.
 
 import contextlib
 import ctypes
+import fcntl
 import logging
 import os
 import select
@@ -54,9 +55,9 @@ class BackgroundResult(Generic[T]):
     @contextlib.contextmanager
     def ahead(self, allowed: bool = True) -> Iterator[None]:
         """A context in which the work goes on meanwhile, if that is ``allowed``; at its end what is not done is left."""
-        if allowed:
-            self.begin()
         try:
+            if allowed:
+                self.begin()
             yield
         finally:
             self.stop()
@@ -64,13 +65,17 @@ class BackgroundResult(Generic[T]):
     def begin(self) -> None:
         """Go on in a copy of this process, where there is a core for it."""
         if self._copy is None and not self._answer and threads.cores() > 1 and _can_be_copied():
-            with contextlib.suppress(OSError):  # too many processes or files, or too little memory
-                self._copy = _copied(lambda: packed(self._work(), *self._shared))
+            # There may be too many processes or files, or too little memory.
+            with contextlib.suppress(OSError), _signals_held() as before:
+                self._copy = _copied(lambda: packed(self._work(), *self._shared), before)
 
     def answer(self) -> T:
         """The value, once the work is done. Raises what the work raises."""
         if self._copy is not None:
-            said, self._copy = _said_by(self._copy), None
+            try:
+                said = _said_by(self._copy)
+            finally:
+                self.stop()
             with contextlib.suppress(Exception):  # cut off, or whatever a stranger's object may raise
                 self._answer.append(unpacked(said, *self._shared))
         if not self._answer:
@@ -91,8 +96,20 @@ def _can_be_copied() -> bool:
     return sys.platform == "linux" and one_thread and here().size == 1 and _seconds(os.getpid()) is not None
 
 
-def _copied(work: Callable[[], bytes]) -> Copy:
-    """A copy of this process that does ``work`` on half of the cores and writes what comes of it into a pipe."""
+@contextlib.contextmanager
+def _signals_held() -> Iterator[set[int]]:
+    """A context in which signals wait, with those that were held before: in a copy that has not parted from this process yet
+    an exception from a handler would go to whatever has called this, and all of that would go on in the copy too."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+    try:
+        yield before
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _copied(work: Callable[[], bytes], held: set[int]) -> Copy:
+    """A copy of this process that does ``work`` on half of the cores and writes what comes of it into a pipe; once it has
+    parted from this one, it holds back no signals but those that were ``held`` before."""
     own, parent = threads.cores() // 2, os.getpid()
     reading, writing = os.pipe()
     try:
@@ -109,11 +126,14 @@ def _copied(work: Callable[[], bytes]) -> Copy:
         return Copy(pid, reading, own)
     try:
         os.close(reading)
+        pipe = fcntl.fcntl(writing, fcntl.F_DUPFD_CLOEXEC, 3)  # it may have the number of a stream that is closed
+        os.close(writing)
         _leave(parent)
+        signal.pthread_sigmask(signal.SIG_SETMASK, held)
         threads.alone(own)
         said = work()
-        with os.fdopen(writing, "wb") as pipe:
-            pipe.write(said)
+        with os.fdopen(pipe, "wb") as answers:
+            answers.write(said)
     finally:
         os._exit(0)  # neither buffers nor exit functions are for a copy
 
@@ -123,6 +143,9 @@ def _leave(parent: int) -> None:
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it died before
         os._exit(1)
+    for number in signal.valid_signals():
+        if callable(signal.getsignal(number)):  # a function of the user's, which the parent calls
+            signal.signal(number, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     logging.disable()
@@ -140,10 +163,8 @@ def _said_by(copy: Copy) -> bytes:
             part = os.read(copy.pipe, 2**20)
             said += part
             if not part:
-                _ended(copy)
                 return bytes(said)
         elif (after := _seconds(copy.pid)) == before:
-            _ended(copy)
             return b""
         else:
             before = after

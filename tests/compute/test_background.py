@@ -209,6 +209,73 @@ def test_a_copy_prints_nothing_and_its_warnings_are_not_seen(two_cores, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+def test_an_exception_from_a_handler_while_a_copy_is_ended_is_what_is_told(two_cores, monkeypatch):
+    wait = os.waitpid
+
+    def interrupted(*which):
+        monkeypatch.setattr(os, "waitpid", wait)
+        wait(*which)
+        raise KeyboardInterrupt
+
+    job = BackgroundResult(os.getpid)
+    monkeypatch.setattr(os, "waitpid", interrupted)
+    with pytest.raises(KeyboardInterrupt), job.ahead():
+        job.answer()
+
+
+def test_a_copy_calls_no_handlers_of_the_users(two_cores):
+    calls, here = [], os.getpid()
+    before = signal.signal(signal.SIGUSR1, lambda *_: calls.append(os.getpid()))
+
+    def work() -> list[int]:
+        if os.getpid() != here:
+            os.kill(os.getpid(), signal.SIGUSR1)
+        return calls
+
+    try:
+        assert begun(work).answer() == []
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+
+
+def said_by(script: str) -> list[str]:
+    """What a process prints that runs ``script`` on two cores."""
+    start = "import os, signal, sys, torch\nfrom ocp_torch.compute import background, threads\n"
+    start += "torch.set_num_threads(1)\nthreads.cores = lambda: 2 - threads.taken\nfork = os.fork\n"
+    command = [sys.executable, "-c", start + script]
+    return subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE, check=True).stdout.split()
+
+
+def test_a_signal_that_comes_as_a_copy_begins_does_not_let_it_go_on_as_its_parent():
+    script = """
+def early():
+    pid = fork()
+    if not pid:
+        os.kill(os.getpid(), signal.SIGINT)
+    return pid
+os.fork = early
+job = background.BackgroundResult(os.getpid)
+try:
+    job.begin()
+except KeyboardInterrupt:
+    print("left", flush=True)
+else:
+    print(job.answer() != os.getpid(), flush=True)
+"""
+    assert said_by(script) == ["True"]
+
+
+def test_where_standard_streams_are_closed_a_copy_answers():
+    script = """
+os.close(0)
+os.close(2)
+job = background.BackgroundResult(os.getpid)
+job.begin()
+print(job.answer() != os.getpid(), flush=True)
+"""
+    assert said_by(script) == ["True"]
+
+
 SCRIPT = """
 import os, time, torch
 from ocp_torch.compute import threads
