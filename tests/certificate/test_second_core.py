@@ -15,6 +15,7 @@ from ocp_torch.compute.background import BackgroundResult
 from ocp_torch.fields import SUBSOLUTION, Fields, PeriodicMLP, Subsolution
 from ocp_torch.problems import Circle, Simulator
 from ocp_torch.problems.constants import resolve_constants
+from ocp_torch.training.evaluator import QuickSettings
 from support import zoo
 
 SMALL = dict(points=256, replicates=2, trajectories=4, ascents=2, occupation_states=0, mollify=True, tolerance=0.1)
@@ -104,16 +105,21 @@ def test_what_was_simulated_beside_training_for_the_bound_is_not_simulated_again
     assert len(policies) == before + 2 + 3
 
 
-def test_what_is_remembered_of_other_weights_is_made_anew():
+def test_what_is_remembered_of_other_networks_or_another_effort_is_made_anew():
     problem, trained = Circle(), trained_of(Circle())
     constants = resolve_constants(problem)
     first = TrainedContext(problem, constants, SETTINGS, RUN, trained=trained)
     assert first.simulated[0].keys() == {"value"}
     again = TrainedContext(problem, constants, SETTINGS, RUN, trained=trained)
     assert again.remembered["value"] is first.simulated[0]["value"]
-    with torch.no_grad():
-        next(trained.fields.parameters()).add_(1e-3)
-    assert TrainedContext(problem, constants, SETTINGS, RUN, trained=trained).remembered == {}
+    quick = QuickSettings(**SMALL, stage=SETTINGS.stage)  # type: ignore[arg-type]
+    assert TrainedContext(problem, constants, quick, RUN, trained=trained).remembered == {}
+    for numbers in (trained.fields.parameters(), trained.fields.buffers()):
+        with torch.no_grad():
+            changed = next(numbers)
+            changed.add_(1e-3)
+            assert TrainedContext(problem, constants, SETTINGS, RUN, trained=trained).remembered == {}
+            changed.sub_(1e-3)
 
 
 def test_the_fit_is_to_the_best_controller_whichever_led_at_first(monkeypatch):

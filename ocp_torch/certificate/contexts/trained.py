@@ -97,16 +97,19 @@ class TrainedContext(FieldsContext):
             s.points,
             s.tolerance,
             s.horizon,
+            s.audited,
+            s.doublings,
             constants.M,
             constants.C_V,
         )
 
     def _weights_of(self, name: str) -> bytes:
-        """What stands for the weights of the controller ``name`` and of its control variate."""
+        """What stands for the networks of the controller ``name`` and of its control variate, all their numbers included."""
         own = {TRAJECTORIES: (TRAJECTORY_VALUE,), BOUNDING: tuple(self.fields.networks)}
         used = own.get(name, tuple(n for n in self.fields.networks if n not in (TRAJECTORY_VALUE, SUBSOLUTION)))
-        weights = (p.numpy().tobytes() for n in used for p in self.fields.networks[n].parameters())
-        return sha256(b"".join(weights)).digest()
+        networks = [self.fields.networks[n] for n in used]
+        numbers = (t.numpy().tobytes() for own in networks for t in (*own.parameters(), *own.buffers()))
+        return sha256(b"".join(numbers)).digest()
 
     @cached_property
     def kind(self) -> str:
