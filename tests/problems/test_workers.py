@@ -110,6 +110,29 @@ def test_signals_to_the_whole_group_are_the_parents_and_the_pool_goes_on(module)
     wait_until(lambda: not alive(team), 5.0)
 
 
+@linux
+def test_a_copy_of_the_process_has_workers_of_its_own(module):
+    pool, x = Workers("simulators:fast", 2), np.zeros((4, 1))
+    pool.map(x, False)
+    before = descendants(os.getpid())
+    reading, writing = os.pipe()
+    copy = os.fork()
+    if not copy:
+        try:
+            pool.map(x, False)
+            os.write(writing, b"".join(b"%d " % pid for pid in descendants(os.getpid())))
+        finally:
+            os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading) as pipe:
+        own = {int(pid) for pid in pipe.read().split()}
+    os.waitpid(copy, 0)
+    assert len(own) == 2
+    assert not own & before
+    wait_until(lambda: not alive(own), 5.0)
+    assert len(pool.map(x, False)[0]) == 4
+
+
 @pytest.mark.nightly
 def test_a_lost_process_an_odd_exception_and_a_simulators_own_processes(module):
     x = np.zeros((4, 1))

@@ -24,7 +24,8 @@ class Workers:
     """``count`` processes that each import ``target``, found where this process would find it.
 
     They start at the first `map`, and end with this object or with this process, however it ends: each waits for a pipe
-    to close that only this process holds open. Not forked, for a process with threads, as PyTorch has, must not be.
+    to close that only this process holds open. Not forked, for a process with threads, as PyTorch has, must not be. A copy of
+    this process starts others: from those of this one both would read the other's answers.
     """
 
     def __init__(self, target: str, count: int) -> None:
@@ -32,12 +33,13 @@ class Workers:
         self._given = (target, list(sys.path), os.getcwd())
         self._team: list[tuple[subprocess.Popen, Connection]] = []
         self._end = lambda: None
+        self._home = os.getpid()
 
     def map(self, x: np.ndarray, one_by_one: bool) -> tuple:
         """The answers at ``x``, each process with its part of the rows. Raises what the function raises."""
         parts = [part for part in np.array_split(x, self.count) if len(part)]
         try:
-            if not self._team:
+            if not self._team or self._home != os.getpid():
                 self._start()
             team = [connection for _, connection in self._team[: len(parts)]]
             for connection, part in zip(team, parts, strict=True):
@@ -57,6 +59,7 @@ class Workers:
     def _start(self) -> None:
         # However this process ends, its end of the pipe closes; children get the reading end alone.
         lifeline, held = os.pipe()
+        self._team, self._home = [], os.getpid()
         self._end = weakref.finalize(self, _dismiss, self._team, held)
         before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
         try:
