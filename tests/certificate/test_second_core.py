@@ -12,6 +12,7 @@ from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.simulated import candidates
 from ocp_torch.compute import background, threads
 from ocp_torch.compute.background import BackgroundResult
+from ocp_torch.errors import ProblemError
 from ocp_torch.fields import SUBSOLUTION, Fields, PeriodicMLP, Subsolution
 from ocp_torch.problems import Circle, Simulator
 from ocp_torch.problems.constants import resolve_constants
@@ -103,6 +104,18 @@ def test_what_was_simulated_beside_training_for_the_bound_is_not_simulated_again
     fresh = Trained(both, None, trained.network)
     assert found.to_dict() == certify_fields(problem, fresh, constants, SETTINGS, RUN).to_dict()
     assert len(policies) == before + 2 + 3
+
+
+def test_a_function_that_is_not_finite_is_told_before_anything_is_simulated():
+    class Hole(Circle):
+        def initial_density(self, x):
+            near = (x[:, 0].remainder(1.0) - 0.3).abs() < 0.05
+            return torch.where(near, torch.nan, super().initial_density(x))
+
+    constants = resolve_constants(Circle())
+    context = TrainedContext(Hole(), constants, SETTINGS, RUN, trained=trained_of(Circle()))
+    with pytest.raises(ProblemError, match="initial_density is not finite at x"):
+        _ = context.tightened
 
 
 def test_what_is_remembered_of_other_networks_or_another_effort_is_made_anew():

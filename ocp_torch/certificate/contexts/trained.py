@@ -65,10 +65,12 @@ class TrainedContext(FieldsContext):
     @property
     def tightened(self) -> Subsolution | None:
         """`V` trained on for its bound, as the certificate would train it, where that promises enough and there is no noise:
-        its controller may be the best one. Beside that the others are simulated, which the certificate remembers."""
+        its controller may be the best one. Beside that the others are simulated, which the certificate remembers. Raises
+        `ProblemError` where a function of the problem is not finite."""
         sampled = self.sampled_value
         if sampled is None or not sampled.search or self.problem.noisy:
             return None
+        _ = self.well_posed  # before anything is simulated
         with sampled.ahead(sampled.tightened):
             _ = self.simulated
             self.progress("lower bound")
