@@ -43,8 +43,8 @@ class BackgroundResult(Generic[T]):
 
     The answer is the same: ``work`` must be a function of nothing that changes meanwhile, and use no global random numbers;
     what it changes stays in the copy, and what it prints or warns of is not seen. ``shared`` are objects that it returns
-    parts of and that are the same afterwards: only their names are sent back. Where there is no second core, where processes
-    cannot be copied safely, and where a copy fails, whoever asks does the work.
+    parts of and that are the same afterwards: they are not sent back. Where there is no second core, where processes cannot
+    be copied safely, and where a copy fails, whoever asks does the work.
     """
 
     def __init__(self, work: Callable[[], T], *shared: object) -> None:

@@ -51,7 +51,8 @@ def side_by_side(function: Callable[[T], S], pieces: Sequence[T], together: bool
 
     The calling thread takes pieces too, so that it never waits for threads that other callers keep busy.
     """
-    count = min(cores(), len(pieces)) - 1 if together else 0
+    free = cores()  # asked for once: a copy that another thread begins may take some meanwhile
+    count = min(free, len(pieces)) - 1 if together else 0
     if count < 1:
         return [function(piece) for piece in pieces]
     left, found, failed = iter(list(enumerate(pieces))), dict[int, S](), dict[int, BaseException]()
@@ -68,7 +69,7 @@ def side_by_side(function: Callable[[T], S], pieces: Sequence[T], together: bool
                 failed[k] = error
                 return
 
-    helping = [_helpers(cores() - 1).submit(work) for _ in range(count)]
+    helping = [_helpers(free - 1).submit(work) for _ in range(count)]
     work()
     wait([helper for helper in helping if not helper.cancel()])
     if failed:  # of several the one that a single core would meet: all pieces before it were taken before it

@@ -49,6 +49,12 @@ def test_an_error_in_a_piece_reaches_whoever_asked(monkeypatch, together):
         side_by_side(work, [0, 1, 2], together)
 
 
+def test_cores_that_are_taken_meanwhile_do_no_harm(monkeypatch):
+    left = iter([2])
+    monkeypatch.setattr(cores, "cores", lambda: next(left, 1))
+    assert side_by_side(lambda k: k * k, range(4)) == [0, 1, 4, 9]
+
+
 def test_of_several_errors_it_is_the_first_that_is_told(monkeypatch):
     monkeypatch.setattr(cores, "cores", lambda: 2)
     later = threading.Event()
