@@ -91,19 +91,9 @@ class TrainedContext(FieldsContext):
     def _remembered_as(self, name: str) -> tuple:
         """All that the simulation of the controller ``name`` depends on, within a run, but weights."""
         s, constants = self.settings, self.constants
-        return (
-            name,
-            self.seed,
-            s.trajectories,
-            s.replicates,
-            s.points,
-            s.tolerance,
-            s.horizon,
-            s.audited,
-            s.doublings,
-            constants.M,
-            constants.C_V,
-        )
+        effort = s.trajectories, s.replicates, s.points, s.tolerance, s.horizon, s.audited, s.doublings
+        used = (constants.M, constants.C_V) if name in (DENSITY, MINIMISED) else ()  # by their `mu`
+        return name, self.seed, effort, used
 
     def _weights_of(self, name: str) -> bytes:
         """What stands for the networks of the controller ``name`` and of its control variate, all their numbers included."""
