@@ -135,7 +135,6 @@ def taught(value, steps: int = 300):
 
 def test_its_controller_is_handed_out_where_it_is_the_best(tmp_path, monkeypatch):
     def training(problem, value, *_):
-        yield
         with torch.enable_grad():
             return Subsolution(taught(value), torch.zeros(0, 1, dtype=torch.float64))
 
