@@ -95,7 +95,7 @@ def test_killed_again_and_again_a_run_leaves_what_it_would_have_left(way, chain,
         if ended.status == 0:
             break
     print(f"{way}, chain {chain}: {start} interruptions")
-    assert (way == "a simulator") == bool(known)
+    assert known or way != "a simulator"  # its workers; other runs have copies of themselves at times
     assert_same(folder, whole)
 
 
