@@ -93,7 +93,7 @@ def _can_be_copied() -> bool:
     """Whether a copy of this process can go on: on Linux, outside of torchrun, and where neither OpenMP nor CUDA nor autograd
     have threads, which a copy lacks."""
     one_thread = torch.get_num_threads() == 1 and not torch.cuda.is_available()
-    return sys.platform == "linux" and one_thread and here().size == 1 and _seconds(os.getpid()) is not None
+    return sys.platform == "linux" and one_thread and here().size == 1 and _ticks(os.getpid()) is not None
 
 
 @contextlib.contextmanager
@@ -156,7 +156,7 @@ def _leave(parent: int) -> None:
 
 def _said_by(copy: Copy) -> bytes:
     """What ``copy`` writes until it ends; nothing where it fails, or waits for what never comes."""
-    before, said, ready = _seconds(copy.pid), bytearray(), select.poll()
+    before, said, ready = _ticks(copy.pid), bytearray(), select.poll()
     ready.register(copy.pipe, select.POLLIN)
     while True:
         if ready.poll(1000.0 * PATIENCE):
@@ -164,7 +164,7 @@ def _said_by(copy: Copy) -> bytes:
             said += part
             if not part:
                 return bytes(said)
-        elif (after := _seconds(copy.pid)) == before:
+        elif (after := _ticks(copy.pid)) == before:
             return b""
         else:
             before = after
@@ -180,7 +180,7 @@ def _ended(copy: Copy) -> None:
         os.waitpid(copy.pid, 0)
 
 
-def _seconds(pid: int) -> Any:
+def _ticks(pid: int) -> Any:
     """The CPU time that the process ``pid`` has used, in ticks; `None` where the system does not tell."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

@@ -71,7 +71,7 @@ def test_the_answer_is_that_of_a_copy_where_there_is_a_core_for_it(two_cores):
         lambda patch: patch.setattr(torch, "get_num_threads", lambda: 2),
         lambda patch: patch.setattr(torch.cuda, "is_available", lambda: True),
         lambda patch: patch.setattr(sys, "platform", "darwin"),
-        lambda patch: patch.setattr(background, "_seconds", lambda pid: None),
+        lambda patch: patch.setattr(background, "_ticks", lambda pid: None),
         lambda patch: patch.setattr(os, "fork", refused),
         lambda patch: patch.setattr(os, "pipe", refused),
     ],
