@@ -88,8 +88,8 @@ class CertificateSettings:
     horizon: str = TRUNCATED  # truncated: bounded tail in `bias`; random: an exponential time, no tail and more noise
     prefer: str = SIMULATED  # hand out the controller of the lowest performance, simulated or certified
     stage: StageSettings = field(default_factory=StageSettings)  # the fit to the closed loop
-    # Whether a few trajectories are simulated once more, on far finer steps, for the bias: no claim may do without, so that
-    # this is no field of a configuration.
+    # Whether a few trajectories are simulated once more, on far finer steps, for the bias, and suprema for the bound without
+    # M sought in steep places too: no claim may do without, so that this is no field of a configuration.
     audited: ClassVar[bool] = True
     doublings: ClassVar[int] = MAX_DOUBLINGS  # of the steps of a simulation without noise, at most
 

@@ -149,17 +149,18 @@ def test_beside_a_held_control_a_worse_controller_stays_rough_and_what_is_rememb
     settings = CertificateSettings(trajectories=32, replicates=4, tolerance=1e-3)
     asked = lambda policy: [(count, doublings) for one, count, doublings in efforts if one is policy]
     whole = (32, MAX_DOUBLINGS)
+    at_length = lambda how, *kept: candidates.simulate_candidates(*how, candidates.first_look(*how, True, *kept))[0]
     for other, effort in ((away, [(8, 1)]), (problem.exact_control, [(8, 1), whole])):
         efforts.clear()
         both = {"value": Candidate(other, None, None), "trajectories": Candidate(held_one, None, None)}
-        found, _ = candidates.simulate_candidates(problem, both, settings, 0, best_only=True)
+        found = at_length((problem, both, settings, 0))
         # The exact controller is better than the held one by less than a rough simulation can tell: either is fine.
         assert asked(other) in (effort, effort[:1])
         assert asked(held_one) == [(candidates.MORE_HELD * 32, MAX_DOUBLINGS)]
     assert found["trajectories"].perf.interval(0.999)[0] < held_cost(problem, 0.05)
     efforts.clear()
     kept = {"trajectories": found["trajectories"]}
-    again, _ = candidates.simulate_candidates(problem, both, settings, 0, True, kept)
+    again = at_length((problem, both, settings, 0), kept)
     assert asked(held_one) == []
     assert {name: one.perf for name, one in again.items()} == {name: one.perf for name, one in found.items()}
 

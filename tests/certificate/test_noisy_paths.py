@@ -7,7 +7,7 @@ import torch
 
 from ocp_torch.certificate.simulated import candidates
 from ocp_torch.certificate.simulated.backward import _noisy_piece, backward_flow
-from ocp_torch.certificate.simulated.candidates import Candidate, simulate_candidates
+from ocp_torch.certificate.simulated.candidates import Candidate, first_look, simulate_candidates
 from ocp_torch.certificate.simulated.performance import Simulation
 from ocp_torch.maths.differences import STEPS
 from ocp_torch.problems import Manufactured, Problem
@@ -35,7 +35,8 @@ def test_with_noise_a_controller_that_is_clearly_worse_is_followed_shortly_even_
     wild = lambda x: torch.full_like(x, 30.0)
     both = {"worse": Candidate(wild, None, None), "good": Candidate(problem.exact_control, None, None)}
     settings = replace(QUICK, tolerance=0.05)
-    found, _ = simulate_candidates(problem, both, settings, 0, best_only=True)
+    looked = first_look(problem, both, settings, 0, best_only=True)
+    found, _ = simulate_candidates(problem, both, settings, 0, looked)
     assert made == efforts
     assert found["worse"].perf.value > 2.0 * found["good"].perf.value
 

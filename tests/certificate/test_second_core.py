@@ -1,5 +1,6 @@
 """Second cores: copies of the process leave a certificate as it is, and no simulation is made twice."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -8,12 +9,14 @@ import torch
 
 from ocp_torch.certificate import Run, StageSettings, Trained, TrainedContext, certify_fields
 from ocp_torch.certificate.contexts import trained as trained_context
+from ocp_torch.certificate.lower import shifted
 from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.simulated import candidates
 from ocp_torch.compute import background, threads
 from ocp_torch.compute.background import BackgroundResult
 from ocp_torch.errors import ProblemError
 from ocp_torch.fields import SUBSOLUTION, Fields, PeriodicMLP, Subsolution
+from ocp_torch.maths.peaks import Peaks
 from ocp_torch.problems import Circle, Simulator
 from ocp_torch.problems.constants import resolve_constants
 from ocp_torch.training.evaluator import QuickSettings
@@ -104,6 +107,34 @@ def test_what_was_simulated_beside_training_for_the_bound_is_not_simulated_again
     fresh = Trained(both, None, trained.network)
     assert found.to_dict() == certify_fields(problem, fresh, constants, SETTINGS, RUN).to_dict()
     assert len(policies) == before + 2 + 3
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_where_that_of_V_is_the_best_known_the_controller_of_V_trained_on_is_simulated_at_length_at_once(
+    known, monkeypatch
+):
+    problem, trained, efforts = Circle(), trained_of(Circle()), []
+    simulation, settings = candidates.Simulation, replace(SETTINGS, trajectories=candidates.CHEAP)
+    constants = resolve_constants(problem)
+    found = TrainedContext(problem, constants, settings, RUN, trained=trained).simulated[0]
+    noted = lambda *given, **how: (efforts.append(how["trajectories"]), simulation(*given, **how))[1]
+    monkeypatch.setattr(candidates, "Simulation", noted)
+    monkeypatch.setattr(TrainedContext, "remembered", found if known else {})
+    both = Fields({**trained.fields.networks, SUBSOLUTION: Subsolution(trained.fields.value, torch.zeros(0, 1))})
+    context = TrainedContext(problem, constants, settings, RUN, trained=replace(trained, fields=both))
+    assert context.expected == (SUBSOLUTION if known else None)
+    assert context.looked.keys() == {"value", SUBSOLUTION}
+    roughly = candidates.CHEAP // candidates.BASELINE_PART
+    assert efforts == ([candidates.CHEAP] if known else [roughly, roughly])
+
+
+@pytest.mark.parametrize(("settings", "seeks"), [(QuickSettings(**SMALL), False), (SETTINGS, True)])  # type: ignore[arg-type]
+def test_steep_places_are_searched_for_claims_alone(settings, seeks, monkeypatch):
+    searched = []
+    empty = lambda *how: (searched.append(how), Peaks(torch.zeros(0, 1, dtype=torch.float64), 0))[1]
+    monkeypatch.setattr(shifted, "steep_peaks", empty)
+    certify_fields(Circle(), trained_of(Circle()), resolve_constants(Circle()), settings, RUN)
+    assert bool(searched) == seeks
 
 
 def test_a_function_that_is_not_finite_is_told_before_anything_is_simulated():

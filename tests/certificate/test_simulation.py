@@ -11,7 +11,7 @@ import torch
 from ocp_torch.certificate import CertificateSettings
 from ocp_torch.certificate.simulated import candidates
 from ocp_torch.certificate.simulated.backward import backward_flow, settled_occupation
-from ocp_torch.certificate.simulated.candidates import Candidate, simulate_candidates
+from ocp_torch.certificate.simulated.candidates import Candidate, first_look, simulate_candidates
 from ocp_torch.certificate.simulated.performance import SIMULATION_REPLICATE, Simulation, starting_points
 from ocp_torch.compute import threads as cores
 from ocp_torch.compute.threads import in_pieces
@@ -343,7 +343,7 @@ def test_looks_halve_their_steps_less_often(monkeypatch):
     monkeypatch.setattr(candidates, "Simulation", simulated)
     own = {"own": Candidate(problem.exact_control, None, None)}
     for settings in (QUICK, CertificateSettings(trajectories=2, replicates=2)):
-        simulate_candidates(problem, own, settings, 0, best_only=True)
+        simulate_candidates(problem, own, settings, 0, first_look(problem, own, settings, 0, best_only=True))
     looks, _, claims, _ = asked  # each beside doing nothing, which is rough
     assert 0 < looks < claims
 

@@ -147,9 +147,8 @@ class Context:
             return None
         search = self.settings.searches(self.constants)
         odd, kept, s = self.narrow_states, self.saved_subsolution, self.settings
-        return SampledValue(
-            self.problem, self.value, self.value_samples, s.ascents, search, self.seed, odd, kept, s.bound_steps
-        )
+        how = s.ascents, search, self.seed, odd, kept, s.bound_steps, s.audited
+        return SampledValue(self.problem, self.value, self.value_samples, *how)
 
     def ahead(self) -> contextlib.AbstractContextManager[None]:
         """A context in which a second core works on the lower side, beside simulation and the upper side."""
@@ -166,21 +165,22 @@ class Context:
         if not self.settings.trajectories or not self.candidates:
             return {}
         self.progress("simulation")
-        return first_look(*self._asked, self.remembered, self._chosen)
+        # Where the controller with the best certified bound is handed out, none can be left out.
+        best_only = not self.external and self.settings.prefer != CERTIFIED
+        return first_look(*self._asked, best_only, self.remembered, self.expected)
 
     @cached_property
     def simulated(self) -> tuple[dict[str, Simulated], Estimate | None]:
         """What simulation shows of the controllers, by name, and what doing nothing costs."""
-        return simulate_candidates(*self._asked, self.looked, self._chosen) if self.looked else ({}, None)
+        return simulate_candidates(*self._asked, self.looked) if self.looked else ({}, None)
 
     @property
-    def _asked(self) -> tuple[Problem, dict[str, Candidate], CertificateSettings, int, bool]:
-        # Where the controller with the best certified bound is handed out, none can be left out.
-        best_only = not self.external and self.settings.prefer != CERTIFIED
-        return self.problem, self.candidates, self.settings, self.seed, best_only
+    def _asked(self) -> tuple[Problem, dict[str, Candidate], CertificateSettings, int]:
+        return self.problem, self.candidates, self.settings, self.seed
 
     @property
-    def _chosen(self) -> str | None:
+    def expected(self) -> str | None:
+        """The controller that will be handed out, or probably, if that is known before any is simulated."""
         return self.kind if self.controller_fixed else None
 
     def outside(self, name: str | None) -> Estimate | None:

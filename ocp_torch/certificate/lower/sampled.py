@@ -37,7 +37,8 @@ class BestShift(NamedTuple):
 class SampledValue:
     """``value`` `V` on ``sets`` of samples of ``problem``; each part is computed when it is first asked for.
 
-    Suprema of its slack are climbed from the ``ascents`` worst states, those ``odd`` ``(K, d)`` included. With ``search`` the
+    Suprema of its slack are climbed from the ``ascents`` worst states, those ``odd`` ``(K, d)`` included, and where they are
+    ``sought`` in steep places too. With ``search`` the
     shifted bound is sought among functions made of `V`, which takes many times as long: `V` trained on for that bound
     (`tightened`, by ``steps`` on states of ``seed``; or one that was ``kept`` from before), and averages over neighbours of
     the better of the two (`mollified`). With noise, which rounds kinks, no averages are tried: on dubins they gave 0.1 to
@@ -53,13 +54,14 @@ class SampledValue:
     odd: Tensor | None = None
     kept: Subsolution | None = None
     steps: int | None = None
+    sought: bool = True
 
     @cached_property
     def own(self) -> Shift:
         """The shifted bound of the best multiple of `V` itself."""
         odd = self.odd
         beside = [] if odd is None or not len(odd) else [Samples.of(self.problem, odd, divergences=False)]
-        return Shift(self.problem, self.value, self.sets, self.ascents, beside)
+        return Shift(self.problem, self.value, self.sets, self.ascents, beside, sought=self.sought)
 
     @property
     def initial(self) -> list[float]:

@@ -41,10 +41,10 @@ class Scaling(NamedTuple):
 class Shift:
     """The shifted bound of the best multiple of a ``value`` `W` on ``sets`` of samples of ``problem``.
 
-    The supremum of the slack is climbed from the ``ascents`` worst of all states, those ``beside`` included, and sought in
-    steep places by `STEEP_ASCENTS` times as many ascents in each search. ``name`` is `W` in words; it is averaged over
-    neighbours at ``radius``, unless that is 0. ``variate`` is the bound of a function near `W`, on larger sets that begin
-    with these states, from which `E[W mu0]` then starts. Properties are computed when they are first asked for.
+    The supremum of the slack is climbed from the ``ascents`` worst of all states, those ``beside`` included; where it is
+    ``sought``, also by `STEEP_ASCENTS` times as many ascents in each search in steep places. ``name`` is `W` in
+    words; it is averaged over neighbours at ``radius``, unless that is 0. ``variate`` is the bound of a function near `W`, on
+    larger sets that begin with these states, from which `E[W mu0]` then starts. Properties are computed when first asked for.
     """
 
     problem: Problem
@@ -55,6 +55,7 @@ class Shift:
     name: str = "V"
     radius: float = 0.0
     variate: "Shift | None" = None
+    sought: bool = True
 
     @cached_property
     def parts(self) -> list[SlackParts]:
@@ -91,6 +92,8 @@ class Shift:
     @cached_property
     def peaks(self) -> Peaks:
         """Peaks of the slack in steep places, from where more than the known supremum may be in reach."""
+        if not self.sought:
+            return Peaks(self._sampled.x[:0], 0)
         slack, rough = (slack_function(self.problem, value) for value in (self.value, rounded(self.value)))
         starts = STEEP_ASCENTS * self.ascents
         if self.radius:  # peaks are as wide as the radius, and each value takes many evaluations

@@ -42,12 +42,12 @@ def first_look(
     seed: int,
     best_only: bool,
     remembered: dict[str, Simulated] | None = None,
-    chosen: str | None = None,
+    expected: str | None = None,
 ) -> dict[str, Simulated]:
     """Each of ``candidates`` simulated, or ``remembered``; with ``best_only``, where that saves time, roughly, on a quarter
-    of the trajectories, but the one that is ``chosen`` already and those that hold their control."""
+    of the trajectories, but the one that is ``expected`` to be the best and those that hold their control."""
     many = problem.noisy or _held(candidates) or settings.trajectories * settings.replicates > CHEAP
-    exact = {chosen, *_held(candidates)} if best_only and len(candidates) > 1 and many else candidates.keys()
+    exact = {expected, *_held(candidates)} if best_only and len(candidates) > 1 and many else candidates.keys()
     known = {name: found for name, found in (remembered or {}).items() if not (found.rough and name in exact)}
     simulate = partial(_simulated, problem, settings, seed)
     return known | {name: simulate(c, name not in exact) for name, c in candidates.items() if name not in known}
@@ -58,15 +58,12 @@ def simulate_candidates(
     candidates: dict[str, Candidate],
     settings: CertificateSettings,
     seed: int,
-    best_only: bool,
-    remembered: dict[str, Simulated] | None = None,
-    chosen: str | None = None,
+    looked: dict[str, Simulated],
 ) -> tuple[dict[str, Simulated], Estimate]:
-    """Performance of each of ``candidates``, and of doing nothing, by a `first_look`: of those that were simulated roughly
-    the best, and any that may still be better, get all trajectories. Beside one that holds its control any that looks worse
+    """Performance of each of ``candidates``, and of doing nothing: of those that a `first_look` ``looked`` at roughly the
+    best, and any that may still be better, get all trajectories. Beside one that holds its control any that looks worse
     stays rough: acting at every instant it trembles where that one jumps, and would take minutes on fine steps."""
-    simulate, held = partial(_simulated, problem, settings, seed), _held(candidates)
-    found = first_look(problem, candidates, settings, seed, best_only, remembered, chosen)
+    simulate, held, found = partial(_simulated, problem, settings, seed), _held(candidates), dict(looked)
     rough = [name for name in found if found[name].rough]
     best = min((s.perf.above for s in found.values() if s.perf.finite), default=math.inf)
     lowest = math.inf  # performance of those simulated on all trajectories
