@@ -10,6 +10,7 @@ from torch import nn
 
 from ocp_torch.certificate.contexts.context import Context
 from ocp_torch.certificate.settings import CERTIFIED
+from ocp_torch.certificate.simulated.memory import Memory
 from ocp_torch.control.policies import DENSITY, MINIMISED, VALUE, Policy, trained_policies
 from ocp_torch.fields.fields import Fields
 from ocp_torch.fields.subsolution import Subsolution
@@ -35,7 +36,7 @@ class Trained:
     occupation: str | None
     network: Callable[..., nn.Module]
     kind: str | None = None
-    memory: dict = field(default_factory=dict, compare=False, repr=False)
+    memory: Memory = field(default_factory=Memory, compare=False, repr=False)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -4,7 +4,6 @@ import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from hashlib import sha256
 
 import torch
 
@@ -12,6 +11,7 @@ from ocp_torch.certificate.checks.observed import Observed, observe
 from ocp_torch.certificate.checks.wellposed import WellPosed, check_problem
 from ocp_torch.certificate.contexts.fields import FieldsContext, in_float64
 from ocp_torch.certificate.report import the_controller
+from ocp_torch.certificate.settings import CertificateSettings
 from ocp_torch.certificate.simulated.candidates import Candidate
 from ocp_torch.certificate.simulated.performance import Simulated
 from ocp_torch.certificate.statistics.estimate import Estimate
@@ -32,8 +32,9 @@ from ocp_torch.control.policies import (
     admissible_density,
     occupation_density,
 )
-from ocp_torch.fields.fields import SUBSOLUTION, TRAJECTORY_VALUE
+from ocp_torch.fields.fields import Fields
 from ocp_torch.fields.subsolution import Subsolution
+from ocp_torch.problems.constants import Constants
 from ocp_torch.problems.samples import Samples
 
 CHECKED_STATES = 4096  # states of each set at which the density is checked for places without mass
@@ -79,30 +80,19 @@ class TrainedContext(FieldsContext):
 
     @property
     def remembered(self) -> dict[str, Simulated]:
-        kept = {name: self.trained.memory.get(self._remembered_as(name)) for name in self.policies}
-        return {name: found[1] for name, found in kept.items() if found and found[0] == self._weights_of(name)}
+        found = {name: self.trained.memory.recall(name, *self._made_with) for name in self.policies}
+        return {name: simulated for name, simulated in found.items() if simulated is not None}
 
     @cached_property
     def simulated(self) -> tuple[dict[str, Simulated], Estimate | None]:
         found, zero = super().simulated
         for name, simulated in found.items():
-            self.trained.memory[self._remembered_as(name)] = self._weights_of(name), simulated
+            self.trained.memory.keep(simulated, name, *self._made_with)
         return found, zero
 
-    def _remembered_as(self, name: str) -> tuple:
-        """All that the simulation of the controller ``name`` depends on, within a run, but weights."""
-        s, constants = self.settings, self.constants
-        effort = s.trajectories, s.replicates, s.points, s.tolerance, s.horizon, s.audited, s.doublings
-        used = (constants.M, constants.C_V) if name in (DENSITY, MINIMISED) else ()  # by their `mu`
-        return name, self.seed, effort, used
-
-    def _weights_of(self, name: str) -> bytes:
-        """What stands for the networks of the controller ``name`` and of its control variate, all their numbers included."""
-        own = {TRAJECTORIES: (TRAJECTORY_VALUE,), BOUNDING: tuple(self.fields.networks)}
-        used = own.get(name, tuple(n for n in self.fields.networks if n not in (TRAJECTORY_VALUE, SUBSOLUTION)))
-        networks = [self.fields.networks[n] for n in used]
-        numbers = (t.numpy().tobytes() for own in networks for t in (*own.parameters(), *own.buffers()))
-        return sha256(b"".join(numbers)).digest()
+    @property
+    def _made_with(self) -> tuple[Fields, CertificateSettings, int, Constants]:
+        return self.fields, self.settings, self.seed, self.constants
 
     @cached_property
     def kind(self) -> str:
