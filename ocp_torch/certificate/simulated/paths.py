@@ -75,11 +75,13 @@ class Paths:
             return self._held(self.loop, self.quick)
         return self._smooth()
 
-    def from_states(self, x: Tensor) -> Tensor:
-        """The results ``(N,)`` of trajectories from an even number of other states ``x`` ``(N, d)``, without an audit."""
+    def from_states(self, x: Tensor, allowed: float) -> Tensor:
+        """The results ``(N,)`` of trajectories from an even number of other states ``x`` ``(N, d)``, without an audit; steps
+        are halved until they change by less than ``allowed``."""
         state = self.loop.start(x)
         steps = Steps.of(self.loop, self.steps.horizon, self.loop(state)[0][:, : x.shape[1]])
-        alike = replace(self, steps=steps, state=state, mass=torch.ones_like(x[:, 0]), replicates=2, audited=False)
+        mass, allowed = torch.ones_like(x[:, 0]), max(allowed, self.allowed)
+        alike = replace(self, steps=steps, state=state, mass=mass, replicates=2, allowed=allowed, audited=False)
         return alike.followed().results
 
     @cached_property

@@ -32,7 +32,9 @@ ASCENTS = 32
 # the 2,048 of a simulation 2.4e-3.
 TOP, NEIGHBOURS = 16, 16
 NEAREST, FARTHEST = 1e-4, 3e-2
-RESULT_ROOM = 2.0  # head-room on the largest result found
+RESULT_ROOM = 2.0  # head-room on the largest result found,
+# which need be known to this part of the largest one met alone: on a torus in a third of the time, the same to .4 %.
+RESULT_PART = 0.02
 
 
 @torch.no_grad()
@@ -96,7 +98,7 @@ def largest_result_of(paths: Paths, results: Tensor) -> float:
     generator = fixed_generator()
     radius = NEAREST * (FARTHEST / NEAREST) ** torch.rand(len(starts), 1, generator=generator, dtype=starts.dtype)
     around = starts + radius * torch.randn(starts.shape, generator=generator, dtype=starts.dtype)
-    found = paths.from_states(torch.cat([peak.x.expand(2, -1), around]).remainder(1.0))
+    found = paths.from_states(torch.cat([peak.x.expand(2, -1), around]).remainder(1.0), RESULT_PART * met)
     return RESULT_ROOM * max(float(found.abs().max()), met)
 
 
