@@ -15,7 +15,7 @@ from ocp_torch.problems.samples import Samples
 from ocp_torch.runs.build import build_certificate_settings
 from ocp_torch.runs.finish import glimpse
 from ocp_torch.runs.run import run_to_end
-from ocp_torch.training.evaluator import STATE_COST
+from ocp_torch.training.evaluator import FULL_OVER_QUICK, STEP_STATES
 from ocp_torch.training.monitor import Monitor, Stages, liouville_residual
 from ocp_torch.training.running import RunningEstimates
 from support.small import METHODS, small
@@ -151,8 +151,24 @@ def test_the_time_that_is_told_counts_what_the_certificate_trains(monkeypatch):
     evaluator, stage = trainer.evaluator, StageSettings(steps=100, rounds=1, batch=50)
     plain = CertificateSettings(points=2048, mollify=False, stage=stage)
     assert evaluator.expected(plain) is None  # nobody has looked yet
-    evaluator.seconds, trainer.state.seconds, trainer.state.samples = 2.0, 3.0, 1000
-    assert evaluator.expected(plain) == pytest.approx(6.0 * 2.0 + 5000 * 0.003)
+    state = trainer.state
+    evaluator.seconds, state.seconds, state.step, state.samples = 2.0, 3.0, 2, 1000
+    each = 3.0 / (1000 + 2 * STEP_STATES)
+    fitted = 100 * (50 + STEP_STATES)
+    assert evaluator.expected(plain) == pytest.approx(FULL_OVER_QUICK * 2.0 + fitted * each)
     searched = evaluator.expected(replace(plain, mollify=None))
-    assert searched == pytest.approx(6.0 * 2.0 + (STEEP_FACTOR * 5000 + STATE_COST * 40 * 2048) * 0.003)
+    tightened = 40 * (2048 + STEP_STATES)
+    assert searched == pytest.approx(FULL_OVER_QUICK * 2.0 + (STEEP_FACTOR * fitted + tightened) * each)
     assert evaluator.expected(replace(plain, mollify=None, points=1024)) < searched
+    none = replace(plain, mollify=None, bound_steps=0)
+    assert evaluator.expected(none) == pytest.approx(FULL_OVER_QUICK * 2.0 + STEEP_FACTOR * fitted * each)
+
+
+@pytest.mark.parametrize("batch", [1, 32, 512])
+def test_small_batches_in_training_do_not_make_the_certificate_seem_long(batch):
+    trainer = small("problem=arm", "method=dual")
+    evaluator, state = trainer.evaluator, trainer.state
+    settings = CertificateSettings(points=2048, mollify=False, stage=StageSettings(steps=100, rounds=1, batch=512))
+    evaluator.seconds, state.step, state.samples = 0.0, 40, 40 * batch
+    state.seconds = 40 * (0.0053 + 9e-6 * batch)  # what a unicycle's steps took, of few states and of many
+    assert evaluator.expected(settings) == pytest.approx(100 * (0.0053 + 9e-6 * 512), rel=0.05)

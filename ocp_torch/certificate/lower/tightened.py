@@ -51,10 +51,10 @@ def plan_of(problem: Problem, steps: int | None) -> tuple[float, int, float]:
     return M, usual if steps is None else steps, rate
 
 
-def new_states(problem: Problem, batch: int, steps: int | None) -> int:
-    """How many new states `tightened` draws with up to ``batch`` a step; the worst that come again are not counted."""
-    states = min(batch, BATCH)
-    return plan_of(problem, steps)[1] * states // BATCH * states
+def batches_of(problem: Problem, batch: int, steps: int | None) -> tuple[int, int]:
+    """The steps of `tightened` and the new states of each, where ``batch`` are the most; the worst come again beside them."""
+    whole, states = plan_of(problem, steps)[1], min(batch, BATCH)
+    return max(min(whole, 1), whole * states // BATCH), states
 
 
 def tightened(
@@ -70,8 +70,7 @@ def tightened(
     objective, unit = LevelledDual(problem), cost_unit(problem)
     fields = Fields({VALUE: copy.deepcopy(value).float().requires_grad_(True)})
     sampler = SobolSampler(problem.dim, derive_seed(seed, Branch.TIGHTENING), torch.float32)
-    states = min(batch, BATCH)
-    count = max(1, whole * states // BATCH)
+    count, states = batches_of(problem, batch, steps)
     stepper, average = short_fit(fields, objective, rate, count, unit, betas=BETAS)
     phase = Phase(Constants(M=M, C_V=1.0, C_u=1.0, sources={}))
     new = lambda: problem.samples(sampler.draw(states), divergences=False)
