@@ -152,21 +152,27 @@ def _estimate_value_bound(problem: Problem) -> tuple[float, str]:
             f"the state cost of {named(problem)} is 0 at all states that were tried, so that doing nothing is optimal; it "
             "must be above 0 somewhere."
         )
-    return require_number(f"the state cost of {named(problem)}", largest), (
-        "the largest state cost met at sampled states, which bounds V*"
-    )
+    met = f"{MARGIN:g} times the largest state cost met at sampled states"
+    whence = "the problem's state_cost_bound" if _declares(problem, largest) else met
+    return require_number(f"the state cost of {named(problem)}", largest), f"{whence}, which bounds V*"
+
+
+def _declares(problem: Problem, largest: float) -> bool:
+    """Whether ``largest``, of `state_cost_supremum`, is what the problem declares; a data set's own is of its samples."""
+    return problem.has_simulator and largest == problem.state_cost_bound
 
 
 def _estimate_control_bound(problem: Problem) -> tuple[float, str]:
     q, conjugate = problem.exponent, problem.control_cost.conjugate_exponent
-    total = 2.0 * conjugate * state_cost_supremum(problem)
+    largest = state_cost_supremum(problem)
+    total, most = 2.0 * conjugate * largest, "declared" if _declares(problem, largest) else "sampled"
     beside = ", which noise may take the control beyond" if problem.noisy else ""
     if problem.driftless:
-        return total ** (1.0 / q), f"what Proposition 2 of the paper gives with a sampled sup f{beside}"
+        return total ** (1.0 / q), f"what Proposition 2 of the paper gives with a {most} sup f{beside}"
     B, a = problem.probe(PROBED_MATRICES, 1, "B", "a")
     alpha = (torch.linalg.pinv(B) @ a.unsqueeze(-1)).squeeze(-1)
-    largest = float(alpha.norm(dim=-1).max())
-    return (total + 2.0**q * (conjugate - 1.0) * largest) ** (
+    fastest = float(alpha.norm(dim=-1).max())
+    return (total + 2.0**q * (conjugate - 1.0) * fastest) ** (
         1.0 / q
     ), f"what Proposition 2 of the paper gives with a least-squares alpha{beside}"
 

@@ -71,6 +71,17 @@ def test_no_state_costs_more_than_the_supremum_whatever_is_declared(declared):
         assert found == declared
 
 
+@pytest.mark.parametrize("declared", [None, 1.0, 2.0, 2.5])
+def test_what_is_said_of_the_value_bound_is_where_it_comes_from(declared):
+    found = resolve_constants(Declared(declared))
+    (said,) = (note for note in found.warnings if note.startswith("C_V is not known"))
+    (control,) = (note for note in found.warnings if note.startswith("C_u is not known"))
+    kept = declared is not None and declared >= 2.0
+    assert found.C_V == pytest.approx(declared if kept else 1.05 * 2.0)
+    assert ("the problem's state_cost_bound" in said) == ("a declared sup f" in control) == kept
+    assert ("1.05 times the largest state cost met" in said) == ("a sampled sup f" in control) == (not kept)
+
+
 def test_what_a_class_declares_in_its_body_is_taken():
     """And what it sets before `Problem.__init__` is called."""
 

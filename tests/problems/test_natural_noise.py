@@ -166,7 +166,7 @@ def test_the_first_noise_leaves_all_else_as_it_was():
 
 def test_the_control_bound_with_noise_is_called_an_estimate():
     said = " ".join(resolve_constants(Arm(joint_noise=0.1)).warnings)
-    assert "Proposition 2 of the paper gives with a sampled sup f, which noise may take the control beyond" in said
+    assert "Proposition 2 of the paper gives with a declared sup f, which noise may take the control beyond" in said
     assert "beyond" not in " ".join(resolve_constants(Arm()).warnings)
 
 
