@@ -67,8 +67,9 @@ def unless_it_failed(failure: str | None, trainer: Trainer):
 def salvaged(
     trainer: Trainer, settings: CertificateSettings, failure: str, monitor: Monitor
 ) -> tuple[Certificate, Fields]:
-    """The results of a run that cannot go on: fields and certificate of its best quick evaluation, refined, or as they were
-    where the problem fails again; without any evaluation those of the present fields. `InputError` if there are none."""
+    """The results of a run that cannot go on: fields and certificate of its best quick evaluation, refined; or, where the
+    problem fails again, as they were, and nothing counts; without any evaluation those of the present fields. `InputError` if
+    there are none."""
     best, seen = trainer.health.best, trainer.health.certificate
     if best is None and trainer.step == 0:
         raise InputError(failure)
@@ -81,9 +82,12 @@ def salvaged(
     if seen is None:
         raise InputError(failure)
     notes.append(
-        f"the numbers are those of the quick evaluation at step {step}: the problem failed again when they were refined."
+        f"the numbers are those of the quick evaluation at step {step}, which claims nothing: the problem failed again when "
+        "they were refined."
     )
-    certificate = replace(seen, run=replace(trainer.run, step=step))
+    # It looked neither for walls that paths jump over nor for peaks in steep places, on which every gap rests.
+    unclaimed = replace(seen.assumptions, problem_holds=False)
+    certificate = replace(seen, run=replace(trainer.run, step=step), assumptions=unclaimed)
     return replace(certificate, warnings=[*seen.warnings, *trainer.health.notes, *notes]), fields
 
 

@@ -240,6 +240,23 @@ def test_a_run_that_fails_under_way_still_gives_what_it_has():
     assert error.value.run.certificate["stopped"] == "failed"
 
 
+def test_a_run_whose_problem_fails_for_good_claims_nothing_by_a_quick_evaluation():
+    """No walls are looked for in its paths, and no peaks in steep places: a bound of a hidden peak was 5 % too high."""
+    hill = Hill()
+    heats = lambda moment: setattr(hill, "hot", moment.kind == "look")
+    with pytest.raises(TrainingFailed) as error:
+        train(hill, settings=SHORT | {"trainer.evaluate_every": 5}, callback=heats)
+    made = error.value.run.certificate
+    assert any("quick evaluation at step 5" in warning for warning in made["warnings"])
+    assert made["perf"]["value"] is not None
+    assert made["lower"]["shifted"] is not None
+    assert not any(bound["counts"] for bound in made["lower"].values() if bound is not None)
+    assert [made["gap"][kind] for kind in ("certified", "simulated", "conditional")] == [None] * 3
+    assert made["suboptimality"]["at_most"] is None
+    assert made["suboptimality"]["at_least"] is None
+    assert not made["assumptions"]["hold"]
+
+
 def test_runs_in_memory_stand_beside_runs_in_folders(here, script):
     table = compare([TrainedRun(here.controller, here.certificate), here, script])
     assert {row["run"] for row in table.rows} == {"run 0", str(here.folder), "run"}
