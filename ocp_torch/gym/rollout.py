@@ -171,7 +171,9 @@ def made(name: str, **options):
     except InputError:
         raise
     except Exception as error:  # whatever a stranger's environment may raise
-        raise InputError(f"env is {name!r}, which cannot be made: {first_line(error)}.") from None
+        unknown = isinstance(error, gymnasium.error.NameNotFound | gymnasium.error.NamespaceNotFound)
+        yours = "; one of your own is named module:Id-v0, after the module that registers it" if unknown else ""
+        raise InputError(f"env is {name!r}, which cannot be made: {first_line(error).rstrip('.')}{yours}.") from None
 
 
 def play(controller: Controller, env, name: str, episodes: int, seed: int, frames: list | None = None) -> Rollouts:

@@ -226,7 +226,8 @@ def test_an_environment_of_another_problem_is_told(gymnasium, run, caplog):
 
 def test_wrong_requests_are_one_sentence(gymnasium, run):
     wrong = (
-        (dict(env="Nowhere-v0"), "env is 'Nowhere-v0', which cannot be made"),
+        (dict(env="Nowhere-v0"), "env is 'Nowhere-v0', which cannot be made.*; one of your own is named module:Id-v0"),
+        (dict(env="my_envs/Mine-v0"), "; one of your own is named module:Id-v0, after the module that registers it"),
         (dict(env="ocp_torch/Torus-v0"), "has d = 2, m = 2, but the controller is for d = 1"),
         (dict(env="ocp_torch/Circle-v0", video="a.mp4"), "video"),
         (dict(env="ocp_torch/Circle-v0", episodes=0), "episodes"),
