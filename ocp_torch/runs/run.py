@@ -126,7 +126,10 @@ def run_to_end(trainer: Trainer, settings: CertificateSettings, folder: Path) ->
     handing out the results of the best quick evaluation so far."""
     started = time.perf_counter()
     end = ending(trainer, settings, folder)
-    log.info("controller from %s, %.0f s in all, in %s", end.controller.kind, time.perf_counter() - started, folder)
+    kind = end.controller.kind
+    known = kind != "value" or trainer.problem.knows_control_matrix
+    handed = f"controller from {kind}" if known else "no controller"
+    log.info("%s, %.0f s in all, in %s", handed, time.perf_counter() - started, folder)
     if trainer.settings.figures:
         log.info("to look at: %s", folder / REPORT)
     if end.failed is not None:

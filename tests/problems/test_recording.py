@@ -35,6 +35,7 @@ from ocp_torch.runs.evaluate import certify_saved, load_run
 from ocp_torch.runs.external import certify as certify_given
 from ocp_torch.runs.figures import FieldFigures
 from ocp_torch.runs.frame import frame_of, in_units
+from ocp_torch.runs.report.advice import advice
 from ocp_torch.training.checkpoint import load_checkpoint
 from ocp_torch.training.monitor import Observer
 from support import zoo
@@ -463,6 +464,23 @@ def test_runs_on_recorded_samples_leave_all_their_files(tmp_path, method, varyin
         assert certificate.subject == u.kind
     with pytest.raises(InputError, match="does not exist"):
         certify_saved(u, CertificateSettings(stage=StageSettings(steps=1)))
+
+
+def test_a_run_without_a_controller_says_so_and_what_to_do(tmp_path, caplog):
+    path = record(tmp_path, zoo.build("manufactured 2-d B(x)"), 300)
+    with caplog.at_level("INFO"):
+        found = session(small(*RUN, f"problem.path={path}", "method=dual", "trainer.figures=false"), tmp_path / "run")
+    assert "no controller, " in caplog.text
+    assert "controller from" not in caplog.text
+    (told,) = (w for w in found.warnings if "no controller" in w)
+    assert "method=pd" in advice(told)
+
+
+def test_no_larger_bound_is_advised_where_none_can_be_believed():
+    told = (
+        "F_M is not used: the occupation density under the controller grows beyond all bounds, so no M can be believed."
+    )
+    assert "A larger `M` does not help" in advice(told)
 
 
 @pytest.mark.nightly

@@ -1,7 +1,7 @@
 """What to do about each warning that a run may leave."""
 
 FRESH = "It cannot change at a resume: start a new run with it."
-WITHOUT_M = "Nothing, where the bound `shifted` is narrow: it needs no `M`."
+WITHOUT_M = "Nothing, where the bound `shifted` is there and narrow: it needs no `M`."
 # Words of a warning, as in the code that warns -> what to do about it. The first entry that fits is used.
 ADVICE = {
     "nothing is certified:": "Look at what the problem declares of itself, then at its functions: one of them is not so.",
@@ -12,6 +12,8 @@ ADVICE = {
     "is not known": f"Set the field that it names, if you know a value. {FRESH}",
     "is below this problem's sup mu*": f"Set a larger `method.occupation_bound`, or leave it out. {FRESH}",
     "F_M is a bound only if": f"{WITHOUT_M} Else give an `M` that you know as `method.occupation_bound`. {FRESH}",
+    "so no M": f"{WITHOUT_M} A larger `M` does not help: noise in every direction would bound the density. Recorded samples "
+    "have no `shifted`, but a model that is fitted to them has: see the guide.",
     "F_M is not used": f"{WITHOUT_M} Else set a larger `method.occupation_bound`, if there is one. {FRESH}",
     "G bounds OPT, but not": "Nothing: another bound speaks of the controller.",
     "and G are not used: the controller's value": f"Nothing, where there is a Lagrangian bound. Else set "
@@ -39,6 +41,8 @@ ADVICE = {
     "no independent draws": "Record states that are drawn independently of each other, each of them once.",
     "at the state of another, and are left out": "Nothing: the others are used.",
     "by the samples met, bounds its value": "Nothing, if the recording covers the states that matter; else record more.",
+    "B varies over the samples, so": "Train with `method=pd`: its controller is `w / mu`.",
+    "no upper bound: the recording holds no": "Record the columns that it names.",
     "no rigorous lower bound": "Nothing: the sampled bounds stand.",
     "the J shown is that of the closed loop": "Nothing.",
 }
