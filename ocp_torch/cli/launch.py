@@ -19,7 +19,7 @@ from ocp_torch.cli.assist import assist
 from ocp_torch.cli.compose import configuration, parsed, register_resolvers, run_data, with_own_defaults
 from ocp_torch.cli.explain import explain, is_choice
 from ocp_torch.cli.help import help_text
-from ocp_torch.cli.outcome import BROKEN_PIPE, INTERRUPTED, Record, fail, failures, typed
+from ocp_torch.cli.outcome import INTERRUPTED, Record, fail, failures, show, typed
 from ocp_torch.cli.single import carry_out, checked, require_places_to_write
 from ocp_torch.compute.processes import FirstProcessLeft, LostError, joined
 from ocp_torch.errors import InputError, require_flag, require_section, shown
@@ -164,15 +164,6 @@ def require_kinds(data: Any, default: Any, name: str = "") -> None:
         require_flag(name, data)
     elif isinstance(default, int | float) and not (isinstance(data, int | float) and not isinstance(data, bool)):
         raise InputError(f"{name} is {shown(data)}, but must be a number.")
-
-
-def show(text: str) -> None:
-    """Print ``text``; leave quietly when the reader, such as `head`, closes the pipe."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(BROKEN_PIPE)
 
 
 def require_no_dashes(options: list[str]) -> None:

@@ -35,6 +35,15 @@ class Record(logging.LogRecord):
         return visible(super().getMessage(), LONGEST_MESSAGE, keep="\n")
 
 
+def show(text: str) -> None:
+    """Print ``text``; leave quietly when the reader, such as `head`, closes the pipe."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(BROKEN_PIPE)
+
+
 def fail(sentence: str) -> None:
     """Print an error on one line, with very long numbers and words shortened, and exit with the status of a wrong input."""
     line = re.sub(r"\d{40,}", lambda digits: f"{digits[0][:6]}...({len(digits[0])} digits)", " ".join(sentence.split()))

@@ -1,11 +1,16 @@
 """`--help`: every field of every command with its value and what it means, from the files that hold the defaults."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 import yaml
 
 from ocp_torch.cli.compose import register_resolvers, with_own_defaults
 from ocp_torch.cli.explain import CONFIGS
 from ocp_torch.cli.help import comments, help_text
+from ocp_torch.cli.outcome import BROKEN_PIPE
 from ocp_torch.errors import InputError
 from support.forked import assert_succeeded, script
 
@@ -116,3 +121,13 @@ def test_help_shows_what_a_class_of_ones_own_is_made_from(tmp_path, monkeypatch)
     assert "  problem.walls=[1,2]\n" in text
     with pytest.raises(InputError, match="winches has no class Wench"):
         typed("problem._target_=winches.Wench")
+
+
+def test_a_reader_that_closes_the_pipe_ends_a_command_quietly():
+    """As `... | head -1` does."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, CONFIGS.parent / "scripts" / "compare.py", "--help"]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (BROKEN_PIPE, "")

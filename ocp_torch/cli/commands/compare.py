@@ -6,7 +6,7 @@ against=problem.noise (or any other number of the configuration) the plot shows 
 import sys
 from pathlib import Path
 
-from ocp_torch.cli.outcome import fail
+from ocp_torch.cli.outcome import fail, show
 from ocp_torch.errors import InputError, nearest, shown
 from ocp_torch.files.reading import kind
 from ocp_torch.runs.compare import compare
@@ -19,8 +19,7 @@ OPTIONS = ("csv", "plot", "html", "against")
 def compared(arguments: list[str]) -> None:
     """Print, and write, what ``arguments`` ask for. Raises `InputError`."""
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(__doc__)
-        return
+        return show(str(__doc__))
     options = dict(a.split("=", 1) for a in arguments if "=" in a and kind(a) is None)
     options = {name: value.strip("'\"") for name, value in options.items()}  # quoted, as other commands want it
     for name, value in options.items():
@@ -36,7 +35,7 @@ def compared(arguments: list[str]) -> None:
         if kind(run) is None:
             raise InputError(f"{shown(run)} does not exist; give runs' folders, or folders that hold some.")
     comparison = compare([Path(run) for run in runs])
-    print(comparison.table())
+    show(comparison.table())
     if "csv" in options:
         comparison.save_csv(Path(options["csv"]))
     if "html" in options:
@@ -47,7 +46,7 @@ def compared(arguments: list[str]) -> None:
         comparison.save_plot(Path(options["plot"]))
     for name in ("csv", "html", "plot"):
         if name in options:
-            print(f"wrote {options[name]}")
+            show(f"wrote {options[name]}")
 
 
 def main() -> None:
