@@ -9,6 +9,7 @@ from matplotlib.image import imread
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ocp_torch.certificate.contexts import trained
+from ocp_torch.compute import threads
 from ocp_torch.control.saved import load_controller
 from ocp_torch.errors import InputError
 from ocp_torch.runs.build import build_certificate_settings
@@ -94,6 +95,7 @@ def test_no_state_of_a_training_batch_is_ever_used_for_evaluation(sampler, seed,
 
     monkeypatch.setattr(trainer.problem, "state_cost", state_cost)
     monkeypatch.setattr(trained, "fit_closed_loop", fit_closed_loop)
+    monkeypatch.setattr(threads, "cores", lambda: 1)  # what a copy of the process meets is not seen here
     trainer.fit(Observer())
     phase.append("evaluation")
     trainer.certify(build_certificate_settings(trainer.config))
