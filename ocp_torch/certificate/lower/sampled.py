@@ -38,11 +38,10 @@ class SampledValue:
     """``value`` `V` on ``sets`` of samples of ``problem``; each part is computed when it is first asked for.
 
     Suprema of its slack are climbed from the ``ascents`` worst states, those ``odd`` ``(K, d)`` included, and where they are
-    ``sought`` in steep places too. With ``search`` the
-    shifted bound is sought among functions made of `V`, which takes many times as long: `V` trained on for that bound
-    (`tightened`, by ``steps`` on states of ``seed``; or one that was ``kept`` from before), and averages over neighbours of
-    the better of the two (`mollified`). With noise, which rounds kinks, no averages are tried: on dubins they gave 0.1 to
-    0.3 % of OPT more, for a tenth of a run's time.
+    ``sought`` in steep places too. With ``search`` the shifted bound is sought among functions made of `V`, which takes many
+    times as long: `V` trained on for that bound (`tightened`, by ``steps`` on states of ``seed``; or one that was ``kept``
+    from before), and averages over neighbours of the better of the two (`mollified`). With noise, which rounds kinks, no
+    averages are tried: on dubins they gave 0.1 to 0.3 % of OPT more, for a tenth of a run's time.
     """
 
     problem: Problem

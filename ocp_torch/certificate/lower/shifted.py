@@ -42,8 +42,8 @@ class Shift:
     """The shifted bound of the best multiple of a ``value`` `W` on ``sets`` of samples of ``problem``.
 
     The supremum of the slack is climbed from the ``ascents`` worst of all states, those ``beside`` included; where it is
-    ``sought``, also by `STEEP_ASCENTS` times as many ascents in each search in steep places. ``name`` is `W` in
-    words; it is averaged over neighbours at ``radius``, unless that is 0. ``variate`` is the bound of a function near `W`, on
+    ``sought``, also by `STEEP_ASCENTS` times as many ascents in each search in steep places. ``name`` is `W` in words;
+    it is averaged over neighbours at ``radius``, unless that is 0. ``variate`` is the bound of a function near `W`, on
     larger sets that begin with these states, from which `E[W mu0]` then starts. Properties are computed when first asked for.
     """
 
